@@ -3,11 +3,12 @@
     python benchmarks/verified_things.py SCANS [--models ycb] [--draws 0 1] [--every 3] [--resting]
     [--clutter 5] [--known even] [--fit]
 
-SCANS holds the scans of the things that the memory knows, in metres, by their names. Each draw
-shows every thing once, with an azimuth, views and errors of the sensor of its own. The camera
-stands five object radii away, between 25 cm from the surface and 45 cm from the centre. Things
-stand as they were scanned, or with ``--resting`` in any pose that they can rest in; with
-``--clutter`` so many boxes stand around each, which hide parts of it.
+SCANS holds the scans of the things that the memory knows, in metres, by their names: they are what
+is looked at. Surfaces, weights and views are those of the memory. Each draw shows every thing once,
+with an azimuth, views and errors of the sensor of its own. The camera stands five object radii away,
+between 25 cm from the surface and 45 cm from the centre. Things stand as they were scanned, or with
+``--resting`` in any pose that they can rest in; with ``--clutter`` so many boxes stand around each,
+which hide parts of it.
 
 Prints after 1, 2, 3 and 5 random views: the share that is named right by features and size, and
 with the geometry; the expected calibration error (ten bins) and the share that is wrong with a
@@ -50,7 +51,7 @@ from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 from nextview.things.unknown import KnownResiduals
 from nextview.things.verifier import Verified
-from nextview.things.weighing import JudgedEpisode, fit_weights
+from nextview.things.weighing import EvidenceWeights, JudgedEpisode, fit_weights
 
 Float = NDArray[np.float64]
 
@@ -158,7 +159,7 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class Taught:
-    """The things of a memory and their scans."""
+    """The things of a memory with its geometry of them, and their scans, which are looked at."""
 
     recogniser: TaughtRecogniser
     names: list[str]
@@ -166,13 +167,16 @@ class Taught:
     surfaces: list[Surface]
     points: list[Float]
     orders: list[int]  # of the symmetry about the vertical; 0 for any azimuth
+    weights: EvidenceWeights  # that the memory was fitted to
 
     @classmethod
     def load(cls, models: str, scans: Path) -> Taught:
         """Read a memory, and the scans of what it knows."""
         recogniser = TaughtRecogniser(models, threads=1)
-        assert recogniser.card.memory is not None
-        names = [thing.name for thing in recogniser.card.memory.things]
+        known = TaughtThings.of(recogniser)
+        if known is None or len(known.names) < len(recogniser.memory.radii):
+            raise UsageError(f"{models}: does not know the geometry of all its things; teach it with --unit")
+        names = list(known.names)
         files = {path.stem: path for path in scans.iterdir() if path.is_file()}
         missing = [name for name in names if name not in files]
         if missing:
@@ -180,10 +184,10 @@ class Taught:
 
         meshes = [load_mesh(files[name], unit="m") for name in names]
         whole = [Surface.from_mesh(mesh, name) for mesh, name in zip(meshes, names, strict=True)]
-        surfaces = [surface.simplified() for surface in track(whole, "simplifying")]
         points = [surface.sample(POINTS, np.random.default_rng(0)) for surface in whole]
         orders = [symmetry_order(*both) for both in zip(whole, points, strict=True)]
-        return cls(recogniser, names, meshes, surfaces, points, orders)
+        surfaces = list(known.verifier.caster.surfaces)
+        return cls(recogniser, names, meshes, surfaces, points, orders, known.verifier.weights)
 
     def resting_poses(self, thing: int) -> Float:
         """How the thing of this number can rest, rotations from the scan's axes, (N, 3, 3)."""
@@ -192,7 +196,7 @@ class Taught:
 
     def things(self, some: NDArray[np.int64]) -> TaughtThings:
         """A recogniser of some of the things."""
-        return TaughtThings(self.recogniser, [self.surfaces[k] for k in some])
+        return TaughtThings(self.recogniser, [self.surfaces[k] for k in some], self.weights)
 
 
 def symmetry_order(surface: Surface, points: Float) -> int:

@@ -151,6 +151,12 @@ def test_every_array_has_to_be_there(models, name):
         open_memory(models / "memory.json")
 
 
+def test_a_memory_of_an_earlier_version_is_refused_in_a_sentence_that_says_what_to_do(models):
+    rewrite(models, lambda arrays: [arrays.pop(name) for name in ("places", "faces", "counts", "boxes")])
+    with pytest.raises(ModelError, match=r"memory\.safetensors: is of an earlier version; teach it again"):
+        open_memory(models / "memory.json")
+
+
 def fewer_features(arrays):
     for name in ("views", "held_out"):
         kept = arrays[name].astype(np.float32)[..., :-1]

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from nextview.errors import MeshError, ModelError, ObservationError
@@ -12,9 +13,13 @@ from nextview.geometry.mesh import Mesh, load_mesh, make_mesh
 from nextview.geometry.observation import Observation, SceneView
 from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.resting import rotated
-from nextview.geometry.viewsphere import look_at_origin
+from nextview.geometry.viewsphere import ViewSphere, look_at_origin
+from nextview.simulation.captured import read_capture
+from nextview.simulation.captured_camera import CapturedCamera
+from nextview.simulation.capturing import write_capture
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, MetricImage, depth_view
+from nextview.things.fusion import fuse
 from nextview.things.ground import levelling
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.proposals import propose
@@ -605,3 +610,52 @@ def test_a_sheet_has_the_symmetries_of_its_outline(thickness):
     assert {one.order for one in found} == {2}
     irregular = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [-0.1, 0.2, 0]], [[0, 1, 2]], process=False)
     assert find_symmetries(turned_about(irregular.vertices, irregular.faces, 5)[1]) == ()
+
+
+# Surfaces from frames
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory):
+    """A block with a thin wall, 12 cm long, captured from 12 viewpoints on a table; metres."""
+    mesh = mesh_of(((0.12, 0.06, 0.03), (0.0, 0.0, 0.0)), ((0.004, 0.06, 0.05), (0.03, 0.0, 0.04)))
+    folder = tmp_path_factory.mktemp("captured") / "block"
+    list(write_capture(mesh, folder, ViewSphere((15.0, 50.0), 6), mesh.metres, table=True))
+    return mesh, folder
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.0015])
+def test_a_surface_from_frames_lies_on_the_thing_and_covers_what_was_seen(captured, noise):
+    mesh, folder = captured
+    camera = CapturedCamera(read_capture(folder))
+    rng = np.random.default_rng(4)
+    clean = camera.observe
+
+    def observe(pose):
+        frame = clean(pose)
+        depth = frame.depth + (noise * rng.normal(size=frame.shape)).astype(np.float32)
+        return replace(frame, depth=np.where(frame.depth > 0, depth, 0).astype(np.float32), pixel_centre=0.5)
+
+    camera.observe = observe
+    camera.take_all(look_at_origin(0.3, 0.0))
+    surface = fuse(camera.object.sightings, camera.object.object_frame.radius, "block")
+
+    height = -mesh.metres * mesh.vertices[:, 2].min()  # the world's origin is below the middle of the mesh
+    true = Surface.from_mesh(mesh, "block")
+    truth = true.sample(100_000, rng) - true.centre + (0, 0, height)
+    off = cKDTree(truth).query(surface.sample(2000, rng))[0]
+    assert off.mean() < 0.0006 + noise / 4  # samples of the truth lie half a millimetre apart
+    assert np.quantile(off, 0.95) < 0.0015 + noise
+
+    seen = truth[truth[:, 2] > 0.004]  # not the side that it stands on
+    gaps = cKDTree(surface.sample(20_000, rng)).query(seen[:2000])[0]
+    assert np.quantile(gaps, 0.95) < 0.003
+
+
+def test_of_frames_that_show_almost_nothing_there_is_no_surface(captured):
+    camera = CapturedCamera(read_capture(captured[1]))
+    camera.take_all(look_at_origin(0.3, 0.0))
+    one = camera.object.sightings[0]
+    few = replace(one, facets=one.facets.some(slice(0, 20)))
+    assert fuse([few], 0.07, "block") is None
+    assert fuse([replace(one, facets=one.facets.some(slice(0, 0)))], 0.07, "block") is None

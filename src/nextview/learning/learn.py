@@ -556,6 +556,9 @@ def _notes(taught: Sequence[Pair]) -> tuple[str, ...]:
     for source, arrays in taught:
         doubts = arrays.get("doubts", np.zeros(0, np.uint8))  # of what was taught now, from a mesh file
         notes.extend(f"{source.name}: {doubt}" for doubt in doubts.tobytes().decode().splitlines())
+    for source, arrays in taught:
+        if not arrays["held_out"].any():
+            notes.append(f"{source.name}: the sensor sees nothing of it; is it in another unit?")
     unknown = [source.name for source, arrays in taught if not np.isfinite(arrays["radii"])]
     if unknown and len(taught) > 1:
         notes.append(f"the size of {len(unknown)} of {len(taught)} things is not known; --unit makes it count")

@@ -28,6 +28,7 @@ from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.simulation.turntable import read_turntable
+from nextview.things.fusion import fuse
 from nextview.things.memory import AZIMUTHS, RINGS, joined
 from nextview.things.surface import FINEST_ERROR, Surface
 from nextview.things.symmetry import find_symmetries
@@ -171,7 +172,10 @@ def _seen(camera: Camera, poses: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def _of_capture(capture: Capture) -> Arrays:
-    """Of captured frames: each cell of the grid is what the nearest of them shows. Every fourth is held out."""
+    """Of captured frames: each cell of the grid is what the nearest of them shows. Every fourth is held out.
+
+    Its surface, and its resting pose, are in the frame of the world in which it was captured.
+    """
     camera = CapturedCamera(capture)
     camera.take_all(GRID.poses[0])
     seen = [view for view in camera.object.observations if view.seen]
@@ -184,13 +188,16 @@ def _of_capture(capture: Capture) -> Arrays:
     rest = np.flatnonzero(~kept) if not kept.all() else np.arange(len(seen))
     held_out = np.resize(rest, HELD_OUT)
     angles = np.stack([np.arcsin(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])], 1)
+    found = camera.object.object_frame
+    surface = fuse(camera.object.sightings, found.radius, capture.folder.name)
     return {
         "views": views.reshape(1, len(RINGS), AZIMUTHS, -1).astype(np.float16),
-        "rotations": np.eye(3, dtype=np.float32)[None],
+        "rotations": found.axes[None].astype(np.float32),
         "held_out": each[held_out].astype(np.float16),
         "held_out_views": angles[held_out].astype(np.float32),
-        "radii": np.array([camera.object.object_frame.radius], np.float32),
+        "radii": np.array([found.radius], np.float32),
         "pictures": _picture(seen[0]),
+        **({} if surface is None else of_surface(surface)),
         **_said(camera.left_out, len(capture.frames) + len(capture.unreadable)),
     }
 

@@ -17,8 +17,8 @@ from nextview.recognition.model_card import Verification
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.things.memory import RINGS, TaughtRecogniser
 from nextview.things.registration import rotation_about_z
-from nextview.things.taught import TaughtThings
-from nextview.things.unknown import SHRINKAGE, KnownResiduals
+from nextview.things.taught import TaughtThings, residuals_of
+from nextview.things.unknown import KnownResiduals
 from nextview.things.weighing import LEAST_BELIEF, EvidenceWeights, JudgedEpisode, fit_weights
 
 Float = NDArray[np.float64]
@@ -235,25 +235,30 @@ def _log_likelihood(weights: EvidenceWeights, episodes: Sequence[JudgedEpisode])
 
 def _residuals(shown: Sequence[Shown], labels: Index) -> KnownResiduals | None:
     """How badly known things are explained; None if none was named right."""
-    right = [one for one in shown if labels[one.named] == one.judged.truth]
-    if not right:
+    named, values, views = _right(shown, labels)
+    if not len(named):
         return None
-    named = np.array([one.named for one in right])
-    values = np.array([one.residual for one in right])
-    views = np.array([one.views for one in right])
     fitted = KnownResiduals.fit(named, values, views, len(labels))
     return KnownResiduals(fitted.usual, tuple(likely_excess(row) for row in fitted.excess))
 
 
+def _right(shown: Sequence[Shown], labels: Index) -> tuple[Index, Float, Index]:
+    """Of what was named right by the best explanation: the thing, the residual and the number of views."""
+    right = [one for one in shown if labels[one.named] == one.judged.truth]
+    things = np.array([one.named for one in right], np.int64)
+    residuals = np.array([one.residual for one in right], np.float64)
+    return things, residuals, np.array([one.views for one in right], np.int64)
+
+
 def likely_excess(found: Float) -> Float:
-    """What known things are likely to exceed their usual residuals by, from what some did.
+    """By how much known things are likely to exceed their usual residuals, from what some did.
 
     Few of them do not tell how rare larger ones are. Of fewer than FEW_RESIDUALS the quantiles are kept that a further
     one of a normal distribution would have (Student's t, as of a prediction interval), or those that were found where
     these are larger.
 
     Args:
-        found: by how much they were exceeded, ascending, (N,).
+        found: see ``KnownResiduals.excess``, ascending, (N,).
 
     Returns:
         The same, or FEW_RESIDUALS quantiles, ascending.
@@ -283,20 +288,9 @@ def with_new_things(before: Verification, shown: Sequence[Shown], labels: Index,
     answers = [int(one.judged.belief(weights).argmax()) for one in shown]
     by_features = [int(one.judged.by_features.argmax()) for one in shown]
 
-    residuals = None
-    if before.usual:
-        usual = np.array(before.usual)[carried]
-        mean = float(np.mean(before.usual))
-        right = [one for one in shown if labels[one.named] == one.judged.truth]
-        for thing in np.flatnonzero(carried < 0):
-            own = [one.residual - mean for one in right if one.named == thing]
-            usual[thing] = mean + np.sum(own) / (len(own) + SHRINKAGE)
-
-        excess = []
-        for number, row in enumerate(before.excess, 1):
-            new = [one.residual - usual[one.named] for one in right if one.views == number]
-            excess.append(np.sort([*row, *new]))
-        residuals = KnownResiduals(usual, tuple(excess))
+    residuals = residuals_of(before, range(len(before.usual)))
+    if residuals is not None:
+        residuals = residuals.extended(carried, *_right(shown, labels))
 
     verification = as_stored(weights, residuals, before.things)
     return VerifiedFit(

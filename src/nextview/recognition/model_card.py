@@ -64,12 +64,12 @@ class Verification(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         weights: Of each kind of evidence, see ``things.weighing.EvidenceWeights``, by their names.
         things: How many things there were when these were fitted.
         usual: Usual residual of each thing, see ``things.unknown.KnownResiduals``.
-        excess: By how much known things exceed it, ascending, after 1, 2, ... views.
+        excess: Logarithms of how many times known things exceed it, ascending, after 1, 2, ... views.
     """
 
     weights: dict[str, Annotated[float, msgspec.Meta(ge=0, le=LARGEST_WEIGHT)]]
     things: Annotated[int, msgspec.Meta(ge=0)]
-    usual: tuple[Annotated[float, msgspec.Meta(ge=-LARGEST_WEIGHT, le=LARGEST_WEIGHT)], ...] = ()
+    usual: tuple[Annotated[float, msgspec.Meta(ge=0, le=LARGEST_WEIGHT)], ...] = ()
     excess: tuple[tuple[Annotated[float, msgspec.Meta(ge=-LARGEST_WEIGHT, le=LARGEST_WEIGHT)], ...], ...] = ()
 
     def __post_init__(self) -> None:

@@ -77,9 +77,10 @@ class SensedCamera:
 
     def observe(self, pose: Float) -> Observation:
         """Look from the direction of a pose, (4, 4), at the sensor's own distance; too little found is nothing seen."""
-        frame = self.frame(pose)
         try:
             thing = ObservedObject(known=self.object_frame, support=False, denoise=self.denoise, life_size=False)
+            # Something of a millimetre is far out of the picture of a camera whose place is known to millimetres.
+            frame = self.frame(pose)
             if frame is None:
                 raise ObservationError("nothing is seen")
             observation = thing.add(frame)

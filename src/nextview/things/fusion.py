@@ -1,9 +1,11 @@
-"""The surface of a thing from depth frames of it, fused in a volume.
+"""The surface of a thing from depth frames of it: small squares where the frames measured it.
 
-Each cell of the volume averages the signed distance to the surface that the frames measured, cut
-off at some cells before and behind it (a TSDF: Curless and Levoy, "A volumetric method for building
-complex models from range images", SIGGRAPH 1996). Marching cubes make it a mesh. Where no frame saw
-anything there is no surface.
+The planes that were fitted to the pixels of all frames are averaged in small cells, and a square
+stands for each. So the noise of many frames averages out, as in surfel maps (Pfister et al.,
+"Surfels", SIGGRAPH 2000; Keller et al., "Real-time 3D reconstruction in dynamic scenes using
+point-based fusion", 3DV 2013). Where no frame saw anything there is no surface. On simulated frames
+through a stereo camera the squares lay 0.3 and 0.5 mm from the scans of a mug and a drill in the
+mean, the marching cubes of a truncated signed distance 0.7 and 1.6 mm: it blurs thin walls.
 """
 
 from collections.abc import Sequence
@@ -11,127 +13,79 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.observed_object import Sighting
 from nextview.things.surface import Surface
 
-Float32 = NDArray[np.float32]
+Float = NDArray[np.float64]
 
-FINEST_CELL = 0.001  # metres: less than depth cameras tell apart
-MOST_CELLS = 120  # along each axis
-BEYOND = 1.1  # how far the volume reaches, object radii
-CUT_OFF = 2.0  # cells, or deviations of the noise, at which distances are cut off
-MOST_FRAMES = 80  # an even choice of more is taken
-OFTEN = 2  # frames that have to have seen a cell, where there are many
-MANY_FRAMES = 8
-SMALL_PIECE = 0.02  # share of the faces below which a piece of the surface is an error
+FINEST_CELL = 0.0015  # metres: what depth cameras tell apart
+CELLS = 45.0  # in a radius, of a large thing
+SQUARE = 0.75  # half the side of a square, cells: neighbours overlap
+MOST_POINTS = 20_000  # of a frame; an even choice of more is taken
+STEEPEST = 0.25  # cosine of the angle of incidence below which a pixel does not count
+FEW_SHARE = 0.1  # of what a usual cell was seen, below which it is an error
+FEWEST_SQUARES = 50
 
 
-def fuse(sightings: Sequence[Sighting], frame: ObjectFrame, name: str) -> Surface | None:
+def fuse(sightings: Sequence[Sighting], radius: float, name: str) -> Surface | None:
     """Fuse what frames show of a thing.
 
     Args:
         sightings: of the thing, all in one world.
-        frame: where it is.
+        radius: of the thing, metres.
         name: what it is called.
 
     Returns:
         Its surface, in the frame of the world, metres; None if too little was measured.
     """
-    some = sightings
-    if len(sightings) > MOST_FRAMES:
-        some = [sightings[k * len(sightings) // MOST_FRAMES] for k in range(MOST_FRAMES)]
-
-    cell = max(FINEST_CELL, 2 * BEYOND * frame.radius / MOST_CELLS)
-    side = int(np.ceil(2 * BEYOND * frame.radius / cell))
-    corner = frame.centre - cell * (side - 1) / 2
-    total = np.zeros(side**3, np.float32)
-    weight = np.zeros(side**3, np.float32)
-    for sighting in some:
-        _add(total, weight, sighting, corner, cell, side)
-
-    seen = weight >= (OFTEN if len(some) >= MANY_FRAMES else 1)
-    distance = np.where(seen, total / np.maximum(weight, 1), 1).reshape(side, side, side)
-    return _surface(distance, seen.reshape(side, side, side), corner, cell, name)
-
-
-def _add(
-    total: Float32,
-    weight: Float32,
-    sighting: Sighting,
-    corner: NDArray[np.float64],
-    cell: float,
-    side: int,
-) -> None:
-    """Add to the sum of distances in each cell, and to how often it was seen, what one frame says.
-
-    Distances are in the distance at which they are cut off.
-    """
-    frame = sighting.frame
-    height, width = frame.shape
-    pose = frame.camera_to_world
-    start = pose[:3, :3].T @ (corner - pose[:3, 3])
-    steps = (np.arange(side) * cell).astype(np.float32)
-    x, y, z = (_along(steps, pose[:3, axis], start[axis]) for axis in range(3))
-
-    before = z > 0
-    depth = np.where(before, z, 1)
-    column = np.floor(frame.intrinsics[0, 0] * x / depth + frame.intrinsics[0, 2]).astype(np.int32)
-    row = np.floor(frame.intrinsics[1, 1] * y / depth + frame.intrinsics[1, 2]).astype(np.int32)
-    inside = before & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    cells = np.flatnonzero(inside)
-    row = row[cells]
-    column = column[cells]
-
-    measured = frame.depth[row, column]
-    thing = sighting.mask[row, column]
-    gap = measured - z[cells]
-    noise = sighting.noise.at(measured) * measured**2
-    cut_off = np.maximum(CUT_OFF * cell, CUT_OFF * noise)
-    on_surface = thing & (gap > -cut_off)
-    empty = ~thing & (gap > 0)
-    said = (measured > 0) & (on_surface | empty)
-
-    distance = np.where(on_surface, np.minimum(gap / cut_off, 1), 1)
-    total[cells[said]] += distance[said]
-    weight[cells[said]] += 1
-
-
-def _along(steps: Float32, direction: NDArray[np.float64], start: float) -> Float32:
-    """Positions of all cells along one axis of the camera: linear in each of their indices."""
-    a, b, c = direction.astype(np.float32)
-    positions = (np.float32(start) + a * steps)[:, None, None] + (b * steps)[:, None] + c * steps
-    return positions.ravel()
-
-
-def _surface(
-    distance: Float32, seen: NDArray[np.bool_], corner: NDArray[np.float64], cell: float, name: str
-) -> Surface | None:
-    """The surface where the distance changes its sign, without small pieces; None if there is none."""
-    from skimage.measure import marching_cubes
-
-    if not (distance[seen] < 0).any():
-        return None
-    try:
-        vertices, faces, _, _ = marching_cubes(distance, 0.0, mask=seen)
-    except (ValueError, RuntimeError):  # the level is not reached, or nowhere among cells that were seen
+    seen = [_measured(sighting) for sighting in sightings]
+    points, normals, weights = (np.concatenate(parts) for parts in zip(*seen, strict=True))
+    if not len(points):
         return None
 
-    faces = _without_small_pieces(faces, len(vertices))
-    used, renumbered = np.unique(faces, return_inverse=True)
-    positions = corner + cell * vertices[used]
-    return Surface(
-        name, positions.astype(np.float32), renumbered.reshape(-1, 3).astype(np.int32)
-    )
+    cell = max(FINEST_CELL, radius / CELLS)
+    # The two sides of a thin wall lie in one cell: they are told apart by where they look.
+    side = np.abs(normals).argmax(1)
+    towards = 2 * side + (normals[np.arange(len(side)), side] > 0)
+    keys = np.column_stack([np.floor(points / cell).astype(np.int64), towards])
+    of_point = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
+
+    total = np.bincount(of_point, weights)
+    middle = np.stack([np.bincount(of_point, weights * axis) for axis in points.T], 1)
+    normal = np.stack([np.bincount(of_point, weights * axis) for axis in normals.T], 1)
+    length = np.linalg.norm(normal, axis=1)
+    kept = (total > FEW_SHARE * np.median(total)) & (length > 0)
+    if kept.sum() < FEWEST_SQUARES:
+        return None
+    middle = middle[kept] / total[kept, None]
+    return _squares(middle, normal[kept] / length[kept, None], SQUARE * cell, name)
 
 
-def _without_small_pieces(faces: NDArray[np.integer], count: int) -> NDArray[np.integer]:
-    """The faces of connected pieces that are no errors of single pixels."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+def _measured(sighting: Sighting) -> tuple[Float, Float, Float]:
+    """Points of the thing, (N, 3), their normals towards the camera, and how much they count."""
+    facets = sighting.facets
+    step = 1 + len(facets.rows) // MOST_POINTS
+    facets = facets.some(slice(None, None, step))
+    points = facets.points
+    normals = -facets.planes / np.linalg.norm(facets.planes, axis=1, keepdims=True)
+    cosine = -np.einsum("ni,ni->n", normals, points) / np.linalg.norm(points, axis=1)
 
-    edges = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    graph = coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count))
-    piece = connected_components(graph, directed=False)[1][faces[:, 0]]
-    sizes = np.bincount(piece)
-    return faces[sizes[piece] >= SMALL_PIECE * len(faces)]
+    pose = sighting.frame.camera_to_world
+    good = np.isfinite(points).all(1) & np.isfinite(normals).all(1) & (cosine > STEEPEST)
+    in_world = points[good] @ pose[:3, :3].T + pose[:3, 3]
+    return in_world, normals[good] @ pose[:3, :3].T, step * cosine[good]
+
+
+def _squares(middle: Float, normal: Float, half: float, name: str) -> Surface:
+    """A square across each normal, (N, 3), about each middle, (N, 3)."""
+    helper = np.eye(3)[np.abs(normal).argmin(1)]
+    along = np.cross(normal, helper)
+    along *= half / np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.cross(normal, along)
+
+    signs = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    corners = signs[:, :1] * along[:, None] + signs[:, 1:] * across[:, None]
+    vertices = (middle[:, None] + corners).reshape(-1, 3)
+    first = 4 * np.arange(len(middle))[:, None]
+    faces = np.concatenate([first + (0, 1, 2), first + (0, 2, 3)], 1).reshape(-1, 3)
+    return Surface(name, vertices.astype(np.float32), faces.astype(np.int32))

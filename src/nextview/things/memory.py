@@ -1,7 +1,6 @@
 """The memory of taught things: what each looks like, and how likely a view is given each."""
 
 import hashlib
-import logging
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
@@ -27,7 +26,6 @@ PICTURE = 64  # side of the picture of a thing, pixels
 LARGEST_RADIUS = 1e4  # of a thing, metres; nothing as large is looked at from around
 LARGEST_LOGIT = 700.0  # that a head can say: the exponential of more is no number
 Float = NDArray[np.floating]
-_log = logging.getLogger("nextview")
 
 
 @dataclass(frozen=True)
@@ -142,25 +140,21 @@ def read_memory(path: Path, sha256: str) -> Memory:
     """Read what ``Memory.save`` wrote.
 
     Raises:
-        ModelError: the file is missing, is not that of this hash, or one of its values makes no
-            sense.
+        ModelError: the file is missing, is not that of this hash, is of an earlier version that
+            knew no geometry, or one of its values makes no sense.
     """
     content = checked_bytes(path, sha256, "a memory")
     where = f"{path}: not a memory"
     arrays = arrays_in(content, _OF_VIEWS, where)
     stored = arrays_in(content, (), where, _OF_SURFACES)
+    if not stored:
+        raise ModelError(f"{path}: is of an earlier version; teach it again with nextview learn")
     missing = sorted(set(_OF_SURFACES) - set(stored))
-    if missing and stored:
+    if missing:
         raise ModelError(f"{where} (it holds no {missing[0]})")
 
     try:
-        if stored:
-            surfaces = StoredSurfaces(**stored)
-        else:
-            check_array("its radii", arrays["radii"], np.floating, (None,), finite=False)
-            surfaces = StoredSurfaces.of([None] * len(arrays["radii"]))
-            _log.warning("%s: holds no geometry; teach it again with nextview learn", path)
-        return Memory(**arrays, surfaces=surfaces)
+        return Memory(**arrays, surfaces=StoredSurfaces(**stored))
     except ModelError as error:
         raise ModelError(f"{where} ({error})") from None
 

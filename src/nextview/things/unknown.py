@@ -45,7 +45,7 @@ class KnownResiduals:
         Raises:
             ModelError: there is no residual for some number of views.
         """
-        logarithms = np.log(np.maximum(residuals, 0) + LEAST_RESIDUAL)
+        logarithms = _logarithms(residuals)
         mean = logarithms.mean()
         sums = np.bincount(things, logarithms - mean, count)
         typical = mean + sums / (np.bincount(things, minlength=count) + SHRINKAGE)
@@ -57,6 +57,38 @@ class KnownResiduals:
             here = np.sort(over[views == number]) if (views == number).any() else np.sort(over)
             excess.append(here)
         return cls(usual, tuple(excess))
+
+    def extended(
+        self,
+        carried: NDArray[np.integer],
+        things: NDArray[np.integer],
+        residuals: Float,
+        views: NDArray[np.integer],
+    ) -> "KnownResiduals":
+        """Add things, and leave what is known of the others as it is.
+
+        Args:
+            carried: number that each thing had before, -1 for a new one, (T,) int.
+            things: which thing each further residual is of, among these, (N,) int.
+            residuals: the further ones, (N,).
+            views: after how many views, (N,) int.
+
+        Returns:
+            The residuals of the T things. A new one that has none of its own has the mean of the
+            others.
+        """
+        known = np.log(self.usual + LEAST_RESIDUAL)
+        typical = np.append(known, known.mean())[carried]
+        logarithms = _logarithms(residuals)
+        for thing in np.flatnonzero(np.asarray(carried) < 0):
+            own = logarithms[things == thing] - known.mean()
+            typical[thing] += own.sum() / (len(own) + SHRINKAGE)
+
+        over = logarithms - typical[things]
+        excess = []
+        for number, before in enumerate(self.excess, 1):
+            excess.append(np.sort(np.concatenate([before, over[views == number]])))
+        return KnownResiduals(np.exp(typical) - LEAST_RESIDUAL, tuple(excess))
 
     def p_value(self, residual: float, thing: int, views: int) -> float:
         """Share of known things that are explained as badly.
@@ -74,3 +106,8 @@ class KnownResiduals:
         over = np.log(exceeded)
         as_bad = len(excess) - np.searchsorted(excess, over - 1e-12)
         return float((1 + as_bad) / (1 + len(excess)))
+
+
+def _logarithms(residuals: Float) -> Float:
+    """Logarithms of residuals; very small ones do not differ."""
+    return np.log(np.maximum(residuals, 0) + LEAST_RESIDUAL)
