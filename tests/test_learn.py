@@ -16,6 +16,7 @@ from nextview.data.predictions import Predictions
 from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh
+from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.learning.learn import learn
 from nextview.policies.base import EpisodeState
@@ -66,9 +67,12 @@ def test_the_explorer_shows_the_leading_things_as_they_were_taught(taught, scans
     assert f"as view {walk.next_view} would show them" in shown
     assert f"differ by {1 - rivals.alike[walk.next_view]:.2f}" in shown
     assert f"The two likeliest, as view {view} would show them" in preview_card(seen, walk)
-    bundled = nextview.load(models="ycb", threads=1).models.recogniser  # its meshes are not here
-    kept = bundled.memory.pictures[bundled.memory.thing[100]]
-    np.testing.assert_array_equal(remembered_picture(bundled, 100, 0, 0), kept)
+    bundled = nextview.load(models="ycb", threads=1).models.recogniser  # its meshes are not here, but their surfaces
+    thing = bundled.memory.thing[100]
+    surface = bundled.memory.surfaces.surface(thing, bundled.card.memory.things[thing].name)
+    standing = rotated(make_mesh(surface.vertices, surface.faces), bundled.memory.rotations[100].astype(float))
+    drawn = SimulatedCamera(standing, 64).observe(look_at_origin(np.radians(RINGS[1]), 2 * np.pi * 3 / AZIMUTHS))
+    np.testing.assert_array_equal(remembered_picture(bundled, 100, 1, 3), drawn.picture)
 
 
 def test_predictions_of_taught_things_replay_with_their_policy(tmp_path, taught, scans, capsys):

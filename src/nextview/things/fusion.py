@@ -87,5 +87,5 @@ def _squares(middle: Float, normal: Float, half: float, name: str) -> Surface:
     corners = signs[:, :1] * along[:, None] + signs[:, 1:] * across[:, None]
     vertices = (middle[:, None] + corners).reshape(-1, 3)
     first = 4 * np.arange(len(middle))[:, None]
-    faces = np.concatenate([first + (0, 1, 2), first + (0, 2, 3)], 1).reshape(-1, 3)
+    faces = (first + np.array([0, 1, 2, 0, 2, 3])).reshape(-1, 3)
     return Surface(name, vertices.astype(np.float32), faces.astype(np.int32))
