@@ -125,6 +125,21 @@ session = system.session(distance=0.6)
 depth, pose = arm.look()
 """,
     "docs/see_it.md": "import nextview",
+    "docs/your_objects.md": """
+from pathlib import Path
+
+import nextview
+
+if Path("mine").exists():  # what the first block has made
+    system = nextview.load(models="mine", unknown=0.02)
+    session = system.session(distance=0.5)
+    from nextview.sensing import Frame
+    from stand_ins import arm, intrinsics
+
+    depth, pose = arm.look()
+    session.update(Frame(depth, intrinsics, pose))
+    poses = session.poses
+""",
 }
 
 
@@ -321,7 +336,7 @@ PREPARED = {  # what a page takes as made before, by commands or pages that it n
         "nextview train map views.zarr runs/lem --epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4"
     ),
 }
-ALONE = ("docs/your_camera.md",)  # pages of which each Python block runs by itself: the session of one has ended in it
+ALONE = ("docs/your_camera.md", "docs/your_objects.md")  # pages of which each Python block runs by itself
 BESIDE = ("docs/your_objects.md",)  # pages whose Python blocks do again what their commands did: in a folder of its own
 STORES = (  # made once, for all pages
     "nextview render data/ModelNet10 views.zarr --workers 1",
