@@ -572,6 +572,15 @@ def _support_shows(scene: Surroundings, origins: Float, rays: Float32) -> NDArra
     return (down > 0) & (height[:, None] > 0) & (away < scene.reach)
 
 
+def _displaced(images: _Images, prior: RegistrationPrior) -> Float:
+    """By how much each camera may see the thing displaced along each axis, (V,), metres.
+
+    As ``RegistrationPrior.displaced`` says of views that were taken.
+    """
+    away = np.linalg.norm(images.origins - images.centre, axis=1).astype(np.float64)
+    return np.hypot(prior.camera, prior.aim * away)
+
+
 def _pairs(count: int) -> tuple[Index, Index]:
     """Rows of all pairs of hypotheses, each once."""
     first, second = np.triu_indices(count, 1)
@@ -633,8 +642,11 @@ def _fitted(images: _Images, sensor: ExpectedSensor, prior: RegistrationPrior) -
     weights = (weights * np.minimum(1, prior.pixels / used)).astype(np.float32)
     thinned = np.stack([column[..., some] for column in columns], 2)
     weighted = thinned * weights[:, :, None]
-    held = np.diag([1 / prior.tilt**2] * 3 + [1 / prior.camera**2] * 3)
-    left = (weighted @ thinned.swapaxes(2, 3)).astype(np.float64) + held
+    held = np.zeros((len(images.origins), 1, 6))
+    held[..., :3] = 1 / prior.tilt**2
+    held[..., 3:] = 1 / _displaced(images, prior)[:, None, None] ** 2
+    left = (weighted @ thinned.swapaxes(2, 3)).astype(np.float64)
+    left += held[..., None] * np.eye(6)
     right = (weighted @ distance[..., None]).astype(np.float64)
     motion = np.linalg.solve(left, right)[..., 0].astype(np.float32)
 
@@ -717,14 +729,15 @@ class _Judged:
 
         away = np.linalg.norm(images.origins - images.centre, axis=1)
         metres = images.step.mean(1) * away
-        beside = beside * metres[:, None, None]
+        displaced = _displaced(images, prior).astype(np.float32)
+        beside = beside * (metres / displaced)[:, None, None]
         return cls(
             shows=shows,
             lost=np.where(shows, np.maximum(1 - images.cosine / GRAZING_COSINE, 0), 0),
             deviation=np.sqrt(_depth_variance(images, sensor, pixels)),
             hole=(pixels.hole * images.cosine).astype(np.float32),
             missing=(pixels.outlier * deep).astype(np.float32),
-            apart=1 - np.exp(-0.5 * (beside / np.float32(prior.camera)) ** 2),
+            apart=1 - np.exp(-0.5 * beside**2),
             behind=images.behind[:, None],
             area=size.prod(1)[:, None].astype(np.float64),
             enough=prior.pixels,
