@@ -68,7 +68,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"--scheduler": "needs the scheduler of the line before",
     r"^(ros2|rosdep|colcon|cp -r ros2|cd |source )": "needs ROS 2; tests/test_ros2.py tries the node with stand-ins",
     r"-m zipfile|efficientnet|resnet34-b627a593": "weights of others, which are fetched first",
-    r"research\.(film|real_things|touching_things|growth)": "needs the YCB scans, and minutes",
+    r"research\.(film|real_things|touching_things|growth)|verified_things": "needs the YCB scans, and minutes",
     r"research\.(train_grid|thing_features)": "trains for hours",
     r"research\.simulated_arm": "takes an hour; research/tests/test_arm.py has episodes of it",
     r"benchmarks/(render|replay|latency|session_latency)\.py": "measures time, on a quiet machine",
