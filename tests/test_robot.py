@@ -291,6 +291,14 @@ def test_a_distance_that_cannot_be_is_refused_once_the_radius_is_known(tiny, dis
     assert snapshot(session) == before
 
 
+def test_a_small_thing_may_be_looked_at_from_some_way_off(tiny):
+    die = box((0.02, 0.02, 0.02), (0, 0, 0.01))
+    session = begin(tiny, distance=0.7)
+    session.update(frame(pose_at(30, 30, 0.3, (0, 0, 0.01)), meshes=(TABLE, die)))
+    assert session.object.object_frame.radius < 0.03
+    assert np.linalg.norm(session.target[:3, 3] - session.object.object_frame.centre) == pytest.approx(0.7)
+
+
 def test_a_frame_that_comes_again_counts_once_and_moves_no_object(tiny):
     """Whatever pose is told with it. The camera is asked for the same view still, as nobody knows where it was."""
     first = frame(pose_at(20, 30, 0.7, (0, 0, 0.08)))

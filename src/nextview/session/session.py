@@ -42,8 +42,8 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 THING_SIZE = 1.3  # times that the size of a taught thing is off, half hidden say, which none has
-FARTHEST_TARGET = 20.0
-"""Object radii: a depth camera measures from some 0.25 m on, and few objects have a radius below 0.02 m."""
+FARTHEST_TARGET = 60.0
+"""Object radii: a camera looks at a thing of 0.01 m radius from 0.6 m; in millimetres it would be a thousand times."""
 CONTRADICTABLE = 3
 """Views before the last with whose geometry it is compared."""
 
@@ -408,7 +408,7 @@ class Session:
         Raises:
             SessionError: the episode has ended, or a session mixes frames and observations.
             ObservationError: the object is not found in the frame, or the image does not suit the networks.
-            UsageError: the session's ``distance`` is inside the object, or more than 20 object radii.
+            UsageError: the session's ``distance`` is inside the object, or more than 60 object radii.
             PolicyError: the policy failed.
         """
         with self._lock:
