@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Annotated, Any, Literal, get_type_hints
 
+import docstring_parser
 import tyro
 
 from nextview.cli.commands import Command
@@ -17,7 +18,6 @@ CONFIG = (
     tyro.conf.PositionalRequiredArgs,
 )
 PRESET = "which recipe the options of the recipe begin as"
-PARAMETER = re.compile(r" +(?:# (?P<above>.+)|(?P<name>\w+): .*?(?:  # (?P<beside>.+))?)")
 
 
 def find(path: str) -> Any:
@@ -44,12 +44,12 @@ def entry(
     function = find(command.function)
     signature = inspect.signature(function)
     hints = get_type_hints(function, include_extras=True)
-    comments = _comments(function)
+    about, helps = _described(function)
     parameters = []
     for parameter in signature.parameters.values():
         kind = hints[parameter.name]
-        if parameter.name in comments:
-            kind = Annotated[kind, tyro.conf.arg(help=comments[parameter.name])]
+        if parameter.name in helps:
+            kind = Annotated[kind, tyro.conf.arg(help=helps[parameter.name])]
         if parameter.name != "track":
             parameters.append(parameter.replace(annotation=kind))
     if command.thesis:
@@ -67,18 +67,25 @@ def entry(
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    text = inspect.cleandoc(function.__doc__ or "").replace("``", "")
-    run.__doc__ = re.sub(r"(?<=\S)\n(?: {8,})?(?=\S)", " ", text)  # a paragraph a line: tyro would keep where lines end
+    run.__doc__ = about
     return run, called
 
 
-def _comments(function: Callable[..., Any]) -> dict[str, str]:
-    """Help of parameters: the comment beside each, or the lines above it, as tyro reads it of the fields of a class."""
-    found, above = {}, []
-    for line in inspect.getsource(function).partition('"""')[0].splitlines()[1:]:
-        if match := PARAMETER.fullmatch(line):
-            if match["above"]:
-                above.append(match["above"])
-            else:
-                found[match["name"]], above = match["beside"] or " ".join(above), []
-    return found
+def _described(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
+    """Read the docstring of a function.
+
+    Args:
+        function: its docstring is in Google's style.
+
+    Returns:
+        What it does, a paragraph a line, as tyro would keep where lines end; and the help of each
+        parameter in its ``Args`` section.
+    """
+    parsed = docstring_parser.parse(function.__doc__ or "", docstring_parser.DocstringStyle.GOOGLE)
+    text = (parsed.description or "").replace("``", "")
+    about = re.sub(r"(?<=\S)\n *(?=\S)", " ", text)
+
+    helps = {}
+    for parameter in parsed.params:
+        helps[parameter.arg_name] = " ".join((parameter.description or "").split())
+    return about, helps
