@@ -1,6 +1,8 @@
-"""The main jobs in a base installation, on small inputs made here; each has to give the right result.
+"""The main jobs in a base installation, on small inputs made here; each has to give the right
+result.
 
-Run by ``.ci/base_installation`` in an empty working folder that holds copies of ``samples`` and ``examples``.
+Run by ``.ci/base_installation`` in an empty working folder that holds copies of ``samples`` and
+``examples``.
 """
 
 import json
@@ -16,7 +18,8 @@ import trimesh
 
 NEXTVIEW = str(Path(sys.executable).with_name("nextview"))
 EXTRAS = ("torch", "pandas", "gymnasium", "viser", "rerun", "distributed", "pytest", "skimage")
-OVER = {"rod": 90, "plate": 180, "angle": 90}  # degrees by which a thing is turned over: to a side on which it rests
+# degrees by which a thing is turned over: to a side on which it rests
+OVER = {"rod": 90, "plate": 180, "angle": 90}
 MATPLOTLIB = {".cache", ".cache/matplotlib", ".config", ".config/matplotlib"}
 
 
@@ -110,7 +113,9 @@ def stores_and_predictions() -> None:
     run("render", "shop", "views.zarr", "--size", 112, "--workers", 0)
     assert "3 objects are sound, 0 damaged" in run("check", "views.zarr", "--workers", 0)
     assert "3 objects" in run("predict", "views.zarr", "views.npz", "--workers", 0)
-    assert "all 40 1.000" in run("predict", "views.zarr", "views.npz", "--workers", 0, "--overwrite")
+    assert "all 40 1.000" in run(
+        "predict", "views.zarr", "views.npz", "--workers", 0, "--overwrite"
+    )
     assert "DAMAGED" not in run("list", "models")
     said = run("benchmark", "views.npz", "results", status=2)
     assert "pip install 'nextview[benchmark]'" in said

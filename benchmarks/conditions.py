@@ -1,12 +1,15 @@
-"""Recognise test objects under every condition: sensors, noise, holes, wrong object frames, pictures that lack a part.
+"""Recognise test objects under every condition: sensors, noise, holes, wrong object frames,
+pictures that lack a part.
 
-    python benchmarks/conditions.py DATASET/ModelNet10 [--objects 150] [--models OLD modelnet10] [--figure out.png]
+    python benchmarks/conditions.py DATASET/ModelNet10 [--objects 150] [--models OLD modelnet10]
+    [--figure out.png]
 
-"clean" is a render without a sensor. The next conditions are renders with one error each, of the strength that their
-name tells: depth noise and holes; a vertical that is wrong by 20 degrees, a centre by 0.15 radii, a radius by a
-quarter; a quarter of the object's width or height cut off; boxes that hide much of it. Then sensors. Every condition
-has the same objects, first views and draws. Prints, for each condition: the share of the object that no box hides in
-the first view, accuracy of the first view alone and at the end (95 % Wilson intervals), views, travel (cells), the
+"clean" is a render without a sensor. The next conditions are renders with one error each, of the
+strength that their name tells: depth noise and holes; a vertical that is wrong by 20 degrees, a
+centre by 0.15 radii, a radius by a quarter; a quarter of the object's width or height cut off;
+boxes that hide much of it. Then sensors. Every condition has the same objects, first views and
+draws. Prints, for each condition: the share of the object that no box hides in the first view,
+accuracy of the first view alone and at the end (95 % Wilson intervals), views, travel (cells), the
 calibration error of the last belief, and the share that is wrong at a belief of the threshold.
 """
 
@@ -35,7 +38,9 @@ from nextview.simulation.sensor import RENDER, sensor_named
 from nextview.simulation.simulated import SimulatedCamera
 
 BOXES = 15.5
-"""So many boxes on average leave about 57 % of an object visible; chosen on held-out training objects."""
+"""So many boxes on average leave about 57 % of an object visible; chosen on held-out training
+objects.
+"""
 
 
 class QuarterCut(SensedCamera):
@@ -55,13 +60,20 @@ class _Exactly:
         return high
 
 
-def wrong_frame(tilt: float = 0.0, centre: float = 0.0, size: float = 1.0) -> Callable[..., SensedCamera]:
-    """A camera that takes the object to lean by so many degrees, to be so many radii away and so much larger."""
+def wrong_frame(
+    tilt: float = 0.0, centre: float = 0.0, size: float = 1.0
+) -> Callable[..., SensedCamera]:
+    """A camera that takes the object to lean by so many degrees, to be so many radii away and so
+    much larger.
+    """
 
     def make(mesh: Mesh, rng: np.random.Generator, denoise: bool) -> SensedCamera:
-        camera, towards = SensedCamera(mesh, RENDER, rng, denoise), rng.normal(size=3)
+        camera = SensedCamera(mesh, RENDER, rng, denoise)
+        towards = rng.normal(size=3)
         about = rng.uniform(0, 2 * np.pi)
-        lean = Rotation.from_rotvec([tilt * np.cos(about), tilt * np.sin(about), 0], degrees=True).as_matrix()
+        lean = Rotation.from_rotvec(
+            [tilt * np.cos(about), tilt * np.sin(about), 0], degrees=True
+        ).as_matrix()
         off = centre * RENDER.radius * towards / np.linalg.norm(towards)
         camera.object_frame = ObjectFrame(off, size * RENDER.radius, lean)
         return camera
@@ -82,7 +94,9 @@ CONDITIONS: dict[str, Callable[..., Camera]] = {
     "tilt 20": wrong_frame(tilt=20),
     "centre 0.15": wrong_frame(centre=0.15),
     "radius 1.25": wrong_frame(size=1.25),
-    "quarter cut": lambda mesh, rng, denoise: QuarterCut(mesh, replace(RENDER, crop=0.25), rng, denoise),
+    "quarter cut": lambda mesh, rng, denoise: QuarterCut(
+        mesh, replace(RENDER, crop=0.25), rng, denoise
+    ),
     "boxes": through(boxes=BOXES),
 }
 NOISY = ("noise", "20 %", "kinect", "stereo", "wrist")
@@ -112,7 +126,15 @@ class Settings:
     dataset: tyro.conf.Positional[Path]
     objects: int = 150
     conditions: tuple[str, ...] = tuple(CONDITIONS)
-    sensors: tuple[str, ...] = ("kinect:1", "kinect:2", "stereo:1", "stereo:2", "setup:1", "wrist:1", "wrist:2")
+    sensors: tuple[str, ...] = (
+        "kinect:1",
+        "kinect:2",
+        "stereo:1",
+        "stereo:2",
+        "setup:1",
+        "wrist:1",
+        "wrist:2",
+    )
     models: tuple[str, ...] = ("modelnet10",)
     policy: str = "gain"
     threshold: float = 0.97
@@ -134,7 +156,9 @@ def rows_of(settings: Settings) -> Iterator[tuple[str, bool]]:
 
 @lru_cache(maxsize=4)
 def system_of(models: str, policy: str, threshold: float, max_views: int) -> System:
-    """A system, loaded once for each process; a folder of models with a policy of its own takes that."""
+    """A system, loaded once for each process; a folder of models with a policy of its own takes
+    that.
+    """
     own = Path(models) / f"{policy}.json"
     chosen = str(own) if own.exists() else policy
     return nextview.load(models, policy=chosen, threshold=threshold, max_views=max_views, threads=1)
@@ -148,18 +172,29 @@ def camera_of(name: str, mesh: Mesh, rng: np.random.Generator, denoise: bool) ->
 
 
 def episodes(settings: Settings, item: tuple[int, Entry]) -> list[list[tuple[float, ...]]]:
-    """First view right, last belief right, views, travel, confidence, visible share: by models and condition."""
+    """First view right, last belief right, views, travel, confidence, visible share: by models
+    and condition.
+    """
     i, entry = item
     mesh = load_mesh(entry.path)
     start = int(np.random.default_rng([settings.seed, i]).integers(40))
     found = []
     for models in settings.models:
-        system, rows = system_of(models, settings.policy, settings.threshold, settings.max_views), []
+        system = system_of(models, settings.policy, settings.threshold, settings.max_views)
+        rows = []
         for name, denoise in rows_of(settings):
             camera = camera_of(name, mesh, np.random.default_rng([settings.seed, i, 1]), denoise)
             result = system.recognise(camera, start)
-            first = system.classes[int(result.views[0].alone.argmax())] if result.views[0].observation.seen else ""
-            shown = camera.visible_share(system.sphere.poses[start]) if isinstance(camera, SensedCamera) else 1.0
+            first = (
+                system.classes[int(result.views[0].alone.argmax())]
+                if result.views[0].observation.seen
+                else ""
+            )
+            shown = (
+                camera.visible_share(system.sphere.poses[start])
+                if isinstance(camera, SensedCamera)
+                else 1.0
+            )
             right = first == entry.label, result.answer == entry.label
             rows.append((*right, len(result.views), result.travel, result.confidence, shown))
         found.append(rows)
@@ -196,34 +231,62 @@ def main(settings: Settings) -> None:
         sensor_named(text)  # says what is wrong with it
     entries = [e for e in list_dataset(settings.dataset) if e.split == settings.split]
     if settings.split == "train":
-        kept = set(system_of(settings.models[0], settings.policy, 0.97, 5).models.recogniser.card.held_out)
+        kept = set(
+            system_of(settings.models[0], settings.policy, 0.97, 5).models.recogniser.card.held_out
+        )
         entries = [e for e in entries if e.name in kept]
     entries = entries[:: max(1, len(entries) // settings.objects)][: settings.objects]
     found: list[list[list[tuple[float, ...]]]] = []
 
     def run() -> Iterator[int]:
-        for (_, entry), rows in each(partial(episodes, settings), list(enumerate(entries)), settings.workers):
+        for (_, entry), rows in each(
+            partial(episodes, settings), list(enumerate(entries)), settings.workers
+        ):
             if isinstance(rows, WorkerDied):
                 raise nextview.NextviewError(f"{entry.path}: cannot be recognised ({rows})")
             found.append(rows)
             yield len(found)
 
     track(run(), len(entries), "recognising")
-    print(f"{len(entries)} {settings.split} objects, policy {settings.policy}, threshold {settings.threshold}\n")
-    columns = "condition", "models", "frames", "visible", "first view", "accuracy", "views", "travel"
+    print(
+        f"{len(entries)} {settings.split} objects, policy {settings.policy}, threshold"
+        f" {settings.threshold}\n"
+    )
+    columns = (
+        "condition",
+        "models",
+        "frames",
+        "visible",
+        "first view",
+        "accuracy",
+        "views",
+        "travel",
+    )
     columns += "calibration error", "wrong and confident"
     print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
-    results, table = np.array(found, float), {}  # objects, models, conditions, numbers
+    # objects, models, conditions, numbers
+    results = np.array(found, float)
+    table = {}
     for j, (name, denoise) in enumerate(rows_of(settings)):
         for k, models in enumerate(settings.models):
             single, right, views, travel, belief, shown = results[:, k, j].T
             calibration = calibration_error(belief, right.astype(bool))
             sure = float(((belief >= settings.threshold) & (right == 0)).mean())
-            cells = [name, Path(models).name, "denoised" if denoise else "as it is", f"{shown.mean():.2f}"]
+            cells = [
+                name,
+                Path(models).name,
+                "denoised" if denoise else "as it is",
+                f"{shown.mean():.2f}",
+            ]
             for share in (single, right):
                 low, high = binomtest(int(share.sum()), len(share)).proportion_ci(method="wilson")
                 cells.append(f"{share.mean():.3f} ({low:.3f}-{high:.3f})")
-            cells += [f"{views.mean():.2f}", f"{travel.mean():.2f}", f"{calibration:.3f}", f"{sure:.3f}"]
+            cells += [
+                f"{views.mean():.2f}",
+                f"{travel.mean():.2f}",
+                f"{calibration:.3f}",
+                f"{sure:.3f}",
+            ]
             print(f"| {' | '.join(cells)} |")
             if denoise:
                 table.setdefault(models, {})[name] = float(right.mean()), float(low), float(high)

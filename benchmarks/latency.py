@@ -1,10 +1,12 @@
-"""How long the bundled networks take for one view, and how near that is to what the cores can multiply.
+"""How long the bundled networks take for one view, and how near that is to what the cores can
+multiply.
 
     python benchmarks/latency.py [--threads 2] [--models NAME-or-card ...]
 
-For each network: milliseconds a view (median and the 95th percentile over single views, ONNX Runtime), multiplications
-and additions of its convolutions and matrix products, and their rate as a share of the rate of a large matrix product
-in single precision, measured in the same run by ONNX Runtime on as many threads. Needs the train extra, for onnx.
+For each network: milliseconds a view (median and the 95th percentile over single views, ONNX
+Runtime), multiplications and additions of its convolutions and matrix products, and their rate as a
+share of the rate of a large matrix product in single precision, measured in the same run by ONNX
+Runtime on as many threads. Needs the train extra, for onnx.
 """
 
 from __future__ import annotations
@@ -32,7 +34,9 @@ SIDE = 2048
 
 
 def flops(card: ModelCard, shape: tuple[int, ...]) -> float:
-    """Multiplications and additions of one forward pass, an input of (1, ...), in convolutions and matrix products."""
+    """Multiplications and additions of one forward pass, an input of (1, ...), in convolutions
+    and matrix products.
+    """
     model = onnx.load(card.path)
     for size, dimension in zip(shape, model.graph.input[0].type.tensor_type.shape.dim, strict=True):
         dimension.Clear()
@@ -46,7 +50,9 @@ def flops(card: ModelCard, shape: tuple[int, ...]) -> float:
     total = 0
     for node in graph.node:
         if node.op_type == "Conv":
-            total += 2 * int(np.prod(known[node.output[0]])) * int(np.prod(known[node.input[1]][1:]))
+            total += (
+                2 * int(np.prod(known[node.output[0]])) * int(np.prod(known[node.input[1]][1:]))
+            )
         elif node.op_type in ("Gemm", "MatMul"):
             deep = known[node.input[0]][-1]
             total += 2 * int(np.prod(known[node.output[0]])) * deep
@@ -57,11 +63,15 @@ def matrix_product(threads: int) -> Callable[[], object]:
     """One product of two square matrices in single precision by ONNX Runtime."""
     pair = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [SIDE, SIDE]) for name in "ab"]
     out = helper.make_tensor_value_info("c", TensorProto.FLOAT, [SIDE, SIDE])
-    graph = helper.make_graph([helper.make_node("MatMul", ["a", "b"], ["c"])], "product", pair, [out])
+    graph = helper.make_graph(
+        [helper.make_node("MatMul", ["a", "b"], ["c"])], "product", pair, [out]
+    )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=8)
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
-    session = ort.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    session = ort.InferenceSession(
+        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+    )
     rng = np.random.default_rng(0)
     values = {name: rng.random((SIDE, SIDE), np.float32) for name in "ab"}
     return lambda: session.run(None, values)
@@ -89,10 +99,13 @@ def main(models: tuple[str, ...] = (), threads: int = 2, rounds: int = 200, seed
     """
     product = matrix_product(threads)
     rng = np.random.default_rng(seed)
-    print(f"{'':22}{'ms a view':>10}{'95 %':>8}{'MFLOP':>9}{'GFLOP/s':>9}{'of a matrix product':>21}")
+    print(
+        f"{'':22}{'ms a view':>10}{'95 %':>8}{'MFLOP':>9}{'GFLOP/s':>9}{'of a matrix product':>21}"
+    )
     for card in map(find_card, models or bundled_cards()):
         session = open_weights(card, threads)
-        sees, size = card.input.kind, card.input.size
+        sees = card.input.kind
+        size = card.input.size
         channels = session.get_inputs()[0].shape[1]
         seen: NDArray = rng.random((1, 1024, 3), np.float32)
         if sees != "cloud":
@@ -104,7 +117,10 @@ def main(models: tuple[str, ...] = (), threads: int = 2, rounds: int = 200, seed
         rate = work / np.median(took)
         share = f"{rate / limit:.2f} of {limit / 1e9:.0f}"
         milli = [1e3 * np.median(took), 1e3 * np.percentile(took, 95)]
-        print(f"{card.name:22}{milli[0]:10.2f}{milli[1]:8.2f}{work / 1e6:9.0f}{rate / 1e9:9.0f}{share:>21}")
+        print(
+            f"{card.name:22}{milli[0]:10.2f}{milli[1]:8.2f}{work / 1e6:9.0f}{rate / 1e9:9.0f}"
+            f"{share:>21}"
+        )
 
 
 if __name__ == "__main__":

@@ -17,9 +17,9 @@ on one side of the body:
 
 Bodies are scans of the folder YCB (metres) that are at least 6 cm in diameter and 4 cm in each
 direction, and models of ModelNet10 (split "test"), scaled to a diameter of 20 cm. Scans
-and models take turns, and so do the changes; bodies and places are drawn by the seed. A place is taken if
-the two things differ in 15 to 60 % of the 40 views, that is by more than 4 mm in 10 or more pixels
-of a picture of 64 x 64; so a view chosen at random often tells nothing.
+and models take turns, and so do the changes; bodies and places are drawn by the seed. A place is
+taken if the two things differ in 15 to 60 % of the 40 views, that is by more than 4 mm in 10 or
+more pixels of a picture of 64 x 64; so a view chosen at random often tells nothing.
 
 OUT receives two PLY files a pair, in metres, in one frame of reference, and ``pairs.csv``; the
 table of pairs is printed.
@@ -234,12 +234,16 @@ def telling_share(pair: Pair) -> float:
     radius = float(np.linalg.norm(both.vertices - centre, axis=1).max())
     first, second = (depth_pictures(mesh, centre, radius) for mesh in pair)
     with np.errstate(invalid="ignore"):
-        different = ~(np.abs(first - second) < DIFFERENT_DEPTH) & (np.isfinite(first) | np.isfinite(second))
+        different = ~(np.abs(first - second) < DIFFERENT_DEPTH) & (
+            np.isfinite(first) | np.isfinite(second)
+        )
     return float((different.sum(1) >= DIFFERENT_PIXELS).mean())
 
 
 def body_of(path: Path, scan: bool) -> trimesh.Trimesh | None:
-    """The mesh of a file in metres, standing on z = 0; None if it is too small or too large a file."""
+    """The mesh of a file in metres, standing on z = 0; None if it is too small or too large a
+    file.
+    """
     try:
         mesh = load_mesh(path, unit="m")
     except MeshError:
@@ -307,8 +311,12 @@ def make_pairs(scans: list[Path], models: list[Path], count: int, seed: int) -> 
     return made
 
 
-def _changed(body: trimesh.Trimesh, change: str, rng: np.random.Generator) -> tuple[Pair, float] | None:
-    """A pair of a body that differs in the wanted share of the views; None if no place was found."""
+def _changed(
+    body: trimesh.Trimesh, change: str, rng: np.random.Generator
+) -> tuple[Pair, float] | None:
+    """A pair of a body that differs in the wanted share of the views; None if no place was
+    found.
+    """
     for _ in range(PLACES_TRIED):
         place = place_on_side(body, rng)
         if place is None:
@@ -336,7 +344,9 @@ def draw(made: list[Made], path: Path) -> None:
         radius = float(np.linalg.norm(both.vertices - centre, axis=1).max())
         pictures = np.stack([depth_pictures(mesh, centre, radius) for mesh in pair.meshes])
         with np.errstate(invalid="ignore"):
-            different = ~(np.abs(pictures[0] - pictures[1]) < DIFFERENT_DEPTH) & np.isfinite(pictures).any(0)
+            different = ~(np.abs(pictures[0] - pictures[1]) < DIFFERENT_DEPTH) & np.isfinite(
+                pictures
+            ).any(0)
         view = int(different.sum(1).argmax())
         for which in (0, 1):
             image = pictures[which, view].reshape(PICTURE_SIDE, PICTURE_SIDE)

@@ -18,7 +18,8 @@ around the thing that hide parts of it.
 | pose | where they tell most of thing and pose |
 | ceiling | where they tell most if the truth and its pose are known beforehand |
 
-A policy of your own is MODULE:CLASS; it is given the viewpoints, and may need "joint" and "outlook".
+A policy of your own is MODULE:CLASS; it is given the viewpoints, and may need "joint" and
+"outlook".
 
 Every episode is a line of OUT/episodes.jsonl as soon as it is finished. A run that was stopped goes
 on where it was, and one with more policies, or more draws, adds what is missing. The tables are
@@ -101,7 +102,9 @@ class Setting:
 class Episode:
     """A thing that can be looked at from all viewpoints. What was computed once is kept."""
 
-    def __init__(self, things: TaughtThings, mesh: Mesh, thing: int, draw: int, setting: Setting) -> None:
+    def __init__(
+        self, things: TaughtThings, mesh: Mesh, thing: int, draw: int, setting: Setting
+    ) -> None:
         """Place the thing, its camera and what stands around it."""
         self.things = things
         self.thing = thing
@@ -179,7 +182,8 @@ class Episode:
         return self._verified[used]
 
     def pose_error(self, views: list[int]) -> float | None:
-        """Mean distance of the thing's surface where it is found from where it is (ADD-S), millimetres.
+        """Mean distance of the thing's surface where it is found from where it is (ADD-S),
+        millimetres.
 
         As the last view sees it. None where the thing is not named right.
         """
@@ -201,7 +205,8 @@ class Episode:
         surface = self.things.verifier.caster.surfaces[self.thing]
         points = surface.sample(POINTS, np.random.default_rng(0))
         there, here = (
-            points @ each[:3, :3].T + each[:3, 3] for each in (self._in_camera[last], np.linalg.inv(camera) @ pose)
+            points @ each[:3, :3].T + each[:3, 3]
+            for each in (self._in_camera[last], np.linalg.inv(camera) @ pose)
         )
         return float(1000 * cKDTree(there).query(here)[0].mean())
 
@@ -309,7 +314,9 @@ def run(episode: Episode, policy: Policy, count: int, rng: np.random.Generator) 
         made.views.append(view)
 
 
-def policies_of(names: tuple[str, ...], things: TaughtThings) -> dict[str, Callable[[Episode], Policy]]:
+def policies_of(
+    names: tuple[str, ...], things: TaughtThings
+) -> dict[str, Callable[[Episode], Policy]]:
     """Policies by name, each made for an episode."""
     card = things.recogniser.card.card_path
     picture = Discriminate.from_card(card, SPHERE) if "picture" in names else None
@@ -365,7 +372,9 @@ class Results:
     def read(cls, file: Path, pairs: bool) -> Results:
         """Read the lines of a run."""
         episodes = read_episodes(file)
-        policies = [name for name in episodes[0]["runs"] if all(name in e["runs"] for e in episodes)]
+        policies = [
+            name for name in episodes[0]["runs"] if all(name in e["runs"] for e in episodes)
+        ]
         names = sorted({episode["thing"] for episode in episodes})
         bodies = [name.partition("_")[0] if pairs else name for name in names]
         groups = np.unique(bodies, return_inverse=True)[1]
@@ -376,7 +385,12 @@ class Results:
         for policy in policies:
             rows: dict[str, list[NDArray]] = {}
             for name in names:
-                runs = [each for episode in episodes if episode["thing"] == name for each in episode["runs"][policy]]
+                runs = [
+                    each
+                    for episode in episodes
+                    if episode["thing"] == name
+                    for each in episode["runs"][policy]
+                ]
                 for key, value in _means(runs).items():
                     rows.setdefault(key, []).append(value)
                 decision[policy] += [x for each in runs for x in each["decision"]]
@@ -448,7 +462,11 @@ def tables(results: Results, episodes: int) -> str:
         accuracy = [f"{x:.3f}" for x in results.right[n].mean(0)]
         rest = [f"{x[n].mean():.3f}" for x in (results.until, results.sure, results.sure_and_wrong)]
         errors = [spread_of(results.pose_error[policy][:, k]) for k in range(1, count)]
-        lines.append(_row([policy, *accuracy, *rest, f"{results.travel[n, :, -1].mean():.2f}", *errors, spent]))
+        lines.append(
+            _row(
+                [policy, *accuracy, *rest, f"{results.travel[n, :, -1].mean():.2f}", *errors, spent]
+            )
+        )
     verification = 1000 * np.concatenate(list(results.verification.values()))
     lines += ["", f"verification of {count} views: {np.median(verification):.0f} ms (median)", ""]
 
@@ -457,12 +475,19 @@ def tables(results: Results, episodes: int) -> str:
         if policy == "random":
             continue
         for k in range(1, count):
-            tests.append((policy, f"after {k + 1}", results.difference(results.right[:, :, k], policy)))
+            tests.append(
+                (policy, f"after {k + 1}", results.difference(results.right[:, :, k], policy))
+            )
         tests.append((policy, "views until sure", results.difference(results.until, policy)))
     adjusted = holm(np.array([test[2][3] for test in tests]))
-    lines += [_row(["policy", "measure", "difference to random", "95 % interval", "p (Holm)"]), "|---" * 5 + "|"]
+    lines += [
+        _row(["policy", "measure", "difference to random", "95 % interval", "p (Holm)"]),
+        "|---" * 5 + "|",
+    ]
     for (policy, measure, (mean, low, high, _)), p in zip(tests, adjusted, strict=True):
-        lines.append(_row([policy, measure, f"{mean:+.3f}", f"{low:+.3f} to {high:+.3f}", f"{p:.4f}"]))
+        lines.append(
+            _row([policy, measure, f"{mean:+.3f}", f"{low:+.3f} to {high:+.3f}", f"{p:.4f}"])
+        )
     return "\n".join(lines)
 
 
@@ -477,7 +502,9 @@ def _row(cells: list[str]) -> str:
 
 
 def load_things(models: str, scans: Path) -> tuple[TaughtThings, list[Mesh]]:
-    """A memory's things of known geometry, and their scans; a memory without geometry takes it from the scans."""
+    """A memory's things of known geometry, and their scans; a memory without geometry takes it
+    from the scans.
+    """
     recogniser = TaughtRecogniser(models, threads=1)
     assert recogniser.card.memory is not None
     names = [thing.name for thing in recogniser.card.memory.things]
@@ -491,7 +518,9 @@ def load_things(models: str, scans: Path) -> tuple[TaughtThings, list[Mesh]]:
     meshes = [load_mesh(files[name], unit="m") for name in track(names, "scans")]
     if known is not None:
         return known, meshes
-    surfaces = [Surface.from_mesh(mesh, name).simplified() for mesh, name in zip(meshes, names, strict=True)]
+    surfaces = [
+        Surface.from_mesh(mesh, name).simplified() for mesh, name in zip(meshes, names, strict=True)
+    ]
     return TaughtThings(recogniser, surfaces), meshes
 
 

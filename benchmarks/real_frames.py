@@ -2,14 +2,16 @@
 
     python benchmarks/real_frames.py FOLDER SCANS [--models ycb]
 
-FOLDER holds frames: NAME.depth.png (uint16, millimetres), NAME.labels.png (uint8, what each pixel shows) and
-names.txt, a line a label, the first of what is none. No pose of the camera is known: up is the normal of the table.
-SCANS holds the scans of the things that the memory knows, in metres, by their names.
+FOLDER holds frames: NAME.depth.png (uint16, millimetres), NAME.labels.png (uint8, what each pixel
+shows) and names.txt, a line a label, the first of what is none. No pose of the camera is known: up
+is the normal of the table. SCANS holds the scans of the things that the memory knows, in metres, by
+their names.
 
-Each thing is given once by a point, the median of what its label shows, and once by its label as a mask. Printed are
-the answer by features and size alone and with the geometry, whether the thing is among the first three, the belief in
-the answer, its residual, and the intersection over union of the label with the outline of the posed scan (of the true
-thing, if it is among the hypotheses; what stands before it is not taken off). Labels of few pixels are left out.
+Each thing is given once by a point, the median of what its label shows, and once by its label as a
+mask. Printed are the answer by features and size alone and with the geometry, whether the thing is
+among the first three, the belief in the answer, its residual, and the intersection over union of
+the label with the outline of the posed scan (of the true thing, if it is among the hypotheses; what
+stands before it is not taken off). Labels of few pixels are left out.
 """
 
 import time
@@ -31,7 +33,8 @@ from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 from nextview.things.verifier import Verified
 
-INTRINSICS = (618.017, 618.003, 312.377, 232.375)  # of the camera of the PoseCNN demo: fx, fy, cx, cy
+# of the camera of the PoseCNN demo: fx, fy, cx, cy
+INTRINSICS = (618.017, 618.003, 312.377, 232.375)
 LEAST_PIXELS = 200  # of a label
 
 Mask = NDArray[np.bool_]
@@ -74,13 +77,17 @@ def memory_with_surfaces(models: str, scans: Path) -> TaughtThings:
     files = {path.stem: path for path in scans.iterdir() if path.is_file()}
     missing = [name for name in names if name not in files]
     if missing:
-        raise UsageError(f"{scans}: holds no scan of {missing[0]}, and of {len(missing) - 1} other things")
+        raise UsageError(
+            f"{scans}: holds no scan of {missing[0]}, and of {len(missing) - 1} other things"
+        )
 
     whole = [Surface.from_mesh(load_mesh(files[name], unit="m"), name) for name in names]
     return TaughtThings(recogniser, [surface.simplified() for surface in whole])
 
 
-def outline(things: TaughtThings, found: Verified, hypothesis: int, view: Observation, frame: Frame) -> Mask:
+def outline(
+    things: TaughtThings, found: Verified, hypothesis: int, view: Observation, frame: Frame
+) -> Mask:
     """The pixels of a frame in which the scan of a hypothesis shows."""
     assert view.scene is not None
     assert view.radius is not None
@@ -97,12 +104,18 @@ def outline(things: TaughtThings, found: Verified, hypothesis: int, view: Observ
 
     origin = (view.scene.pose[:3, 3] * view.radius - place) @ turn
     thing = found.things[hypothesis : hypothesis + 1]
-    depth, _ = caster.cast(thing, origin[None].astype(np.float32), (rays @ turn)[None].astype(np.float32))
+    depth, _ = caster.cast(
+        thing, origin[None].astype(np.float32), (rays @ turn)[None].astype(np.float32)
+    )
     return np.isfinite(depth[0]).reshape(frame.shape)
 
 
-def name_one(things: TaughtThings, name: str, label: Mask, frame: Frame, given: dict[str, Frame | str]) -> Named | None:
-    """Name the thing of a label, which is given by a point or by a mask; None where it is not found."""
+def name_one(
+    things: TaughtThings, name: str, label: Mask, frame: Frame, given: dict[str, Frame | str]
+) -> Named | None:
+    """Name the thing of a label, which is given by a point or by a mask; None where it is not
+    found.
+    """
     by = str(given["by"])
     shown = label & (frame.depth > 0)
     point = np.median(frame.positions(*np.nonzero(shown)), axis=0)
@@ -137,7 +150,9 @@ def name_one(things: TaughtThings, name: str, label: Mask, frame: Frame, given: 
     )
 
 
-def named_in(things: TaughtThings, path: Path, names: list[str], intrinsics: NDArray[np.float64]) -> Iterator[Named]:
+def named_in(
+    things: TaughtThings, path: Path, names: list[str], intrinsics: NDArray[np.float64]
+) -> Iterator[Named]:
     """All things of one frame, by a point and by a mask."""
     depth = np.asarray(Image.open(path))
     labels = np.asarray(Image.open(path.with_name(path.name.replace("depth", "labels"))))
@@ -147,7 +162,9 @@ def named_in(things: TaughtThings, path: Path, names: list[str], intrinsics: NDA
         if (label & (frame.depth > 0)).sum() < LEAST_PIXELS or name not in things.names:
             continue
         for by in ("point", "mask"):
-            found = name_one(things, name, label, frame, {"name": path.name.split(".")[0], "by": by})
+            found = name_one(
+                things, name, label, frame, {"name": path.name.split(".")[0], "by": by}
+            )
             if found is not None:
                 yield found
 
@@ -178,7 +195,10 @@ def main(
         for each in named_in(things, path, names, matrix):
             found.append(each)
             said = f"{each.by_features} | {each.answer} | {each.confidence:.2f}"
-            print(f"| {each.frame} | {each.thing} | {each.by} | {said} | {each.residual:.2f} | {each.overlap:.2f} |")
+            print(
+                f"| {each.frame} | {each.thing} | {each.by} | {said} | {each.residual:.2f} |"
+                f" {each.overlap:.2f} |"
+            )
 
     print()
     for by in ("point", "mask"):
@@ -189,8 +209,9 @@ def main(
         overlap = np.mean([each.overlap for each in some])
         slowest = 1000 * max(each.seconds for each in some)
         print(
-            f"by {by}: of {len(some)} things {features} named right by features, {right} with the geometry, {three} "
-            f"among the first three; mean overlap {overlap:.2f}; at most {slowest:.0f} ms of CPU for the geometry"
+            f"by {by}: of {len(some)} things {features} named right by features, {right} with the"
+            f" geometry, {three} among the first three; mean overlap {overlap:.2f}; at most"
+            f" {slowest:.0f} ms of CPU for the geometry"
         )
 
 

@@ -1,4 +1,5 @@
-"""How long the benchmark's full grid takes by replay, how that grows, and what it would take with the networks.
+"""How long the benchmark's full grid takes by replay, how that grows, and what it would take with
+the networks.
 
     python benchmarks/replay.py [--predictions test.npz] [--meshes table.off desk.off ...]
 
@@ -35,7 +36,8 @@ TEN += ["oracle-valley", "true-lem", "true-lcm", "oracle-gain"]
 def made_up(objects: int, azimuths: int = 8, classes: int = 10) -> Predictions:
     rng = np.random.default_rng(0)
     sphere = ViewSphere((0.0, 18.0, 36.0, 54.0, 72.0), azimuths)
-    v, labels = len(sphere), np.arange(objects) % classes
+    v = len(sphere)
+    labels = np.arange(objects) % classes
     logits = rng.normal(size=(objects, v, classes)) + 2 * np.eye(classes)[labels][:, None]
     return Predictions(
         logits.astype(np.float32),
@@ -54,7 +56,9 @@ def made_up(objects: int, azimuths: int = 8, classes: int = 10) -> Predictions:
     )
 
 
-def run(source: Path | tuple[int, int], names: list[str] | None, max_views: int = 5) -> tuple[float, float, float, int]:
+def run(
+    source: Path | tuple[int, int], names: list[str] | None, max_views: int = 5
+) -> tuple[float, float, float, int]:
     """Seconds to load and replay, seconds to summarise, peak memory in GB, episodes."""
     predictions = Predictions.load(source) if isinstance(source, Path) else made_up(*source)
     began = time.perf_counter()
@@ -69,12 +73,15 @@ def run(source: Path | tuple[int, int], names: list[str] | None, max_views: int 
 
 
 def with_networks(meshes: list[Path], n_views: int = 40) -> float:
-    """Seconds a view with the simulated camera and the bundled networks, one view of a time, as live."""
+    """Seconds a view with the simulated camera and the bundled networks, one view of a time, as
+    live.
+    """
     from nextview.geometry.mesh import load_mesh
     from nextview.session.system import load
     from nextview.simulation.simulated import SimulatedCamera
 
-    models, sphere = load(policy="lem").models, ViewSphere.named("40")
+    models = load(policy="lem").models
+    sphere = ViewSphere.named("40")
     cameras = [SimulatedCamera(load_mesh(path), 224, sphere.distance) for path in meshes]
     models.evidence([cameras[0].observe(sphere.poses[0])])
     began = time.perf_counter()
@@ -110,14 +117,20 @@ def main(predictions: Path | None = None, meshes: list[Path] | None = None) -> N
     for what, case in cases:
         with ProcessPoolExecutor(1, get_context("spawn")) as pool:
             replayed, summarised, memory, episodes = pool.submit(run, *case).result()
-        print(f"| {what} | {replayed:.2f} | {summarised:.2f} | {memory:.2f} | {episodes:,} |", flush=True)
+        print(
+            f"| {what} | {replayed:.2f} | {summarised:.2f} | {memory:.2f} | {episodes:,} |",
+            flush=True,
+        )
     if meshes:
         observation = with_networks(meshes)
         table = Predictions.load(full) if isinstance(full, Path) else made_up(*full)
         grid = Grid(make_specs(table, 10, 0), 10, THRESHOLDS, 5, 0)
         list(run_grid(grid, TEN))
         n_views = sum(int(ends.n_views.sum()) for _, _, ends in grid.cells())
-        print(f"\nWith the networks: {1000 * observation:.1f} ms a view over {len(meshes)} meshes; {n_views:,} views")
+        print(
+            f"\nWith the networks: {1000 * observation:.1f} ms a view over {len(meshes)} meshes;"
+            f" {n_views:,} views"
+        )
         print(f"would take {observation * n_views / 3600:.1f} hours.")
 
 

@@ -2,7 +2,8 @@
 
     python benchmarks/reproduction.py predictions.npz docs/reproduction.md
 
-Every number and every verdict on the page is worked out here from the predictions; none is typed in.
+Every number and every verdict on the page is worked out here from the predictions; none is typed
+in.
 """
 
 from __future__ import annotations
@@ -56,7 +57,10 @@ class Compared(NamedTuple):
     p: float
 
     def __str__(self) -> str:
-        return f"{100 * self.difference:+.1f} ({100 * self.low:+.1f} to {100 * self.high:+.1f}, p {_p(self.p)})"
+        return (
+            f"{100 * self.difference:+.1f} ({100 * self.low:+.1f} to {100 * self.high:+.1f}, p"
+            f" {_p(self.p)})"
+        )
 
     @property
     def verdict(self) -> str:
@@ -73,7 +77,9 @@ def _p(p: float) -> str:
 def tests_of(tables: Tables, measure: str) -> dict[tuple[str, float], Compared]:
     rows = tables.tests[tables.tests["measure"] == measure]
     columns = ["policy", "threshold", "difference", "low", "high", "p_holm"]
-    return {(policy, t): Compared(*rest) for policy, t, *rest in rows[columns].to_numpy(object).tolist()}
+    return {
+        (policy, t): Compared(*rest) for policy, t, *rest in rows[columns].to_numpy(object).tolist()
+    }
 
 
 def page(predictions: Path, samples: int = 2000) -> str:
@@ -83,9 +89,14 @@ def page(predictions: Path, samples: int = 2000) -> str:
     list(run_grid(grid, default_entries(specs)))
     ran = {name for name, paths in grid.paths.items() if not paths.fixed}
     references = [name for name in (*BASELINES, "lem", "true-lem", "lcm") if name in ran]
-    tables = {name: summarise(grid, name, samples, np.random.default_rng([0, 1])) for name in references}
+    tables = {
+        name: summarise(grid, name, samples, np.random.default_rng([0, 1])) for name in references
+    }
     rows = (
-        tables["random"].summary[["policy", "threshold", "measure", "value", "low", "high"]].to_numpy(object).tolist()
+        tables["random"]
+        .summary[["policy", "threshold", "measure", "value", "low", "high"]]
+        .to_numpy(object)
+        .tolist()
     )
     value = {(p, None if t != t else t, m): (v, low, high) for p, t, m, v, low, high in rows}
     test = {name: tests_of(of, "accuracy") for name, of in tables.items()}
@@ -94,7 +105,11 @@ def page(predictions: Path, samples: int = 2000) -> str:
 
     def number(policy: str, threshold: float | None, measure: str, digits: int = 3) -> str:
         v, low, high = value[policy, threshold, measure]
-        return f"{v:.{digits}f} ({low:.{digits}f}-{high:.{digits}f})" if high > low else f"{v:.{digits}f}"
+        return (
+            f"{v:.{digits}f} ({low:.{digits}f}-{high:.{digits}f})"
+            if high > low
+            else f"{v:.{digits}f}"
+        )
 
     def named(classes: tuple[int, ...]) -> str:
         return ", ".join(table.classes[i] for i in classes) or "none"
@@ -102,19 +117,28 @@ def page(predictions: Path, samples: int = 2000) -> str:
     out = [
         "# What of the published comparison holds up",
         "",
-        f"{len(table)} objects, {len(table.classes)} classes, 10 first views each, at most 5 views; the same first "
-        "views for every policy and threshold. In brackets: 95 % bootstrap intervals over objects. p-values are of the "
-        "paired bootstrap, after one Holm correction over all that is compared with the same policy: every other one, "
-        "published, learned or oracle, at every threshold, as in `nextview benchmark`. Differences of accuracy are in "
-        "percentage points.",
+        (
+            f"{len(table)} objects, {len(table.classes)} classes, 10 first views each, at most 5"
+            " views; the same first views for every policy and threshold. In brackets: 95 %"
+            " bootstrap intervals over objects. p-values are of the paired bootstrap, after one"
+            " Holm correction over all that is compared with the same policy: every other one,"
+            " published, learned or oracle, at every threshold, as in `nextview benchmark`."
+            " Differences of accuracy are in percentage points."
+        ),
         "",
-        "`python benchmarks/reproduction.py predictions.npz docs/reproduction.md` makes this page, verdicts and all.",
-        f"The predictions (SHA-256 `{sha256_of(predictions)[:16]}...`) come from `nextview predict modelnet10.zarr "
-        "predictions.npz --split test`; models: "
-        + ", ".join(f"{kind} {name} (`{sha[:12]}...`)" for kind, (name, sha) in table.models.items())
-        + f". Valley classes: {named(specs.valley_classes('lem'))} (LEM), {named(specs.valley_classes('lcm'))} (LCM), "
-        "chosen on validation objects. Single views are right "
-        f"{100 * (table.logits.argmax(2) == table.labels[:, None]).mean():.1f} % of the time (published: 87.1 %).",
+        (
+            "`python benchmarks/reproduction.py predictions.npz docs/reproduction.md` makes this"
+            " page, verdicts and all."
+        ),
+        f"The predictions (SHA-256 `{sha256_of(predictions)[:16]}...`) come from `nextview predict"
+        " modelnet10.zarr predictions.npz --split test`; models: "
+        + ", ".join(
+            f"{kind} {name} (`{sha[:12]}...`)" for kind, (name, sha) in table.models.items()
+        )
+        + f". Valley classes: {named(specs.valley_classes('lem'))} (LEM),"
+        f" {named(specs.valley_classes('lcm'))} (LCM), chosen on validation objects. Single views"
+        f" are right {100 * (table.logits.argmax(2) == table.labels[:, None]).mean():.1f} % of"
+        " the time (published: 87.1 %).",
         "",
         "## In short",
         "",
@@ -122,22 +146,37 @@ def page(predictions: Path, samples: int = 2000) -> str:
     if nothing := nothing_differs(tables["random"], AT, "random"):
         out.append(f"- {nothing}")
     leaks: list[str] = []
-    for leak, honest in (("oracle-valley", "lem"), ("lcm-oracle-valley", "lcm"), ("true-oracle-valley", "true-lem")):
+    for leak, honest in (
+        ("oracle-valley", "lem"),
+        ("lcm-oracle-valley", "lcm"),
+        ("true-oracle-valley", "true-lem"),
+    ):
         if leak in ran and honest in test:
-            leaks.append(f"{leak} {test[honest][leak, AT].verdict} {honest}: {test[honest][leak, AT]}")
+            leaks.append(
+                f"{leak} {test[honest][leak, AT].verdict} {honest}: {test[honest][leak, AT]}"
+            )
     if leaks:
-        out.append(f"- **The leak**: what the true class changes (points, at {AT}): {'; '.join(leaks)}.")
+        out.append(
+            f"- **The leak**: what the true class changes (points, at {AT}): {'; '.join(leaks)}."
+        )
     baselines = (
-        f"{name} {test['random'][name, AT].verdict} random: {test['random'][name, AT]}" for name in BASELINES[1:]
+        f"{name} {test['random'][name, AT].verdict} random: {test['random'][name, AT]}"
+        for name in BASELINES[1:]
     )
     out.append(f"- **The baselines**: {'; '.join(baselines)}.")
     out += [
         "",
         "## At the published thresholds",
         "",
-        "`nextview benchmark predictions.npz results --uncalibrated`; `summary.csv`. Published: tables 5, 8 and 9.",
+        (
+            "`nextview benchmark predictions.npz results --uncalibrated`; `summary.csv`. Published:"
+            " tables 5, 8 and 9."
+        ),
         "",
-        "| policy | threshold | accuracy | published | class accuracy | published | travel of the moved | published |",
+        (
+            "| policy | threshold | accuracy | published | class accuracy | published | travel of"
+            " the moved | published |"
+        ),
         "|---|---|---|---|---|---|---|---|",
     ]
     for name in (*BASELINES, "oracle-valley", "lem", "lcm-oracle-valley", "lcm", "lcm-peak"):
@@ -146,7 +185,10 @@ def page(predictions: Path, samples: int = 2000) -> str:
             cells = []
             for measure, digits in (("accuracy", 3), ("class_accuracy", 3), ("travel_moved", 2)):
                 theirs = published(name, t, measure, table.classes)
-                cells += [number(name, t, measure, digits), "" if theirs is None else f"{theirs:.{digits}f}"]
+                cells += [
+                    number(name, t, measure, digits),
+                    "" if theirs is None else f"{theirs:.{digits}f}",
+                ]
             out.append(f"| {name} | {t} | " + " | ".join(cells) + " |")
     out += [
         "",
@@ -158,13 +200,26 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "|---|---|---|---|---|---|",
     ]
     for name in dict.fromkeys((*BASELINES, *lems)):
-        measures = ("accuracy", 3), ("clean_accuracy", 3), ("n_views", 2), ("travel_all", 2), ("arc_all", 2)
-        out.append(f"| {name} | " + " | ".join(number(name, AT, m, digits) for m, digits in measures) + " |")
+        measures = (
+            ("accuracy", 3),
+            ("clean_accuracy", 3),
+            ("n_views", 2),
+            ("travel_all", 2),
+            ("arc_all", 2),
+        )
+        out.append(
+            f"| {name} | "
+            + " | ".join(number(name, AT, m, digits) for m, digits in measures)
+            + " |"
+        )
     out += [
         "",
         f"## Accuracy against each baseline at threshold {AT}, points",
         "",
-        "`nextview benchmark predictions.npz results --uncalibrated --reference BASELINE`; `tests.csv`.",
+        (
+            "`nextview benchmark predictions.npz results --uncalibrated --reference BASELINE`;"
+            " `tests.csv`."
+        ),
         "",
         "| policy | what it knows | "
         + " | ".join(f"against {b}" for b in BASELINES)
@@ -183,13 +238,20 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "| policy | " + " | ".join(map(str, THRESHOLDS)) + " |",
         "|---" * (1 + len(THRESHOLDS)) + "|",
     ]
-    for name in (name for name in ("oracle-valley", "lem", "lcm", "gain", "oracle-gain") if name in lems):
-        out.append(f"| {name} | " + " | ".join(str(test["random"][name, t]) for t in THRESHOLDS) + " |")
+    for name in (
+        name for name in ("oracle-valley", "lem", "lcm", "gain", "oracle-gain") if name in lems
+    ):
+        out.append(
+            f"| {name} | " + " | ".join(str(test["random"][name, t]) for t in THRESHOLDS) + " |"
+        )
     out += [
         "",
         "## Fixed views",
         "",
-        "`summary.csv`, rows without a threshold. Published: tables 3 and 12, from a network for 40 classes.",
+        (
+            "`summary.csv`, rows without a threshold. Published: tables 3 and 12, from a network"
+            " for 40 classes."
+        ),
         "",
         "| views | accuracy | class accuracy | published | views |",
         "|---|---|---|---|---|",
@@ -198,13 +260,17 @@ def page(predictions: Path, samples: int = 2000) -> str:
         if paths.fixed:
             theirs = published(name, None, "class_accuracy", table.classes)
             out.append(
-                f"| {name} | {number(name, None, 'accuracy')} | {number(name, None, 'class_accuracy')} | "
-                f"{'' if theirs is None else f'{theirs:.3f}'} | {paths.views.shape[1]} |"
+                f"| {name} | {number(name, None, 'accuracy')} |"
+                f" {number(name, None, 'class_accuracy')} |"
+                f" {'' if theirs is None else f'{theirs:.3f}'} | {paths.views.shape[1]} |"
             )
+    duplicates = [n for n, c in zip(table.names, table.conflicting, strict=True) if c]
     out += [
         "",
-        f"Duplicates: {', '.join(n for n, c in zip(table.names, table.conflicting, strict=True) if c) or 'none'} "
-        "are the very meshes of objects with another label, in either split.",
+        (
+            f"Duplicates: {', '.join(duplicates) or 'none'}"
+            " are the very meshes of objects with another label, in either split."
+        ),
     ]
     if not {"lcm", "lcm-peak"} & ran:
         out += ["", "Not reproduced: the LCM from a predicted map; no such network is bundled."]

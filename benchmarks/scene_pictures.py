@@ -1,9 +1,10 @@
 """Draw a contact sheet of scenes: one object at three levels, seen from some of the 40 views.
 
-    python benchmarks/scene_pictures.py ModelNet10 docs/images/scenes.png [--target chair_0917 --seed 0]
+    python benchmarks/scene_pictures.py ModelNet10 docs/images/scenes.png [--target chair_0917
+    --seed 0]
 
-The target is orange, what stands around it grey, the table light. Above each picture is the share of the target that
-shows; a view to which no camera can be brought is crossed out.
+The target is orange, what stands around it grey, the table light. Above each picture is the share
+of the target that shows; a view to which no camera can be brought is crossed out.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ def picture(scene: Scene, pose: np.ndarray) -> np.ndarray:
     shade = headlight(depth, intrinsics)[..., None] / 255
     image = np.tile(np.array([0.98, 0.965, 0.94]), (SIZE, SIZE, 1))
     for which, colour in COLOURS.items():
-        image = np.where((owner == which)[..., None], np.array(colour) * (0.45 + 0.55 * shade), image)
+        image = np.where(
+            (owner == which)[..., None], np.array(colour) * (0.45 + 0.55 * shade), image
+        )
     return np.clip(image, 0, 1)
 
 
@@ -53,13 +56,20 @@ def main(
     seed: int = 0,
 ) -> None:
     """Draw it."""
-    files = {e.name: e.path.relative_to(dataset).as_posix() for e in list_dataset(dataset) if e.split == split}
+    files = {
+        e.name: e.path.relative_to(dataset).as_posix()
+        for e in list_dataset(dataset)
+        if e.split == split
+    }
     if target not in files:
         raise UsageError(f"{dataset}: no object of the split {split} is called {target}")
-    meshes, sphere = Meshes(dataset, tuple(sorted(files.values()))), ViewSphere.named("40")
+    meshes = Meshes(dataset, tuple(sorted(files.values())))
+    sphere = ViewSphere.named("40")
     with matplotlib.rc_context(STYLE | {"axes.grid": False}):
         figure = Figure((1.65 * len(VIEWS), 1.85 * len(LEVELS)))
-        axes = figure.subplots(len(LEVELS), len(VIEWS), gridspec_kw={"wspace": 0.04, "hspace": 0.16})
+        axes = figure.subplots(
+            len(LEVELS), len(VIEWS), gridspec_kw={"wspace": 0.04, "hspace": 0.16}
+        )
         for row, level in zip(axes, LEVELS, strict=True):
             layout = draw_scene(files[target], meshes, level, seed, f"{target}@{level}-0")
             scene = build_scene(layout, dataset)

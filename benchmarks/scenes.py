@@ -1,17 +1,19 @@
 """Choose and judge policies in scenes: objects among others, half hidden.
 
-    python benchmarks/scenes.py choose learning.npz [--policies random-all visibility@0 visible-gain@0]
-    python -m research.plan scenes.zarr volumetric    # of the store that scenes.npz was predicted from
-    python benchmarks/scenes.py judge scenes.npz ... --ours visible-gain [--policies ...] [--figure scenes_travel.png]
-    python benchmarks/scenes.py calibration scenes.npz ... --alone single-objects.npz ...
+    python benchmarks/scenes.py choose learning.npz [--policies random-all visibility@0
+    visible-gain@0] python -m research.plan scenes.zarr volumetric    # of the store that scenes.npz
+    was predicted from python benchmarks/scenes.py judge scenes.npz ... --ours visible-gain
+    [--policies ...] [--figure scenes_travel.png] python benchmarks/scenes.py calibration scenes.npz
+    ... --alone single-objects.npz ...
 
-``choose``: what policies reach on scenes for learning, classes weighted evenly: mean log-belief in the truth and
-accuracy after 2 to 5 views, as ``nextview train gain`` judges. ``judge``: by level accuracy and travel after 2, 3 and
-5 views, points over random, and those of ours over each rival, with 95 % bootstrap intervals over scenes and one Holm
-correction for all that is claimed; the share of what one step of foresight gains; as a figure, accuracy against travel
-in cells and in seconds of a robot that takes ``SECONDS`` for a view and ``TURN`` for a radian around the object.
-``calibration``: how far the belief after 1, 2, 3 and 5 random views can be trusted, by level and by how much of the
-target they show.
+``choose``: what policies reach on scenes for learning, classes weighted evenly: mean log-belief in
+the truth and accuracy after 2 to 5 views, as ``nextview train gain`` judges. ``judge``: by level
+accuracy and travel after 2, 3 and 5 views, points over random, and those of ours over each rival,
+with 95 % bootstrap intervals over scenes and one Holm correction for all that is claimed; the share
+of what one step of foresight gains; as a figure, accuracy against travel in cells and in seconds of
+a robot that takes ``SECONDS`` for a view and ``TURN`` for a radian around the object.
+``calibration``: how far the belief after 1, 2, 3 and 5 random views can be trusted, by level and by
+how much of the target they show.
 """
 
 from __future__ import annotations
@@ -53,12 +55,15 @@ RIVALS = ("random-all", "visibility", "volumetric", "gain")
 CEILINGS = ("true-visible_share-all", "oracle-gain-all")
 REFERENCE = "random-all"
 COUNTS = (2, 3, 5)
-SECONDS, TURN = 1.0, 2.0
+SECONDS = 1.0
+TURN = 2.0
 """Of a robot: for each view, and for a turn by a radian."""
 SURE = 0.9
 """Whoever is at least so sure and wrong is so confidently."""
 SHARES = (0.0, 0.1, 0.3, 0.6, 1.0)
-"""Ends of the bins of the mean share of the target that the views show; where nothing was seen yet, in none."""
+"""Ends of the bins of the mean share of the target that the views show; where nothing was seen
+yet, in none.
+"""
 LEAST = 10
 """Targets of which a row of the table tells."""
 COLOURS = ("#4a5560", "#d99000", "#0b5fa5", "#00805a", "#b5179e", "#d1495b", "#7a6fd0", "#38a0d9")
@@ -74,19 +79,27 @@ def choose(
     """Print what policies reach on scenes for learning."""
     p = Predictions.load(predictions).deduplicate()
     table = ReplayTable.select(p, np.arange(len(p)), np.random.default_rng(seed))
-    print(f"{len(p)} scenes; after 2 to {n_views} views: log-belief in the truth (mean), accuracy, travel (cells)")
+    print(
+        f"{len(p)} scenes; after 2 to {n_views} views: log-belief in the truth (mean), accuracy,"
+        " travel (cells)"
+    )
     for name in policies:
         policy = make_policy(name, p.sphere, (), p.classes)
         reached = [
-            follow(table, policy, n_views, kind, np.random.default_rng(seed)) for kind in ("log-belief", "right")
+            follow(table, policy, n_views, kind, np.random.default_rng(seed))
+            for kind in ("log-belief", "right")
         ]
         logs, right = (", ".join(f"{x:.4f}" for x in value.mean) for value in reached)
-        print(f"{name:24}{logs} ({reached[0].mean.mean():.4f})   {right}   {reached[1].travel[-1]:.2f}")
+        print(
+            f"{name:24}{logs} ({reached[0].mean.mean():.4f})   {right}  "
+            f" {reached[1].travel[-1]:.2f}"
+        )
 
 
 @dataclass(frozen=True)
 class Reached:
-    """What a policy reaches in scenes of one level after 1 to K views, means over the first views of each scene.
+    """What a policy reaches in scenes of one level after 1 to K views, means over the first views
+    of each scene.
 
     Attributes:
         right: how often its answer is right, (N, K).
@@ -101,12 +114,16 @@ class Reached:
 
 def reached_in(grid: Grid, name: str) -> Reached:
     """That of all scenes of a grid, in their order."""
-    path, most = grid.paths[name], max(COUNTS)
-    last = np.minimum((path.views >= 0).sum(1)[:, None], np.arange(1, most + 1)) - 1  # some end before: no view is free
+    path = grid.paths[name]
+    most = max(COUNTS)
+    # some end before: no view is free
+    last = np.minimum((path.views >= 0).sum(1)[:, None], np.arange(1, most + 1)) - 1
     rows = np.arange(len(last))[:, None]
     right = path.answers[rows, last] == grid.specs.labels[:, None]
     travel = path.travel[rows, last], SECONDS * last + TURN * path.arc[rows, last]
-    return Reached(*(grid_mean(grid, np.asarray(values, np.float64)) for values in (right, *travel)))
+    return Reached(
+        *(grid_mean(grid, np.asarray(values, np.float64)) for values in (right, *travel))
+    )
 
 
 def judge(
@@ -128,7 +145,8 @@ def judge(
         ours: the policy that is tested.
         policies: that stand in the tables, with their points over random.
         rivals: those that ours is tested against.
-        known: predictions of scenes that were looked at before; those around the same targets are left out.
+        known: predictions of scenes that were looked at before; those around the same targets are
+            left out.
         figure: accuracy against travel, a picture.
         table: the comparisons, with p before and after the correction, as CSV.
         runs: first views of each scene.
@@ -140,19 +158,27 @@ def judge(
     looked_at = {name.rpartition("@")[0] for path in known for name in Predictions.load(path).names}
     for path in predictions:
         p = Predictions.load(path)
-        p = p.of_objects(np.flatnonzero([name.rpartition("@")[0] not in looked_at for name in p.names]))
+        p = p.of_objects(
+            np.flatnonzero([name.rpartition("@")[0] not in looked_at for name in p.names])
+        )
         grid = Grid(make_specs(p, runs, seed), runs, (1.0,), max(COUNTS), seed)
         track(run_grid(grid, names), len(names), f"going through {path.name}")
         for name, why in grid.failures.items():
             print(f"{name}: {why}")
         of = levels_of(p.names)
         for level, name in product(sorted({*of}), grid.paths):
-            mine, every = of == level, reached_in(grid, name)
+            mine = of == level
+            every = reached_in(grid, name)
             part = Reached(*(getattr(every, f.name)[mine] for f in fields(Reached)))
             found[level].setdefault(name, []).append(part)
     scenes = {
         level: {
-            name: Reached(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Reached)))
+            name: Reached(
+                *(
+                    np.concatenate([getattr(part, f.name) for part in parts])
+                    for f in fields(Reached)
+                )
+            )
             for name, parts in by_name.items()
         }
         for level, by_name in found.items()
@@ -167,9 +193,15 @@ def judge(
 
 
 def compared(
-    scenes: dict[str, dict[str, Reached]], ours: str, rivals: tuple[str, ...], samples: int, rng: np.random.Generator
+    scenes: dict[str, dict[str, Reached]],
+    ours: str,
+    rivals: tuple[str, ...],
+    samples: int,
+    rng: np.random.Generator,
 ) -> pd.DataFrame:
-    """All with random, and ours with its rivals: points and interval; of the latter p, and p after Holm."""
+    """All with random, and ours with its rivals: points and interval; of the latter p, and p
+    after Holm.
+    """
     rows = []
     for level, of in scenes.items():
         weights = resample(len(of[REFERENCE].right), samples, rng) / len(of[REFERENCE].right)
@@ -177,10 +209,16 @@ def compared(
         pairs += [(ours, rival) for rival in rivals if rival in of]
         for name, other in pairs:
             against = (of[name].right - of[other].right)[:, np.array(COUNTS) - 1]
-            mean, drawn = against.mean(0), weights @ against
+            mean = against.mean(0)
+            drawn = weights @ against
             p = bootstrap_p(mean, drawn) if name == ours else np.full(len(COUNTS), np.nan)
-            rows += [(level, name, other, *row) for row in zip(COUNTS, mean, *interval(drawn), p, strict=True)]
-    table = pd.DataFrame(rows, columns=["level", "policy", "other", "views", "points", "low", "high", "p"])
+            rows += [
+                (level, name, other, *row)
+                for row in zip(COUNTS, mean, *interval(drawn), p, strict=True)
+            ]
+    table = pd.DataFrame(
+        rows, columns=["level", "policy", "other", "views", "points", "low", "high", "p"]
+    )
     return table.assign(p_holm=holm(table["p"].to_numpy(np.float64)))
 
 
@@ -189,28 +227,50 @@ def show(scenes: dict[str, dict[str, Reached]], table: pd.DataFrame, ours: str) 
     print(f"{int(table['p'].notna().sum())} comparisons, one correction")
     for level, of in scenes.items():
         print(f"\n{level} clutter, {len(of[REFERENCE].right)} scenes\n")
-        print("| policy | against | " + " | ".join(f"after {k} (cells) | points (95 %), p" for k in COUNTS) + " |")
+        print(
+            "| policy | against | "
+            + " | ".join(f"after {k} (cells) | points (95 %), p" for k in COUNTS)
+            + " |"
+        )
         print("|---" * (2 + 2 * len(COUNTS)) + "|")
         known = {name: means(reached) for name, reached in of.items()}
-        print(f"| {REFERENCE} | | " + " | ".join(f"{known[REFERENCE][k]} | " for k in COUNTS) + " |")
-        for (name, other), rows in table[table["level"] == level].groupby(["policy", "other"], sort=False):
+        print(
+            f"| {REFERENCE} | | " + " | ".join(f"{known[REFERENCE][k]} | " for k in COUNTS) + " |"
+        )
+        for (name, other), rows in table[table["level"] == level].groupby(
+            ["policy", "other"], sort=False
+        ):
             cells = []
             for row in rows.itertuples():
                 points = f"{100 * row.points:+.1f} ({100 * row.low:+.1f} to {100 * row.high:+.1f})"
-                cells += [known[name][row.views], points + ("" if np.isnan(row.p_holm) else f", {row.p_holm:.2g}")]
+                cells += [
+                    known[name][row.views],
+                    points + ("" if np.isnan(row.p_holm) else f", {row.p_holm:.2g}"),
+                ]
             print(f"| {name} | {other} | " + " | ".join(cells) + " |")
         for k in COUNTS:
-            had, most = ((of[name].right - of[REFERENCE].right)[:, k - 1].mean() for name in (ours, CEILINGS[-1]))
-            print(f"\n{ours} after {k}: {had / most:.0%} of the {100 * most:.1f} points of one step of foresight")
+            had, most = (
+                (of[name].right - of[REFERENCE].right)[:, k - 1].mean()
+                for name in (ours, CEILINGS[-1])
+            )
+            print(
+                f"\n{ours} after {k}: {had / most:.0%} of the {100 * most:.1f} points of one step"
+                " of foresight"
+            )
 
 
 def means(reached: Reached) -> dict[int, str]:
     """Accuracy and travel after so many views."""
-    return {k: f"{reached.right[:, k - 1].mean():.3f} ({reached.cells[:, k - 1].mean():.2f})" for k in COUNTS}
+    return {
+        k: f"{reached.right[:, k - 1].mean():.3f} ({reached.cells[:, k - 1].mean():.2f})"
+        for k in COUNTS
+    }
 
 
 def draw(scenes: dict[str, dict[str, Reached]], out: Path) -> None:
-    """Accuracy after 1 to 5 views against the travel until then, in cells and in seconds, by level."""
+    """Accuracy after 1 to 5 views against the travel until then, in cells and in seconds, by
+    level.
+    """
     with matplotlib.rc_context(STYLE):
         figure = Figure((3.2 * len(scenes), 6.4), layout="constrained")
         axes = figure.subplots(2, len(scenes), sharey="col", squeeze=False)
@@ -218,11 +278,23 @@ def draw(scenes: dict[str, dict[str, Reached]], out: Path) -> None:
             shown = {name: reached for name, reached in of.items() if "@" not in name}
             followed = [name for name in shown if not is_oracle(name)]
             for name, reached in shown.items():
-                drawn = ("-", COLOURS[followed.index(name) % len(COLOURS)]) if name in followed else CEILING.get(name)
+                drawn = (
+                    ("-", COLOURS[followed.index(name) % len(COLOURS)])
+                    if name in followed
+                    else CEILING.get(name)
+                )
                 line, colour = drawn or ("-.", "#8a939b")
                 for axis, travel in zip(column, (reached.cells, reached.seconds), strict=True):
                     right = reached.right.mean(0)
-                    axis.plot(travel.mean(0), right, line, color=colour, marker="o", markersize=3, label=name)
+                    axis.plot(
+                        travel.mean(0),
+                        right,
+                        line,
+                        color=colour,
+                        marker="o",
+                        markersize=3,
+                        label=name,
+                    )
             column[0].set_title(f"{level} clutter", fontsize=10)
             column[0].set_xlabel("travel (cells)")
             column[1].set_xlabel("travel (s)")
@@ -235,8 +307,8 @@ def draw(scenes: dict[str, dict[str, Reached]], out: Path) -> None:
 
 @dataclass(frozen=True)
 class Believed:
-    """What is believed after 1 to K views of each of E walks: belief in the answer, whether it is right, and minus the
-    logarithm of the belief in the truth; (E, K) each."""
+    """What is believed after 1 to K views of each of E walks: belief in the answer, whether it is
+    right, and minus the logarithm of the belief in the truth; (E, K) each."""
 
     confidence: np.ndarray
     right: np.ndarray
@@ -246,10 +318,17 @@ class Believed:
     def of(cls, p: Predictions, rows: np.ndarray, views: np.ndarray) -> Believed:
         """Of walks through views, (E, K), around objects, (E,)."""
         weights = p.seen[rows[:, None], views]
-        total = (weights[..., None] * p.log_evidence[rows[:, None], views].astype(np.float64)).cumsum(1)
+        total = (
+            weights[..., None] * p.log_evidence[rows[:, None], views].astype(np.float64)
+        ).cumsum(1)
         logs = p.calibration.log_belief(total, np.maximum(weights.cumsum(1), 1), len(p.classes))
-        answers, labels = logs.argmax(-1), p.labels[rows]
-        sure = np.exp(np.stack([of_true_class(step, answer) for step, answer in zip(logs, answers, strict=True)]))
+        answers = logs.argmax(-1)
+        labels = p.labels[rows]
+        sure = np.exp(
+            np.stack(
+                [of_true_class(step, answer) for step, answer in zip(logs, answers, strict=True)]
+            )
+        )
         return cls(sure, answers == labels[:, None], -of_true_class(logs, labels))
 
 
@@ -265,13 +344,16 @@ def calibration(
     Args:
         predictions: of scenes.
         alone: of single objects, among them the targets of these scenes.
-        episodes: of random views that can be reached, of each scene; the same ones of the target alone.
+        episodes: of random views that can be reached, of each scene; the same ones of the target
+            alone.
         samples: of the bootstrap over targets.
         seed: of all that is random.
     """
-    singles, parts = [Predictions.load(path) for path in alone], []
+    singles = [Predictions.load(path) for path in alone]
+    parts = []
     for path in predictions:
-        p, rng = Predictions.load(path), np.random.default_rng(seed)
+        p = Predictions.load(path)
+        rng = np.random.default_rng(seed)
         scenes = scenes_of(p)
         if scenes is None:
             raise UsageError(f"{path}: holds single objects, no scenes")
@@ -281,23 +363,35 @@ def calibration(
         targets = np.array([name.partition("@")[0] for name in p.names])
         single = next((single for single in singles if {*targets} <= {*single.names}), None)
         if single is None:
-            raise UsageError(f"{path}: no predictions of single objects hold all targets of these scenes")
+            raise UsageError(
+                f"{path}: no predictions of single objects hold all targets of these scenes"
+            )
         same = np.array([single.names.index(name) for name in targets])[rows]
         share = np.stack([scenes.store.read("measures/visible_share", row) for row in scenes.rows])[
             rows[:, None], views
         ]
         nothing = ~p.seen[rows[:, None], views].cumsum(1).astype(bool)
         show = np.where(nothing, np.nan, share.cumsum(1) / np.arange(1, max(COUNTS) + 1))
-        ours, bare = Believed.of(p, rows, views), Believed.of(single, same, views)
-        parts.append((levels_of(p.names)[rows], targets[rows], show, *(vars(of) for of in (ours, bare))))
+        ours = Believed.of(p, rows, views)
+        bare = Believed.of(single, same, views)
+        parts.append(
+            (levels_of(p.names)[rows], targets[rows], show, *(vars(of) for of in (ours, bare)))
+        )
     level, target, show = (np.concatenate([part[i] for part in parts]) for i in range(3))
-    both = [Believed(*(np.concatenate([part[i][f.name] for part in parts]) for f in fields(Believed))) for i in (3, 4)]
-    print("| clutter | views | show | walks (targets) | accuracy, alone | surer than right, points (95 %), alone "
-          f"| calibration error, alone | log-loss, alone | at least {SURE} sure and wrong, alone |")  # fmt: skip
+    both = [
+        Believed(*(np.concatenate([part[i][f.name] for part in parts]) for f in fields(Believed)))
+        for i in (3, 4)
+    ]
+    print(
+        "| clutter | views | show | walks (targets) | accuracy, alone | surer than right, points"
+        f" (95 %), alone | calibration error, alone | log-loss, alone | at least {SURE} sure and"
+        " wrong, alone |"
+    )
     print("|---" * 9 + "|")
     rng = np.random.default_rng([seed, 1])
     for name, k in product((*(name for name in LEVELS if name in level), "any"), (1, *COUNTS)):
-        mine, share = (level == name) | (name == "any"), show[:, k - 1]
+        mine = (level == name) | (name == "any")
+        share = show[:, k - 1]
         kept = {"all": mine} | {
             f"{low:g} to {high:g}": mine & (share >= low) & (share < high + (high == 1))
             for low, high in pairwise(SHARES)
@@ -309,23 +403,38 @@ def calibration(
 
 
 def trusted(
-    both: list[Believed], here: np.ndarray, k: int, targets: np.ndarray, samples: int, rng: np.random.Generator
+    both: list[Believed],
+    here: np.ndarray,
+    k: int,
+    targets: np.ndarray,
+    samples: int,
+    rng: np.random.Generator,
 ) -> str:
-    """The cells of the table after k views of some walks; in each that of the targets alone stands behind."""
+    """The cells of the table after k views of some walks; in each that of the targets alone
+    stands behind.
+    """
     _, at = np.unique(targets, return_inverse=True)
-    weights, cells = resample(int(at.max()) + 1, samples, rng)[:, at], []
+    weights = resample(int(at.max()) + 1, samples, rng)[:, at]
+    cells = []
     for of in both:
         sure, right, loss = (getattr(of, f.name)[here, k - 1] for f in fields(of))
         gap = 100 * (sure - right)
         low, high = interval(((weights @ gap) / weights.sum(1))[:, None])
         sure_and_wrong = ((sure >= SURE) & ~right).mean()
-        cells.append((
-            f"{right.mean():.3f}", f"{gap.mean():+.1f} ({low[0]:+.1f} to {high[0]:+.1f})",
-            f"{calibration_error(sure, right):.3f}", f"{loss.mean():.3f}", f"{100 * sure_and_wrong:.1f} %",
-        ))  # fmt: skip
+        cells.append(
+            (
+                f"{right.mean():.3f}",
+                f"{gap.mean():+.1f} ({low[0]:+.1f} to {high[0]:+.1f})",
+                f"{calibration_error(sure, right):.3f}",
+                f"{loss.mean():.3f}",
+                f"{100 * sure_and_wrong:.1f} %",
+            )
+        )
     return " | ".join(map(", ".join, zip(*cells, strict=True)))
 
 
 if __name__ == "__main__":
     with orderly_end("run it again"):
-        tyro.extras.subcommand_cli_from_dict({"choose": choose, "judge": judge, "calibration": calibration})
+        tyro.extras.subcommand_cli_from_dict(
+            {"choose": choose, "judge": judge, "calibration": calibration}
+        )

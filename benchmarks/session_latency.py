@@ -1,13 +1,15 @@
-"""How long one update of a session takes, from a 640 x 480 frame on, and whether memory stays flat over many.
+"""How long one update of a session takes, from a 640 x 480 frame on, and whether memory stays flat
+over many.
 
     python benchmarks/session_latency.py [--updates 200] [--threads 2] [--cpu] [--threshold 1]
 
-A chair on a table, noise 1 mm, 3 % holes, from random places around it; sessions of up to five frames, one after the
-other, that never reach the threshold by default. The time of an update is until it is said where to look next, or, in
-the last one, what the object is. Prints the mean, the median and the 99th percentile of the milliseconds, in parts:
-finding the object in the frame (noise, support plane, cluster), its geometry (surface, object frame, images, of
-earlier frames too where the object frame got better), the networks, the policy, and the rest (checks). Then the same by
-the number of the frame in its session, and the resident memory after each tenth of the updates.
+A chair on a table, noise 1 mm, 3 % holes, from random places around it; sessions of up to five
+frames, one after the other, that never reach the threshold by default. The time of an update is
+until it is said where to look next, or, in the last one, what the object is. Prints the mean, the
+median and the 99th percentile of the milliseconds, in parts: finding the object in the frame
+(noise, support plane, cluster), its geometry (surface, object frame, images, of earlier frames too
+where the object frame got better), the networks, the policy, and the rest (checks). Then the same
+by the number of the frame in its session, and the resident memory after each tenth of the updates.
 """
 
 from __future__ import annotations
@@ -43,7 +45,9 @@ class Clock:
         self.spent: dict[str, float] = defaultdict(float)
 
     def timed(self, part: str, run: Callable[..., Any], within: str = "") -> Callable[..., Any]:
-        """A function that does the same and is timed; its time is taken from that of the part within which it runs."""
+        """A function that does the same and is timed; its time is taken from that of the part
+        within which it runs.
+        """
 
         def timed(*given: Any, **more: Any) -> Any:
             begun = self.now()
@@ -59,7 +63,8 @@ class Clock:
 
 
 def frames(rng: np.random.Generator) -> list[Frame]:
-    mesh, scene = sample_mesh("chair"), EmbreeScene()
+    mesh = sample_mesh("chair")
+    scene = EmbreeScene()
     vertices = 0.12 * mesh.vertices
     vertices[:, 2] -= vertices[:, 2].min()
     corners = np.array([[-0.7, -0.7, 0], [0.7, -0.7, 0], [0.7, 0.7, 0], [-0.7, 0.7, 0]], np.float32)
@@ -73,7 +78,9 @@ def frames(rng: np.random.Generator) -> list[Frame]:
         pose[2, 3] += 0.1
         origins = np.tile(pose[:3, 3].astype(np.float32), (len(rays), 1))
         hits = scene.run(origins, (rays @ pose[:3, :3].T).astype(np.float32), output=1)
-        depth = np.where(hits["primID"] >= 0, hits["tfar"], np.nan).reshape(SHAPE) + rng.normal(0, 0.001, SHAPE)
+        depth = np.where(hits["primID"] >= 0, hits["tfar"], np.nan).reshape(SHAPE) + rng.normal(
+            0, 0.001, SHAPE
+        )
         depth[rng.random(SHAPE) < 0.03] = np.nan
         found.append(Frame(depth, INTRINSICS, pose))
     return found
@@ -85,7 +92,9 @@ def resident() -> float:
     return int(status.split("VmRSS:")[1].split()[0]) / 1024
 
 
-def main(updates: int = 200, threads: int = 2, cpu: bool = False, seed: int = 0, threshold: float = 1.0) -> None:
+def main(
+    updates: int = 200, threads: int = 2, cpu: bool = False, seed: int = 0, threshold: float = 1.0
+) -> None:
     """Print the tables.
 
     Args:
@@ -95,15 +104,23 @@ def main(updates: int = 200, threads: int = 2, cpu: bool = False, seed: int = 0,
         seed: of the places and the noise.
         threshold: of the sessions; 0.97 is that of use.
     """
-    system, views = nextview.load(threshold=threshold, threads=threads), frames(np.random.default_rng(seed))
-    clock, taken, memory = Clock(time.process_time if cpu else time.perf_counter), [], []
+    system = nextview.load(threshold=threshold, threads=threads)
+    views = frames(np.random.default_rng(seed))
+    clock = Clock(time.process_time if cpu else time.perf_counter)
+    taken = []
+    memory = []
     # What is timed is wrapped here, so that the product itself knows nothing of it.
     for name in ("fit_facets", "enclose", "look_again"):
         within = "finding"
-        setattr(observed_object, name, clock.timed("geometry", getattr(observed_object, name), within))
-    observed_object.check_observation = clock.timed("rest", observed_object.check_observation, "finding")
+        setattr(
+            observed_object, name, clock.timed("geometry", getattr(observed_object, name), within)
+        )
+    observed_object.check_observation = clock.timed(
+        "rest", observed_object.check_observation, "finding"
+    )
     observed_object.check_views = clock.timed("rest", observed_object.check_views, "finding")
-    policy_type, models_type = type(system.policy), type(system.models)
+    policy_type = type(system.policy)
+    models_type = type(system.models)
     policy_type.scores = clock.timed("policy", policy_type.scores)  # type: ignore[attr-defined]
     ObservedObject.add = clock.timed("finding", ObservedObject.add)  # type: ignore[method-assign]
     models_type.evidence = clock.timed("networks", models_type.evidence)  # type: ignore[method-assign]
@@ -118,7 +135,8 @@ def main(updates: int = 200, threads: int = 2, cpu: bool = False, seed: int = 0,
             begun = clock.now()
             session.update(views[k % FRAMES])
             if session.done:
-                str(session.result)  # whether it is of a known class is asked for here, where not before
+                # whether it is of a known class is asked for here, where not before
+                str(session.result)
             took = clock.now() - begun
             clock.spent["rest"] += took - sum(clock.spent.values())
             if k >= 0:
@@ -127,13 +145,22 @@ def main(updates: int = 200, threads: int = 2, cpu: bool = False, seed: int = 0,
                     memory.append((k, resident()))
             k += 1
     table = np.array(taken)
-    numbers, times = table[:, 0], 1e3 * table[:, 1:]
-    print("mean: " + ", ".join(f"{name} {m:.1f}" for name, m in zip(("all", *PARTS), times.mean(0), strict=True)))
+    numbers = table[:, 0]
+    times = 1e3 * table[:, 1:]
+    print(
+        "mean: "
+        + ", ".join(
+            f"{name} {m:.1f}" for name, m in zip(("all", *PARTS), times.mean(0), strict=True)
+        )
+    )
     print(f"{'ms':16}{'updates':>8}" + "".join(f"{name:>18}" for name in ("all", *PARTS)))
     for label, rows in [("all", numbers > 0), *((f"frame {n}", numbers == n) for n in range(1, 6))]:
         if rows.any():
-            middle, high = np.median(times[rows], 0), np.percentile(times[rows], 99, axis=0)
-            cells = "".join(f"{f'{m:.1f} ({h:.1f})':>18}" for m, h in zip(middle, high, strict=True))
+            middle = np.median(times[rows], 0)
+            high = np.percentile(times[rows], 99, axis=0)
+            cells = "".join(
+                f"{f'{m:.1f} ({h:.1f})':>18}" for m, h in zip(middle, high, strict=True)
+            )
             print(f"{label:16}{int(rows.sum()):8}{cells}")
     print("median (99th percentile)")
     print("MiB after updates: " + ", ".join(f"{k}: {size:.0f}" for k, size in memory))

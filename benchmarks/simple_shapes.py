@@ -1,9 +1,12 @@
-"""What whole episodes say of simple shapes that nobody taught: ball, box, rod, can, cone, capsule, ring, slab.
+"""What whole episodes say of simple shapes that nobody taught: ball, box, rod, can, cone, capsule,
+ring, slab.
 
-    python benchmarks/simple_shapes.py                                         # 3, 6, 12 cm; the YCB models
-    python benchmarks/simple_shapes.py --models modelnet10 --radii 0.3 0.6     # the size of furniture
+    python benchmarks/simple_shapes.py                                         # 3, 6, 12 cm; the
+    YCB models python benchmarks/simple_shapes.py --models modelnet10 --radii 0.3 0.6     # the size
+    of furniture
 
-Each shape stands upright, turned at random, and is looked at through a sensor with all defaults, its size known.
+Each shape stands upright, turned at random, and is looked at through a sensor with all defaults,
+its size known.
 """
 
 import tempfile
@@ -65,7 +68,9 @@ def main(
             for done, (name, radius) in enumerate(asked, 1):
                 turn = rng.uniform(0, 2 * np.pi)
                 path = write_shape(Path(folder) / f"{name}.ply", name, radius, turn)
-                result = system.recognise(path, seed=int(rng.integers(2**32)), unit="m", sensor=sensor)
+                result = system.recognise(
+                    path, seed=int(rng.integers(2**32)), unit="m", sensor=sensor
+                )
                 found.setdefault((name, radius), []).append(result)
                 yield done
 
@@ -73,7 +78,9 @@ def main(
     print(table(found, radii))
 
 
-def table(found: dict[tuple[str, float], list[nextview.Recognition]], radii: tuple[float, ...]) -> str:
+def table(
+    found: dict[tuple[str, float], list[nextview.Recognition]], radii: tuple[float, ...]
+) -> str:
     """What was said, as text: names of confident answers in bold."""
     lines = [
         f"| shape | {' | '.join(f'{100 * radius:g} cm' for radius in radii)} |",

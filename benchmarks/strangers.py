@@ -1,15 +1,15 @@
 """Whole episodes with all defaults: how often objects are named, named right, and called unknown.
 
-    python benchmarks/strangers.py data/ModelNet10 --split test --draws 3 [--sensor wrist] [--aligned]
-    python benchmarks/strangers.py data/PSB --objects 300 --every-second
-    python benchmarks/strangers.py YCB --unit m [--models mine]
-    python benchmarks/strangers.py data/ModelNet10 --split test --objects 60 --around heavy
+    python benchmarks/strangers.py data/ModelNet10 --split test --draws 3 [--sensor wrist]
+    [--aligned] python benchmarks/strangers.py data/PSB --objects 300 --every-second python
+    benchmarks/strangers.py YCB --unit m [--models mine] python benchmarks/strangers.py
+    data/ModelNet10 --split test --objects 60 --around heavy
 
-Each object is turned about the vertical by a random angle, as real objects are, unless ``--aligned``
-leaves it as its file has it. An episode begins at a random view. With ``--around`` the object stands
-among others of the folder, in drawn scenes of a level of clutter. "Most like" also counts objects
-that were called unknown. ``--draws`` episodes are run with each object; each has its own angle, first
-view and sensor noise.
+Each object is turned about the vertical by a random angle, as real objects are, unless
+``--aligned`` leaves it as its file has it. An episode begins at a random view. With ``--around``
+the object stands among others of the folder, in drawn scenes of a level of clutter. "Most like"
+also counts objects that were called unknown. ``--draws`` episodes are run with each object; each
+has its own angle, first view and sensor noise.
 """
 
 from pathlib import Path
@@ -66,7 +66,9 @@ def main(
     chosen = np.sort(np.random.default_rng(seed).permutation(len(entries))[:objects])
     entries = [entries[i] for i in chosen]
 
-    def camera_before(entry: Entry, draw: int, rng: np.random.Generator) -> Camera | FrameCamera | None:
+    def camera_before(
+        entry: Entry, draw: int, rng: np.random.Generator
+    ) -> Camera | FrameCamera | None:
         if around is not None:
             scene = f"{entry.name}@{around}-{draw}"
             try:
@@ -83,7 +85,8 @@ def main(
         return SensedCamera(mesh, sensor, rng)
 
     # One row of outcomes for each object; each holds the means over its episodes.
-    rows, labels = [], []
+    rows = []
+    labels = []
 
     def work():
         for done, entry in enumerate(entries, 1):

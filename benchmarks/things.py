@@ -1,14 +1,17 @@
-"""Compare policies on taught things after fixed numbers of views, on all of them and on those that are confused most.
+"""Compare policies on taught things after fixed numbers of views, on all of them and on those that
+are confused most.
 
     nextview render THINGS shown.zarr --sensor wrist --rotated --seed 7
-    nextview render THINGS again.zarr --sensor wrist --rotated --seed 7 --noise-seed 1     # the same, with other errors
-    nextview predict shown.zarr shown.npz --models MINE; nextview predict again.zarr again.npz --models MINE
-    python benchmarks/things.py MINE/memory.json things shown.npz again.npz [--by-shape] [--policies MODULE:CLASS]
+    nextview render THINGS again.zarr --sensor wrist --rotated --seed 7 --noise-seed 1     # the
+    same, with other errors nextview predict shown.zarr shown.npz --models MINE; nextview predict
+    again.zarr again.npz --models MINE python benchmarks/things.py MINE/memory.json things shown.npz
+    again.npz [--by-shape] [--policies MODULE:CLASS]
 
-Each predictions file is a draw of the sensor's noise: all are judged. Writes things.md (the table) and things.csv
-(every number) into the folder. The bootstrap is over things, whose runs and draws belong together; p is McNemar's test
-over things, with one Holm correction. ``foresight`` sees what each view will say, its noise too. The fair ceiling
-knows the thing and its azimuth, but of the noise only other draws: it goes where these believe in the truth most.
+Each predictions file is a draw of the sensor's noise: all are judged. Writes things.md (the table)
+and things.csv (every number) into the folder. The bootstrap is over things, whose runs and draws
+belong together; p is McNemar's test over things, with one Holm correction. ``foresight`` sees what
+each view will say, its noise too. The fair ceiling knows the thing and its azimuth, but of the
+noise only other draws: it goes where these believe in the truth most.
 """
 
 from __future__ import annotations
@@ -38,21 +41,33 @@ if TYPE_CHECKING:
     import pandas as pd
 
 RIVALS = ("random-all", "spread", "furthest", "orbit-10")
-OWN, FORESIGHT, CEILING = "discriminate", "foresight", "fair ceiling"
-MOST, ENOUGH = 10, 0.95
+OWN = "discriminate"
+FORESIGHT = "foresight"
+CEILING = "fair ceiling"
+MOST = 10
+ENOUGH = 0.95
 """Views within which so many are to be right."""
-ROWS, SAMPLES = 64, 4000
-Float, Whole = NDArray[np.floating], NDArray[np.int64]
+ROWS = 64
+SAMPLES = 4000
+Float = NDArray[np.floating]
+Whole = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class FairCeiling:
-    """The view after which the true class is believed most, in the mean over other draws of the noise."""
+    """The view after which the true class is believed most, in the mean over other draws of the
+    noise.
+
+    Attributes:
+        log_evidence: (draws, things, V, D).
+        labels: of the things, (N,).
+        objects: draw * things + thing of each episode, (E,).
+    """
 
     sphere: ViewSphere
-    log_evidence: Float  # (draws, things, V, D)
-    labels: Whole  # of the things, (N,)
-    objects: Whole  # draw * things + thing of each episode, (E,)
+    log_evidence: Float
+    labels: Whole
+    objects: Whole
     classes: int
     calibration: Calibration
     needs: tuple[str, ...] = ()
@@ -60,12 +75,16 @@ class FairCeiling:
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Whole:
         """See ``Policy.next_views``."""
         rows = np.split(np.arange(len(state.current)), range(ROWS, len(state.current), ROWS))
-        return best_view(self.sphere, state, np.concatenate([self._worth(state, each) for each in rows]))
+        return best_view(
+            self.sphere, state, np.concatenate([self._worth(state, each) for each in rows])
+        )
 
     def _worth(self, state: EpisodeState, rows: NDArray[np.int64]) -> NDArray[np.float64]:
         """Mean logarithm of the belief in the truth after each view, (rows, V)."""
         draw, thing = np.divmod(self.objects[state.episodes[rows]], self.log_evidence.shape[1])
-        seen = np.matmul(state.visited[rows, None].astype(np.float32), self.log_evidence[draw, thing])
+        seen = np.matmul(
+            state.visited[rows, None].astype(np.float32), self.log_evidence[draw, thing]
+        )
         worth = np.zeros((len(rows), len(self.sphere)))
         for step in range(1, len(self.log_evidence)):
             other = self.log_evidence[(draw + step) % len(self.log_evidence), thing]
@@ -86,12 +105,15 @@ def together(draws: Sequence[Predictions]) -> Predictions:
 
 
 def margins(recogniser: TaughtRecogniser, by_shape: bool) -> NDArray[np.float64]:
-    """How clearly the memory's own held-out views, one at a time, name each class: the mean margin, (C,)."""
+    """How clearly the memory's own held-out views, one at a time, name each class: the mean
+    margin, (C,).
+    """
     memory = recogniser.memory
     k, f = memory.held_out.shape[1:]
     where = memory.held_out_views.reshape(-1, 2)
     evidence = recogniser.evidence(memory.held_out.reshape(-1, f).astype(np.float32), where[:, 0])
-    logits, size = evidence.logits, recogniser.card.size
+    logits = evidence.logits
+    size = recogniser.card.size
     if size is not None and not by_shape:
         logits = logits + size.logits(np.repeat(memory.radii, k))
     total = log_evidence_of(logits, evidence.azimuth_bins, where[:, 1])
@@ -108,24 +130,35 @@ def run(
 ) -> dict[str, Trajectories]:
     """Where each policy goes, by its name in the table; ``others`` are compared too."""
     specs = make_specs(together(draws), runs, seed)
-    p, n = specs.predictions, len(draws[0])
+    p = specs.predictions
+    n = len(draws[0])
     found = {name: replay(name, specs, MOST, seed) for name in dict.fromkeys((*RIVALS, *others))}
     found[OWN] = replay(str(card), specs, MOST, seed)
     found[FORESIGHT] = replay("oracle-gain-all", specs, most, seed)
     if len(draws) > 1:
         evidence = p.log_evidence.reshape(len(draws), n, len(p.sphere), -1)
-        policy = FairCeiling(p.sphere, evidence, p.labels[:n], specs.objects, len(p.classes), p.calibration)
-        found[CEILING] = replay_policy(CEILING, policy, specs, Stopping(1.0, most), np.random.default_rng(seed))
+        policy = FairCeiling(
+            p.sphere, evidence, p.labels[:n], specs.objects, len(p.classes), p.calibration
+        )
+        found[CEILING] = replay_policy(
+            CEILING, policy, specs, Stopping(1.0, most), np.random.default_rng(seed)
+        )
     return found
 
 
-def measured(paths: dict[str, Trajectories], labels: Whole, things: Whole, n_views: Sequence[int]) -> list[dict]:
-    """Numbers of some of the things: accuracy, travel, the lead over random, its p, and the share of the ceiling's."""
+def measured(
+    paths: dict[str, Trajectories], labels: Whole, things: Whole, n_views: Sequence[int]
+) -> list[dict]:
+    """Numbers of some of the things: accuracy, travel, the lead over random, its p, and the
+    share of the ceiling's.
+    """
     weights = resample(len(things), SAMPLES, np.random.default_rng(1))
     right: dict[tuple[str, int], NDArray[np.bool_]] = {}
     for name, path in paths.items():
         for k in range(1, (max(n_views) if name in (FORESIGHT, CEILING) else MOST) + 1):
-            answer = path.answers[np.arange(len(path.views)), np.minimum(k, (path.views >= 0).sum(1)) - 1]
+            answer = path.answers[
+                np.arange(len(path.views)), np.minimum(k, (path.views >= 0).sum(1)) - 1
+            ]
             right[name, k] = (answer.reshape(-1, len(labels)) == labels)[:, things]
     rows = []
     for (name, k), hits in right.items():
@@ -136,30 +169,57 @@ def measured(paths: dict[str, Trajectories], labels: Whole, things: Whole, n_vie
         ends = paths[name].travel[:, :k][:, -1].reshape(-1, len(labels))[:, things]
         tested = name not in (RIVALS[0], FORESIGHT, CEILING) and k in n_views and k > 1
         lead = each[:, 1].mean()
-        rows.append({
-            "policy": name, "n_views": k, "accuracy": hits.mean(), "low": low[0], "high": high[0], "lead": lead,
-            "travel": ends.mean(), "lead_low": low[1], "lead_high": high[1],
-            "p": mcnemar(hits, random) if tested else np.nan, "of_ceiling": lead / gap if gap > 0 and k > 1 else np.nan,
-        })  # fmt: skip
+        rows.append(
+            {
+                "policy": name,
+                "n_views": k,
+                "accuracy": hits.mean(),
+                "low": low[0],
+                "high": high[0],
+                "lead": lead,
+                "travel": ends.mean(),
+                "lead_low": low[1],
+                "lead_high": high[1],
+                "p": mcnemar(hits, random) if tested else np.nan,
+                "of_ceiling": lead / gap if gap > 0 and k > 1 else np.nan,
+            }
+        )
     return rows
 
 
 def markdown(table: pd.DataFrame, n_views: Sequence[int]) -> str:
     """The table as text."""
-    head = ["things", "policy", *(f"{k} view{'s' * (k > 1)}" for k in n_views), f"{ENOUGH:.0%} right"]
+    head = [
+        "things",
+        "policy",
+        *(f"{k} view{'s' * (k > 1)}" for k in n_views),
+        f"{ENOUGH:.0%} right",
+    ]
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for (things, name), rows in table.groupby(["things", "policy"], sort=False):
-        cells, by_views = [], rows.set_index("n_views")
+        cells = []
+        by_views = rows.set_index("n_views")
         for k in n_views:
             row = by_views.loc[k]
             cell = f"{row.accuracy:.3f} ({row.low:.3f}-{row.high:.3f})"
             if k > 1 and name != RIVALS[0]:
-                cell += f", {100 * row.lead:+.1f} ({100 * row.lead_low:+.1f} to {100 * row.lead_high:+.1f})"
+                cell += (
+                    f", {100 * row.lead:+.1f} ({100 * row.lead_low:+.1f} to"
+                    f" {100 * row.lead_high:+.1f})"
+                )
                 cell += "" if np.isnan(row.p_holm) else f", p {row.p_holm:.2g}"
-                cell += "" if np.isnan(row.of_ceiling) or name == CEILING else f", {row.of_ceiling:.0%}"
+                cell += (
+                    "" if np.isnan(row.of_ceiling) or name == CEILING else f", {row.of_ceiling:.0%}"
+                )
             cells.append(cell + (f", travel {row.travel:.1f}" if k > 1 else ""))
         enough = rows.n_views[rows.accuracy >= ENOUGH]
-        views = f"{enough.min()} views" if len(enough) else "-" if rows.n_views.max() < MOST else f"not after {MOST}"
+        views = (
+            f"{enough.min()} views"
+            if len(enough)
+            else "-"
+            if rows.n_views.max() < MOST
+            else f"not after {MOST}"
+        )
         lines.append(f"| {things} | {name} | {' | '.join(cells)} | {views} |")
     return "\n".join(lines) + "\n"
 
@@ -189,7 +249,9 @@ def main(
         import pandas as pd
 
     if not predictions:
-        raise UsageError("name at least one file of predictions, made by nextview predict with these models")
+        raise UsageError(
+            "name at least one file of predictions, made by nextview predict with these models"
+        )
     draws = [draw.by_shape() if by_shape else draw for draw in map(Predictions.load, predictions)]
     recogniser = TaughtRecogniser(card)
     if recogniser.classes != draws[0].classes:

@@ -5,10 +5,10 @@
 
 SCANS holds the scans of the things that the memory knows, in metres, by their names: they are what
 is looked at. Surfaces, weights and views are those of the memory. Each draw shows every thing once,
-with an azimuth, views and errors of the sensor of its own. The camera stands five object radii away,
-between 25 cm from the surface and 45 cm from the centre. Things stand as they were scanned, or with
-``--resting`` in any pose that they can rest in; with ``--clutter`` so many boxes stand around each,
-which hide parts of it.
+with an azimuth, views and errors of the sensor of its own. The camera stands five object radii
+away, between 25 cm from the surface and 45 cm from the centre. Things stand as they were scanned,
+or with ``--resting`` in any pose that they can rest in; with ``--clutter`` so many boxes stand
+around each, which hide parts of it.
 
 Prints after 1, 2, 3 and 5 random views: the share that is named right by features and size, and
 with the geometry; the expected calibration error (ten bins) and the share that is wrong with a
@@ -19,8 +19,8 @@ the definitions of the BOP toolkit), and the share in the right resting pose, or
 same; and the milliseconds that the verification takes, without the features.
 
 With ``--fit`` the weights that the draws call for are printed, with the loss that they are chosen
-by. With ``--known even`` or ``odd`` every other thing is taught and all are shown: the first half of
-the draws says which residuals are usual, the others are judged by a p-value of 0.02.
+by. With ``--known even`` or ``odd`` every other thing is taught and all are shown: the first half
+of the draws says which residuals are usual, the others are judged by a p-value of 0.02.
 """
 
 from __future__ import annotations
@@ -159,15 +159,20 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class Taught:
-    """The things of a memory with its geometry of them, and their scans, which are looked at."""
+    """The things of a memory with its geometry of them, and their scans, which are looked at.
+
+    Attributes:
+        orders: of the symmetry about the vertical; 0 for any azimuth.
+        weights: that the memory was fitted to.
+    """
 
     recogniser: TaughtRecogniser
     names: list[str]
     meshes: list[Mesh]
     surfaces: list[Surface]
     points: list[Float]
-    orders: list[int]  # of the symmetry about the vertical; 0 for any azimuth
-    weights: EvidenceWeights  # that the memory was fitted to
+    orders: list[int]
+    weights: EvidenceWeights
 
     @classmethod
     def load(cls, models: str, scans: Path) -> Taught:
@@ -175,12 +180,16 @@ class Taught:
         recogniser = TaughtRecogniser(models, threads=1)
         known = TaughtThings.of(recogniser)
         if known is None or len(known.names) < len(recogniser.memory.radii):
-            raise UsageError(f"{models}: does not know the geometry of all its things; teach it with --unit")
+            raise UsageError(
+                f"{models}: does not know the geometry of all its things; teach it with --unit"
+            )
         names = list(known.names)
         files = {path.stem: path for path in scans.iterdir() if path.is_file()}
         missing = [name for name in names if name not in files]
         if missing:
-            raise UsageError(f"{scans}: holds no scan of {missing[0]}, and of {len(missing) - 1} other things")
+            raise UsageError(
+                f"{scans}: holds no scan of {missing[0]}, and of {len(missing) - 1} other things"
+            )
 
         meshes = [load_mesh(files[name], unit="m") for name in names]
         whole = [Surface.from_mesh(mesh, name) for mesh, name in zip(meshes, names, strict=True)]
@@ -224,8 +233,12 @@ def shown(taught: Taught, things: TaughtThings, thing: int, draw: int, setting: 
     standing = rotated(mesh, turn)
     around = None
     if setting.clutter:
-        around = boxes_around(standing.vertices, setting.clutter, np.random.default_rng([thing, draw, 2]))
-    camera = SensedCamera(standing, setting.sensor, np.random.default_rng([thing, draw, 7]), around=around)
+        around = boxes_around(
+            standing.vertices, setting.clutter, np.random.default_rng([thing, draw, 2])
+        )
+    camera = SensedCamera(
+        standing, setting.sensor, np.random.default_rng([thing, draw, 7]), around=around
+    )
     observations = []
     cameras = []
     for view in rng.permutation(len(SPHERE)):
@@ -248,7 +261,9 @@ def shown(taught: Taught, things: TaughtThings, thing: int, draw: int, setting: 
     return Episode(thing, observations, evidence, to_object @ in_truth, in_cameras)
 
 
-def judged(things: TaughtThings, taught: Taught, some: NDArray[np.int64], episode: Episode, views: int) -> Outcome:
+def judged(
+    things: TaughtThings, taught: Taught, some: NDArray[np.int64], episode: Episode, views: int
+) -> Outcome:
     """Recognise the thing of an episode after some views, among some things."""
     begun = time.process_time()  # one thread; others on the machine do not count
     found = things.verify(episode.observations[:views], episode.log_evidence[:views])
@@ -344,7 +359,9 @@ def table(outcomes: Sequence[Outcome], views: Sequence[int]) -> Iterator[str]:
             f"{len(right) / len(some):.3f}",
             f"{calibration_error(some):.3f}",
             f"{wrong:.3f}",
-            f"{np.median(azimuths):.1f}, {np.quantile(azimuths, 0.95):.1f}" if len(azimuths) else "-",
+            f"{np.median(azimuths):.1f}, {np.quantile(azimuths, 0.95):.1f}"
+            if len(azimuths)
+            else "-",
             f"{np.median(places):.1f}, {np.quantile(places, 0.95):.1f}",
             f"{np.median(in_world):.1f}",
             f"{np.mean([o.add_s is not None and o.add_s < 0.1 for o in right]):.3f}",
@@ -358,11 +375,16 @@ def mistakes(taught: Taught, outcomes: Sequence[Outcome], views: Sequence[int]) 
     """What was taken for what."""
     for k in views:
         wrong = [o for o in outcomes if o.views == k and not o.right]
-        pairs = [f"{taught.names[o.thing]} for {taught.names[o.answer]} ({o.confidence:.2f})" for o in wrong]
+        pairs = [
+            f"{taught.names[o.thing]} for {taught.names[o.answer]} ({o.confidence:.2f})"
+            for o in wrong
+        ]
         yield f"after {k}: {', '.join(pairs) or 'none'}"
 
 
-def unknown_table(outcomes: Sequence[list[Outcome]], known: NDArray[np.int64], views: Sequence[int]) -> Iterator[str]:
+def unknown_table(
+    outcomes: Sequence[list[Outcome]], known: NDArray[np.int64], views: Sequence[int]
+) -> Iterator[str]:
     """How many of the things that were not taught, and of those that were, are called unknown."""
     fitted = [o for draw in outcomes[: len(outcomes) // 2] for o in draw if o.right]
     things = np.array([int(np.searchsorted(known, o.thing)) for o in fitted])

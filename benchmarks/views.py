@@ -1,10 +1,12 @@
-"""``nextview benchmark --views`` with a choice of policies and references of its own, and its figure.
+"""``nextview benchmark --views`` with a choice of policies and references of its own, and its
+figure.
 
-    python benchmarks/views.py test.npz views [--policies gain@0.01 ...] [--views 2 3 5] [--against lem ...]
+    python benchmarks/views.py test.npz views [--policies gain@0.01 ...] [--views 2 3 5] [--against
+    lem ...]
 
-Writes views.md (the table), views.csv (every number in a row of its own) and front.png (accuracy against travel) into
-the folder, and prints the table. The gap is that between random and oracle-gain, which sees what every view of the
-window would say.
+Writes views.md (the table), views.csv (every number in a row of its own) and front.png (accuracy
+against travel) into the folder, and prints the table. The gap is that between random and
+oracle-gain, which sees what every view of the window would say.
 """
 
 from __future__ import annotations
@@ -40,14 +42,29 @@ from nextview.errors import UsageError
 from nextview.session.style import GREY, STYLE, to_png
 
 POLICIES = (
-    "random", "random-all", "lem", "lcm-peak", "furthest", "spread", "fixed-sequence", "fixed-sequence-near",
-    "class-table", "gain@0", "gain", "gain@0.005", "gain@0.01", "gain@0.02", "gain@0.05", "oracle-gain",
-)  # fmt: skip
+    "random",
+    "random-all",
+    "lem",
+    "lcm-peak",
+    "furthest",
+    "spread",
+    "fixed-sequence",
+    "fixed-sequence-near",
+    "class-table",
+    "gain@0",
+    "gain",
+    "gain@0.005",
+    "gain@0.01",
+    "gain@0.02",
+    "gain@0.05",
+    "oracle-gain",
+)
 REFERENCES = ("random", "random-all")
 
 
 def families(names: Sequence[str], specs: EpisodeSpecs) -> dict[str, list[tuple[float, str]]]:
-    """The policies that were run at two travel weights or more: travel weight and full name of each, ascending.
+    """The policies that were run at two travel weights or more: travel weight and full name of
+    each, ascending.
 
     Where a policy's own travel weight was asked for by number too, it is the policy's.
     """
@@ -56,22 +73,30 @@ def families(names: Sequence[str], specs: EpisodeSpecs) -> dict[str, list[tuple[
         travel_weight = getattr(entry_policy(name, specs), "travel_weight", None)
         if travel_weight is not None:
             found.setdefault(name.partition("@")[0], {}).setdefault(travel_weight, name)
-    return {family: sorted(members.items()) for family, members in found.items() if len(members) > 1}
+    return {
+        family: sorted(members.items()) for family, members in found.items() if len(members) > 1
+    }
 
 
 def front(table: pd.DataFrame, travel_weights: dict[str, list[tuple[float, str]]]) -> Figure:
-    """Accuracy against travel, a panel for each number of views; what takes the truth is only named above it.
+    """Accuracy against travel, a panel for each number of views; what takes the truth is only named
+    above it.
 
-    A line joins the travel weights of one policy. Dots are filled where McNemar's p against random, corrected, is under
-    0.05.
+    A line joins the travel weights of one policy. Dots are filled where McNemar's p against random,
+    corrected, is under 0.05.
     """
-    found, n_views = by_key(table), table["n_views"].unique().tolist()
+    found = by_key(table)
+    n_views = table["n_views"].unique().tolist()
     at_prices = {name for members in travel_weights.values() for _, name in members}
     drawn = [name for name in table["policy"].unique() if not knows_truth(name)]
-    names = [name for name in drawn if name in at_prices or name.partition("@")[0] not in travel_weights]
+    names = [
+        name for name in drawn if name in at_prices or name.partition("@")[0] not in travel_weights
+    ]
     colour = {name: COLOURS.get(name, "#4a5560") for name in names}
     text_of = {name: Path(name).name for name in names}
-    for own, (family, members) in zip(OWN * len(travel_weights), travel_weights.items(), strict=False):
+    for own, (family, members) in zip(
+        OWN * len(travel_weights), travel_weights.items(), strict=False
+    ):
         for travel_weight, name in members:
             colour[name] = own
             text_of[name] = f"{Path(family).name if name == family else ''}@{travel_weight:g}"
@@ -83,35 +108,65 @@ def front(table: pd.DataFrame, travel_weights: dict[str, list[tuple[float, str]]
         panels = figure.subplots(1, len(n_views), sharey=True, squeeze=False)[0]
         lines = []
         for axes, k in zip(panels, n_views, strict=True):
-            place = {name: (found[name, k, "travel"][0], found[name, k, "accuracy"][0]) for name in names}
+            place = {
+                name: (found[name, k, "travel"][0], found[name, k, "accuracy"][0]) for name in names
+            }
             for members in travel_weights.values():
                 line = [place[name] for _, name in members]
-                axes.plot(*zip(*line, strict=True), color=colour[members[0][1]], linewidth=1.2, zorder=2)
+                axes.plot(
+                    *zip(*line, strict=True), color=colour[members[0][1]], linewidth=1.2, zorder=2
+                )
                 lines.append((axes, line))
             for name, (x, y) in place.items():
                 clear = found[name, k, "to_random"][4] < 0.05
-                axes.plot(x, y, "o", color=colour[name], markersize=5, zorder=3,
-                          markerfacecolor=colour[name] if clear else "white")  # fmt: skip
+                axes.plot(
+                    x,
+                    y,
+                    "o",
+                    color=colour[name],
+                    markersize=5,
+                    zorder=3,
+                    markerfacecolor=colour[name] if clear else "white",
+                )
             axes.margins(0.16, 0.1)
             axes.yaxis.set_major_locator(MaxNLocator(steps=[1, 2, 5, 10]))
             axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=1))
             axes.set_xlabel("mean travel, grid cells")
             above = [
-                f"{name}: {100 * found[name, k, 'accuracy'][0]:.1f} % for {found[name, k, 'travel'][0]:.1f} cells"
+                f"{name}: {100 * found[name, k, 'accuracy'][0]:.1f} % for"
+                f" {found[name, k, 'travel'][0]:.1f} cells"
                 for name in table["policy"].unique()
                 if knows_truth(name)
             ]
-            axes.set_title(f"{k} view{'s' * (k > 1)}", loc="left", fontweight="bold", fontsize=10, y=1.0,
-                           pad=8 + 11 * len(above))  # fmt: skip
-            axes.annotate("\n".join(above), (0, 1), xytext=(0, 5), xycoords="axes fraction",
-                          textcoords="offset points", fontsize=8, va="bottom")  # fmt: skip
+            axes.set_title(
+                f"{k} view{'s' * (k > 1)}",
+                loc="left",
+                fontweight="bold",
+                fontsize=10,
+                y=1.0,
+                pad=8 + 11 * len(above),
+            )
+            axes.annotate(
+                "\n".join(above),
+                (0, 1),
+                xytext=(0, 5),
+                xycoords="axes fraction",
+                textcoords="offset points",
+                fontsize=8,
+                va="bottom",
+            )
         panels[0].set_ylabel("accuracy")
-        filled = "filled: differs from random by McNemar's test, corrected for all comparisons (p < 0.05)"
+        filled = (
+            "filled: differs from random by McNemar's test, corrected for all comparisons (p <"
+            " 0.05)"
+        )
         figure.supxlabel(filled, fontsize=8, x=0.99, ha="right")
         figure.canvas.draw()  # settles where the points are
         figure.set_layout_engine("none")
         for axes, k in zip(panels, n_views, strict=True):
-            points = {name: (found[name, k, "travel"][0], found[name, k, "accuracy"][0]) for name in names}
+            points = {
+                name: (found[name, k, "travel"][0], found[name, k, "accuracy"][0]) for name in names
+            }
             label(axes, points, text_of, colour, [line for of, line in lines if of is axes])
     return figure
 
@@ -123,22 +178,34 @@ def label(
     colour: dict[str, str],
     lines: Sequence[Sequence[tuple[float, float]]],
 ) -> None:
-    """Write the name of each point beside it, where it covers no other name, no point and as little line as may be.
+    """Write the name of each point beside it, where it covers no other name, no point and as little
+    line as may be.
 
-    Each takes the best of the places round its point in turn, the most crowded point first; a name that has to stand
-    off is tied to its point by a thin line.
+    Each takes the best of the places round its point in turn, the most crowded point first; a name
+    that has to stand off is tied to its point by a thin line.
     """
     point = axes.figure.dpi / 72  # in pixels
     dots = {name: axes.transData.transform(at) for name, at in points.items()}
-    along = [np.linspace(a, b, 60) for line in lines for a, b in pairwise(axes.transData.transform(line))]
+    along = [
+        np.linspace(a, b, 60) for line in lines for a, b in pairwise(axes.transData.transform(line))
+    ]
     taken = [Bbox.from_extents(*(at - 3.5 * point), *(at + 3.5 * point)) for at in dots.values()]
-    inside, tied = axes.get_window_extent(), []
+    inside = axes.get_window_extent()
+    tied = []
     everyone = np.array(list(dots.values()))
     crowd = {name: np.sort(np.hypot(*(everyone - at).T))[:4].sum() for name, at in dots.items()}
     for name in sorted(dots, key=crowd.__getitem__):
         at = dots[name]
-        text = axes.annotate(text_of[name], points[name], xytext=(0, 0), textcoords="offset points", va="bottom",
-                             fontsize=7.5, color=colour[name], zorder=4)  # fmt: skip
+        text = axes.annotate(
+            text_of[name],
+            points[name],
+            xytext=(0, 0),
+            textcoords="offset points",
+            va="bottom",
+            fontsize=7.5,
+            color=colour[name],
+            zorder=4,
+        )
         size = np.array(text.get_window_extent().size)
         tries = []
         for far, angle in product((6, 11, 17, 25, 35, 47), np.radians(np.arange(0, 360, 15))):
@@ -148,7 +215,9 @@ def label(
             box = Bbox([centre - size / 2, centre + size / 2])
             bad = 40 * sum(_overlap(box, other) for other in taken)
             bad += 40 * (box.width * box.height - _overlap(box, inside))
-            bad += 300 * sum(map(box.count_contains, tied)) + 30 * sum(map(box.count_contains, along))
+            bad += 300 * sum(map(box.count_contains, tied)) + 30 * sum(
+                map(box.count_contains, along)
+            )
             if far > 11:
                 bad += 60 * sum(other.count_contains(tie[6:]) for other in taken)
             tries.append((bad + far * far + 20 * abs(np.sin(angle)), far, box, tie))
@@ -182,8 +251,8 @@ def main(
     Args:
         predictions: made by nextview predict.
         out: folder for views.md, views.csv and front.png.
-        policies: names, or MODULE:CLASS for your own, beside random, random-all and oracle-gain; by default a choice of
-            those that the predictions allow.
+        policies: names, or MODULE:CLASS for your own, beside random, random-all and oracle-gain; by
+            default a choice of those that the predictions allow.
         views: after how many the policies are compared.
         split: take only the objects of this one; needed where the predictions hold several.
         runs: random first views of each object.
@@ -195,7 +264,10 @@ def main(
     if split:
         table = table.of_split(split)
     elif len(set(table.splits)) > 1:
-        raise UsageError(f"{predictions}: holds training and test objects; choose with --split which are compared")
+        raise UsageError(
+            f"{predictions}: holds training and test objects; choose with --split which are"
+            " compared"
+        )
     if not views or not 1 <= min(views) <= max(views) <= len(table.sphere):
         raise UsageError(f"policies are compared after 1 to {len(table.sphere)} views, not {views}")
     specs = make_specs(table, runs, seed)
@@ -203,7 +275,11 @@ def main(
     names = list(dict.fromkeys([*REFERENCES, *against, *(policies or POLICIES), CEILING]))
     grid = Grid(specs, runs, (), max(views), seed)
     track(run_grid(grid, names), len(names), "replaying policies")
-    for name in [name for name, paths in grid.paths.items() if paths.views.shape[1] < max(views) and paths.fixed]:
+    for name in [
+        name
+        for name, paths in grid.paths.items()
+        if paths.views.shape[1] < max(views) and paths.fixed
+    ]:
         grid.failures[name] = f"{name} is over before view {max(views)}"
         del grid.paths[name]
     compared = [name for name in dict.fromkeys((REFERENCES[0], *against)) if name in grid.paths]

@@ -2,8 +2,9 @@
 
     python examples/arm_over_table.py samples/chair.off [--seed 0]
 
-Arm, camera and table are simulated; the object is made 24 cm across and put somewhere on the table. Replace ``Arm`` by
-yours: all that the session needs is ``look``, ``can_reach``, ``seconds`` and ``go_to``.
+Arm, camera and table are simulated; the object is made 24 cm across and put somewhere on the table.
+Replace ``Arm`` by yours: all that the session needs is ``look``, ``can_reach``, ``seconds`` and
+``go_to``.
 """
 
 from pathlib import Path
@@ -16,7 +17,9 @@ import nextview
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.sensing import Frame, ObservedObject
 
-BASE, REACH, CLEARANCE = np.array([-0.55, 0.0, 0.0]), 1.1, 0.08
+BASE = np.array([-0.55, 0.0, 0.0])
+REACH = 1.1
+CLEARANCE = 0.08
 """Where the arm stands, how far it reaches, and how near to the table it goes; metres."""
 
 
@@ -24,12 +27,16 @@ class Arm:
     """A simulated arm with a camera on its wrist."""
 
     def __init__(self, mesh, rng):
-        turn, where = rng.uniform(0, 2 * np.pi), rng.uniform(-0.1, 0.1, 2)
-        c, s = np.cos(turn), np.sin(turn)
+        turn = rng.uniform(0, 2 * np.pi)
+        where = rng.uniform(-0.1, 0.1, 2)
+        c = np.cos(turn)
+        s = np.sin(turn)
         vertices = 0.12 * mesh.vertices @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
         vertices += [*where, -vertices[:, 2].min()]
-        self.things, self.rng = [(vertices, mesh.faces), square(0.8), square(4.0, -0.75)], rng
-        self.pose = look_at_origin(np.radians(35), np.radians(160), 0.6)  # home: it looks at the middle of the table
+        self.things = [(vertices, mesh.faces), square(0.8), square(4.0, -0.75)]
+        self.rng = rng
+        # home: it looks at the middle of the table
+        self.pose = look_at_origin(np.radians(35), np.radians(160), 0.6)
         self.refused = 0
 
     def look(self):
@@ -53,8 +60,11 @@ class Arm:
 
 def recognise(arm: Arm) -> nextview.Recognition:
     """What a user writes."""
-    session = nextview.load(threshold=0.99).session(object=ObservedObject(life_size=False), distance=0.6)
-    session.reachable, session.travel_cost = arm.can_reach, arm.seconds
+    session = nextview.load(threshold=0.99).session(
+        object=ObservedObject(life_size=False), distance=0.6
+    )
+    session.reachable = arm.can_reach
+    session.travel_cost = arm.seconds
     depth, pose = arm.look()
     session.update(Frame(depth, INTRINSICS, pose))
     while not session.done:

@@ -2,8 +2,8 @@
 
     python examples/grasp_point.py
 
-A mug and a carton are taught from their scans. The mug then stands somewhere on a table, seen by a noisy depth camera,
-which is simulated here: on a robot, ``look`` gives its frames.
+A mug and a carton are taught from their scans. The mug then stands somewhere on a table, seen by a
+noisy depth camera, which is simulated here: on a robot, ``look`` gives its frames.
 """
 
 import tempfile
@@ -47,7 +47,9 @@ def teach(folder: Path) -> nextview.System:
 
 
 class Robot:
-    """A depth camera over a table on which the mug stands, in a pose that only the simulation knows."""
+    """A depth camera over a table on which the mug stands, in a pose that only the simulation
+    knows.
+    """
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
@@ -56,7 +58,9 @@ class Robot:
         self.true[:3, 3] = *rng.uniform(-0.3, 0.3, 2), 0.0
         things = [mug().apply_transform(self.true), trimesh.creation.box((1.5, 1.5, 0.04))]
         things[1].apply_translation((0, 0, -0.02))
-        self.caster = RayCaster([(thing.vertices, thing.faces.astype(np.int32)) for thing in things])
+        self.caster = RayCaster(
+            [(thing.vertices, thing.faces.astype(np.int32)) for thing in things]
+        )
 
     def first_pose(self) -> np.ndarray:
         """Where the camera stands before it is told where to go: it sees the mug."""

@@ -25,9 +25,13 @@ if TYPE_CHECKING:
 NEEDED = ("research", "mujoco", "mink", "gymnasium_robotics")
 
 
-def recognise(arm: Arm, looked=lambda session: None, threshold: float = 0.97) -> nextview.Recognition:
+def recognise(
+    arm: Arm, looked=lambda session: None, threshold: float = 0.97
+) -> nextview.Recognition:
     """What a user writes; ``arm.run`` is the loop of ``arm_over_table.py``."""
-    session = nextview.load(threshold=threshold).session(object=ObservedObject(life_size=False), distance=0.4)
+    session = nextview.load(threshold=threshold).session(
+        object=ObservedObject(life_size=False), distance=0.4
+    )
     return arm.run(session, lambda: looked(session))
 
 
@@ -40,7 +44,9 @@ def main(
 ) -> None:
     for package in NEEDED:
         if find_spec(package) is None:
-            raise MissingExtraError(f"{sys.argv[0]} needs the package {package}: pip install './research[arm]'")
+            raise MissingExtraError(
+                f"{sys.argv[0]} needs the package {package}: pip install './research[arm]'"
+            )
     from panda_film import Film
 
     from research.arm import Arm, first_joints

@@ -9,7 +9,8 @@ from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.viewsphere import look_at_origin
 from research.arm import along, seconds_of
 
-SIZE, SIDE = (440, 400), 200
+SIZE = (440, 400)
+SIDE = 200
 """Of the scene, and the width of what is shown beside it, pixels."""
 FINER = 1
 """Rays for a pixel, along each side."""
@@ -18,17 +19,23 @@ SLOWER = 3
 RATE = 10
 """Frames a second."""
 LIGHT = np.array([-0.5, -0.55, 0.67])
-BACKGROUND, GREY, ACCENT = (244, 245, 247), (90, 95, 105), (30, 110, 190)
+BACKGROUND = (244, 245, 247)
+GREY = (90, 95, 105)
+ACCENT = (30, 110, 190)
 
 
 class Film:
     """Frames of an arm; nothing is drawn without a file to write them to."""
 
     def __init__(self, arm, path):
-        self.arm, self.path, self.frames, self.filmed = arm, path, [], 0
+        self.arm = arm
+        self.path = path
+        self.frames = []
+        self.filmed = 0
         self.pose = look_at_origin(np.radians(24), np.radians(-52), 1.75)
         self.pose[:3, 3] += [0.28, 0.0, 0.3]
-        self.beside, self.seconds = None, 0.0
+        self.beside = None
+        self.seconds = 0.0
 
     def looked(self, session):
         """The way that the arm has come, and a still of what it believes now."""
@@ -58,13 +65,24 @@ class Film:
         if self.path is None:
             return
         palette = self.frames[-1].quantize(96)
-        frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in self.frames]
+        frames = [
+            frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in self.frames
+        ]
         frames += [frames[-1]] * (2 * RATE)
-        frames[0].save(self.path, save_all=True, append_images=frames[1:], duration=1000 // RATE, loop=0, optimize=True)
+        frames[0].save(
+            self.path,
+            save_all=True,
+            append_images=frames[1:],
+            duration=1000 // RATE,
+            loop=0,
+            optimize=True,
+        )
 
 
 def evenly(way, n):
-    """n places on a way and how much of it is done there, in step with time; the first one left out."""
+    """n places on a way and how much of it is done there, in step with time; the first one left
+    out.
+    """
     fine = along(way, 0.02)
     at = np.array([seconds_of(fine[: k + 1]) for k in range(len(fine))]) / seconds_of(fine)
     for done in np.linspace(0, 1, max(n, 1) + 1)[1:]:
@@ -74,10 +92,14 @@ def evenly(way, n):
 
 def scene(things, pose):
     """A picture of things, lit by a lamp that throws shadows."""
-    width, height = FINER * SIZE[0], FINER * SIZE[1]
-    x, y = np.meshgrid((np.arange(width) + 0.5) / width - 0.5, (np.arange(height) + 0.5 - height / 2) / width)
+    width = FINER * SIZE[0]
+    height = FINER * SIZE[1]
+    x, y = np.meshgrid(
+        (np.arange(width) + 0.5) / width - 0.5, (np.arange(height) + 0.5 - height / 2) / width
+    )
     rays = np.stack([x, y, np.full(x.shape, 1.0)], -1).reshape(-1, 3) @ pose[:3, :3].T
-    triangles, colours = [each for each, _ in things], np.array([colour for _, colour in things])
+    triangles = [each for each, _ in things]
+    colours = np.array([colour for _, colour in things])
     cast = embree_scene(triangles)
     hits = first_hits(cast, pose[:3, 3], rays)
     hit = hits["primID"] >= 0
@@ -89,25 +111,32 @@ def scene(things, pose):
     facing = np.abs((normals * rays[hit]).sum(1)) / np.linalg.norm(rays[hit], axis=1)
     picture = np.tile(np.array(BACKGROUND, float) / 255, (len(rays), 1))
     picture[hit] = colours[hits["geomID"][hit]] * (0.22 + 0.2 * facing + 0.55 * lit)[:, None]
-    image = Image.fromarray((255 * picture.clip(0, 1) + 0.5).astype(np.uint8).reshape(height, width, 3))
+    image = Image.fromarray(
+        (255 * picture.clip(0, 1) + 0.5).astype(np.uint8).reshape(height, width, 3)
+    )
     return image.resize(SIZE, Image.Resampling.BOX)
 
 
 def first_hits(cast, origins, rays):
-    """What Embree says of where rays, (N, 3), end first: primID (-1 for nothing), geomID, tfar, and normals Ng."""
+    """What Embree says of where rays, (N, 3), end first: primID (-1 for nothing), geomID, tfar,
+    and normals Ng.
+    """
     origins = np.ascontiguousarray(np.broadcast_to(origins, rays.shape), np.float32)
     return cast.run(origins, np.ascontiguousarray(rays, np.float32), output=1)
 
 
 def beside(session):
     """What the camera on the wrist saw last, and what is believed."""
-    view, depth = session.views[-1], session.object.sightings[-1].frame.depth
+    view = session.views[-1]
+    depth = session.object.sightings[-1].frame.depth
     panel = Image.new("RGB", (SIDE, SIZE[1]), BACKGROUND)
     text(panel, (8, 12), f"view {len(session.views)}: depth", 13)
     near = np.where(depth > 0, 1 - (depth - 0.2) / 0.8, 0).clip(0, 1)
     colours = (255 * matplotlib.colormaps["viridis"](near)[..., :3]).astype(np.uint8)
     colours[depth == 0] = 30
-    small = Image.fromarray(colours).resize((SIDE - 16, (SIDE - 16) * depth.shape[0] // depth.shape[1]))
+    small = Image.fromarray(colours).resize(
+        (SIDE - 16, (SIDE - 16) * depth.shape[0] // depth.shape[1])
+    )
     panel.paste(small, (8, 34))
     text(panel, (8, 152), "the object, found", 13)
     shaded = headlight(view.observation.depth, view.observation.intrinsics)
@@ -117,7 +146,9 @@ def beside(session):
     order = np.argsort(-view.belief)[:4]
     for row, k in enumerate(order):
         y = 306 + 21 * row
-        draw.rectangle((90, y + 2, 90 + 100 * float(view.belief[k]), y + 14), ACCENT if row == 0 else GREY)
+        draw.rectangle(
+            (90, y + 2, 90 + 100 * float(view.belief[k]), y + 14), ACCENT if row == 0 else GREY
+        )
         text(panel, (8, y), session.models.classes[k].replace("_", " "), 12)
     return panel
 

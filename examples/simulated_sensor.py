@@ -1,4 +1,7 @@
-"""A depth camera over simulated things, for the examples. With a real camera nothing of this is needed."""
+"""A depth camera over simulated things, for the examples.
+
+With a real camera nothing of this is needed.
+"""
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -9,12 +12,15 @@ SHAPE = 480, 640
 
 
 def look(things, pose, rng):
-    """Depth in metres, (480, 640), noise of 1 mm and 3 % holes, of things: pairs of vertices (metres) and faces."""
+    """Depth in metres, (480, 640), noise of 1 mm and 3 % holes, of things: pairs of vertices
+    (metres) and faces.
+    """
     scene = EmbreeScene()
     for vertices, faces in things:
         TriangleMesh(scene, np.asarray(vertices, np.float32), np.ascontiguousarray(faces, np.int32))
     row, column = np.indices(SHAPE)
-    x, y = (column - INTRINSICS[0, 2]) / INTRINSICS[0, 0], (row - INTRINSICS[1, 2]) / INTRINSICS[1, 1]
+    x = (column - INTRINSICS[0, 2]) / INTRINSICS[0, 0]
+    y = (row - INTRINSICS[1, 2]) / INTRINSICS[1, 1]
     rays = np.stack([x, y, np.ones(SHAPE)], -1).reshape(-1, 3) @ pose[:3, :3].T
     origins = np.tile(pose[:3, 3], (len(rays), 1))
     hits = scene.run(origins.astype(np.float32), rays.astype(np.float32), output=1)
@@ -26,7 +32,9 @@ def look(things, pose, rng):
 
 def square(half, height=0.0):
     """A level square about the z axis."""
-    corners = np.array([[-half, -half, height], [half, -half, height], [half, half, height], [-half, half, height]])
+    corners = np.array(
+        [[-half, -half, height], [half, -half, height], [half, half, height], [-half, half, height]]
+    )
     return corners, np.array([[0, 1, 2], [0, 2, 3]])
 
 

@@ -2,8 +2,9 @@
 
     python examples/turntable.py samples/monitor.off [--seed 0]
 
-Camera and turntable are simulated. The world is the plate's: when it turns by an angle, the camera goes round the
-object by the same angle the other way. What was not there when the plate was empty is the object.
+Camera and turntable are simulated. The world is the plate's: when it turns by an angle, the camera
+goes round the object by the same angle the other way. What was not there when the plate was empty
+is the object.
 """
 
 from pathlib import Path
@@ -16,8 +17,12 @@ import nextview
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.sensing import Frame, ObservedObject
 
-ELEVATION, DISTANCE, SPEED = 30.0, 0.7, 45.0
-"""Of the camera, degrees over the plate and metres from its middle; and of the plate, degrees a second."""
+ELEVATION = 30.0
+DISTANCE = 0.7
+SPEED = 45.0
+"""Of the camera, degrees over the plate and metres from its middle; and of the plate, degrees a
+second.
+"""
 
 
 class Turntable:
@@ -26,13 +31,17 @@ class Turntable:
     def __init__(self, mesh, rng):
         vertices = 0.12 * mesh.vertices
         vertices += [*rng.uniform(-0.02, 0.02, 2), -vertices[:, 2].min()]
-        self.thing, self.rng, self.angle = (vertices, mesh.faces), rng, rng.uniform(0, 360)
+        self.thing = (vertices, mesh.faces)
+        self.rng = rng
+        self.angle = rng.uniform(0, 360)
 
     def look(self, empty=False):
         """Depth, and where the camera is, seen from the plate."""
         pose = look_at_origin(np.radians(ELEVATION), np.radians(-self.angle), DISTANCE)
         pose[2, 3] += 0.08  # it aims a little over the plate
-        return look([disc(0.25), disc(9.0, -0.1), *([] if empty else [self.thing])], pose, self.rng), pose
+        return look(
+            [disc(0.25), disc(9.0, -0.1), *([] if empty else [self.thing])], pose, self.rng
+        ), pose
 
     def turn_to(self, angle):
         self.angle = angle
@@ -48,9 +57,12 @@ def seconds(here, there):
 
 def recognise(turntable: Turntable) -> nextview.Recognition:
     """What a user writes."""
-    empty = np.fmax(turntable.look(empty=True)[0], turntable.look(empty=True)[0])  # fills the holes of each other
+    # fills the holes of each other
+    empty = np.fmax(turntable.look(empty=True)[0], turntable.look(empty=True)[0])
     thing = ObservedObject(support=False, life_size=False)
-    session = nextview.load(viewpoints=f"rings:{ELEVATION}x24", threshold=0.99).session(object=thing, distance=DISTANCE)
+    session = nextview.load(viewpoints=f"rings:{ELEVATION}x24", threshold=0.99).session(
+        object=thing, distance=DISTANCE
+    )
     session.travel_cost = seconds
     while not session.done:
         depth, pose = turntable.look()

@@ -1,1 +1,3 @@
-"""Rival systems, agents, measures and studies that plug into nextview from outside, as a user's own code does."""
+"""Rival systems, agents, measures and studies that plug into nextview from outside, as a user's
+own code does.
+"""

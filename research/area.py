@@ -1,4 +1,6 @@
-"""Area measures: how much of the object is seen, and how evenly over its faces (thesis, section 3.4.1)."""
+"""Area measures: how much of the object is seen, and how evenly over its faces (thesis, section
+3.4.1).
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ def bits(shares: NDArray[np.floating]) -> float:
 def view_area(view: MeasuredView) -> float:
     """Share of the image that shows the object: its projected area.
 
-    Dutagaci et al. 2010 ("view area"), Secord et al. 2011 ("projected area"); thesis, section 3.4.1.
+    Dutagaci et al. 2010 ("view area"), Secord et al. 2011 ("projected area"); thesis, section
+    3.4.1.
 
     Returns:
         Between 0 and 1; the sphere around the object fills pi/4 of the image.
@@ -28,10 +31,11 @@ def view_area(view: MeasuredView) -> float:
 
 
 def visible_area_ratio(view: MeshView) -> float:
-    """Area of the surface that is seen, over the area of the whole surface; what is hidden of a face does not count.
+    """Area of the surface that is seen, over the area of the whole surface; what is hidden of a
+    face does not count.
 
-    Plemenos and Benayada 1996, Polonsky et al. 2005 ("visibility ratio"), Dutagaci et al. 2010 ("ratio of visible
-    area"); thesis, section 3.4.1.
+    Plemenos and Benayada 1996, Polonsky et al. 2005 ("visibility ratio"), Dutagaci et al. 2010
+    ("ratio of visible area"); thesis, section 3.4.1.
 
     Returns:
         Between 0 and 1: of a sphere from distance d, (1 - 1/d) / 2.
@@ -40,10 +44,12 @@ def visible_area_ratio(view: MeshView) -> float:
 
 
 def surface_visibility(view: MeshView) -> float:
-    """Area of the faces of which anything is seen, over the area of all faces: the ratio of visible area by faces.
+    """Area of the faces of which anything is seen, over the area of all faces: the ratio of visible
+    area by faces.
 
-    Secord et al. 2011 ("surface visibility"), Dutagaci et al. 2010; thesis, section 3.4.1, by "the mesh area visible
-    from a viewpoint". Large faces that are nearly hidden count whole, so it depends on how the mesh is cut.
+    Secord et al. 2011 ("surface visibility"), Dutagaci et al. 2010; thesis, section 3.4.1, by "the
+    mesh area visible from a viewpoint". Large faces that are nearly hidden count whole, so it
+    depends on how the mesh is cut.
 
     Returns:
         Between 0 and 1: 1/2 of a cube of which three sides are seen.
@@ -54,8 +60,9 @@ def surface_visibility(view: MeshView) -> float:
 def viewpoint_entropy(view: MeshView) -> float:
     """Shannon entropy of the shares that the faces have in the object's projected area.
 
-    Vázquez et al. 2001, without their background; Dutagaci et al. 2010 ("surface area entropy"); thesis, section 3.4.1
-    and equation 3. It counts faces as they are cut: cut each into four and it is 2 bits more, from everywhere.
+    Vázquez et al. 2001, without their background; Dutagaci et al. 2010 ("surface area entropy");
+    thesis, section 3.4.1 and equation 3. It counts faces as they are cut: cut each into four and it
+    is 2 bits more, from everywhere.
 
     Returns:
         Bits; 0 where one face is seen or none.

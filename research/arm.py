@@ -1,8 +1,8 @@
 """A simulated arm, a Franka Panda, with a depth camera on its wrist, beside an object on a table.
 
-MuJoCo tells where the links are and what they touch, mink solves the inverse kinematics, and the depth is cast by
-Embree: MuJoCo's own renderer needs OpenGL, which not every machine has. The arm's model is the one in
-``gymnasium-robotics``, which comes from https://github.com/vikashplus/franka.
+MuJoCo tells where the links are and what they touch, mink solves the inverse kinematics, and the
+depth is cast by Embree: MuJoCo's own renderer needs OpenGL, which not every machine has. The arm's
+model is the one in ``gymnasium-robotics``, which comes from https://github.com/vikashplus/franka.
 
 >>> arm = Arm(nextview.load_mesh("chair.off"), np.random.default_rng(0))        # doctest: +SKIP
 >>> arm.run(nextview.load().session(object=ObservedObject(life_size=False), distance=0.4))  # doctest: +SKIP
@@ -34,9 +34,20 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 FASTEST = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])
-"""Velocity limits of the seven joints, rad/s (Franka Control Interface, robot and interface specifications)."""
-RANGES = np.array([[-2.8973, 2.8973], [-1.7628, 1.7628], [-2.8973, 2.8973], [-3.0718, -0.0698], [-2.8973, 2.8973],
-                   [-0.0175, 3.7525], [-2.8973, 2.8973]])  # fmt: skip
+"""Velocity limits of the seven joints, rad/s (Franka Control Interface, robot and interface
+specifications).
+"""
+RANGES = np.array(
+    [
+        [-2.8973, 2.8973],
+        [-1.7628, 1.7628],
+        [-2.8973, 2.8973],
+        [-3.0718, -0.0698],
+        [-2.8973, 2.8973],
+        [-0.0175, 3.7525],
+        [-2.8973, 2.8973],
+    ]
+)
 """Limits of the joints, rad (the same source)."""
 OFFSETS = np.array([0, 0, 0, 0, 0, np.pi / 2, np.pi / 4])
 """The model counts its last two joints from elsewhere: Franka's angles less the model's."""
@@ -53,7 +64,9 @@ STARTS = HOME + np.array(
     ]
 )
 """Where the search for joints begins if it finds none from where the arm is."""
-ITERATIONS, CLOSE, STRAIGHT = 20, 0.002, np.radians(0.5)
+ITERATIONS = 20
+CLOSE = 0.002
+STRAIGHT = np.radians(0.5)
 """Steps of a search, and how near it has to come: metres and radians."""
 LONGEST = 0.9
 """Metres from the shoulder beyond which no wrist comes: nothing is searched there."""
@@ -82,12 +95,17 @@ def _assets() -> Path:
     spec = find_spec("gymnasium_robotics")  # to import it takes a while, and prints
     if spec is None or spec.origin is None:
         with extras():
-            raise ModuleNotFoundError("No module named 'gymnasium_robotics'", name="gymnasium_robotics")
+            raise ModuleNotFoundError(
+                "No module named 'gymnasium_robotics'", name="gymnasium_robotics"
+            )
     return Path(spec.origin).parent / "envs/assets/kitchen_franka/franka_assets"
 
 
 def _model(vertices: Float, faces: NDArray[np.int32]) -> Any:
-    """The arm with its camera, the table and the object. MuJoCo takes the object's convex hull for collisions."""
+    """The arm with its camera, the table and the object.
+
+    MuJoCo takes the object's convex hull for collisions.
+    """
     with extras():
         import mujoco
 
@@ -96,21 +114,37 @@ def _model(vertices: Float, faces: NDArray[np.int32]) -> Any:
         spec.delete(spec.joint(f"robot:panda0_finger_joint{finger}"))
     for k, limits in enumerate(RANGES - OFFSETS[:, None]):
         spec.joint(f"robot:panda0_joint{k + 1}").range = limits
-    hand = np.array([[1.0, 1, 0], [-1, 1, 0], [0, 0, np.sqrt(2)]]) / np.sqrt(2)  # columns: its axes in those of link 7
+    # columns: its axes in those of link 7
+    hand = np.array([[1.0, 1, 0], [-1, 1, 0], [0, 0, np.sqrt(2)]]) / np.sqrt(2)
     eye = np.zeros(4)
-    mujoco.mju_mat2Quat(eye, np.stack([hand[:, 1], -hand[:, 0], hand[:, 2]], 1).ravel())  # x right, y down, z forward
+    # x right, y down, z forward
+    mujoco.mju_mat2Quat(eye, np.stack([hand[:, 1], -hand[:, 0], hand[:, 2]], 1).ravel())
     wrist = spec.body("panda0_link7")
     wrist.add_site(name="camera", pos=hand @ CAMERA, quat=eye)
-    box, back = mujoco.mjtGeom.mjGEOM_BOX, CAMERA - [0, 0, 0.013]  # its lens is in the middle of its front
+    # its lens is in the middle of its front
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    back = CAMERA - [0, 0, 0.013]
     for name, size, pos in (
         ("camera", [0.045, 0.0125, 0.012], back),
         ("mount", [0.015, 0.03, 0.006], back / [2, 1, 1]),
     ):
-        wrist.add_geom(name=name, type=box, size=size, pos=hand @ pos, quat=eye, rgba=[0.15, 0.15, 0.18, 1], mass=0.05)
+        wrist.add_geom(
+            name=name,
+            type=box,
+            size=size,
+            pos=hand @ pos,
+            quat=eye,
+            rgba=[0.15, 0.15, 0.18, 1],
+            mass=0.05,
+        )
     shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # of meshes that enclose no volume, too
     spec.add_mesh(name="object", uservert=vertices.ravel(), userface=faces.ravel(), inertia=shell)
     spec.worldbody.add_geom(
-        name="object", type=mujoco.mjtGeom.mjGEOM_MESH, meshname="object", margin=CLEARANCE, rgba=[0.25, 0.5, 0.75, 1]
+        name="object",
+        type=mujoco.mjtGeom.mjGEOM_MESH,
+        meshname="object",
+        margin=CLEARANCE,
+        rgba=[0.25, 0.5, 0.75, 1],
     )
     return spec.compile()
 
@@ -127,7 +161,8 @@ class Arm:
 
     Attributes:
         joints: where the arm is, (7,) float64.
-        motions: what it did so far, one for each time that it moved: the joints at the corners of its way.
+        motions: what it did so far, one for each time that it moved: the joints at the corners of
+            its way.
         seconds: how long it has moved.
         refused: poses to which it found no way.
     """
@@ -144,17 +179,23 @@ class Arm:
             import mink
             import mujoco
 
-        cos, sin = np.cos(turn := rng.uniform(0, 2 * np.pi)), np.sin(turn)
+        cos = np.cos(turn := rng.uniform(0, 2 * np.pi))
+        sin = np.sin(turn)
         vertices = radius * mesh.vertices @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
         vertices += [*(OBJECT + rng.uniform(-0.05, 0.05, 2)), -vertices[:, 2].min()]
-        self.sensor, self.joints, self._rng = sensor, np.asarray(joints, float), rng
+        self.sensor = sensor
+        self.joints = np.asarray(joints, float)
+        self._rng = rng
         self.motions: list[list[Float]] = []
-        self.seconds, self.refused = 0.0, 0
-        self._mujoco, self._mink = mujoco, mink
+        self.seconds = 0.0
+        self.refused = 0
+        self._mujoco = mujoco
+        self._mink = mink
         self.model = _model(vertices, mesh.faces)
         self.data = mujoco.MjData(self.model)
         self._site = self.model.site("camera").id
-        # Turning the camera about its line of sight shows nothing new: that much the arm is free to choose.
+        # Turning the camera about its line of sight shows nothing new: that much the arm is free to
+        # choose.
         self._aim = mink.FrameTask(
             "camera", "site", position_cost=1.0, orientation_cost=[0.3, 0.3, 0.0], lm_damping=1e-4
         )
@@ -185,20 +226,23 @@ class Arm:
         self._mujoco.mj_kinematics(self.model, self.data)
 
     def touches(self, joints: Float) -> bool:
-        """Whether the arm touches itself, or comes nearer than CLEARANCE to the table or the object's convex hull."""
+        """Whether the arm touches itself, or comes nearer than CLEARANCE to the table or the
+        object's convex hull.
+        """
         self._place(joints)
         self._mujoco.mj_collision(self.model, self.data)
         return self.data.ncon > 0
 
     def solve(self, pose: Float) -> Float | None:
-        """Joints with which the camera stands at a pose, turned about its line of sight as suits the arm.
+        """Joints with which the camera stands at a pose, turned about its line of sight as suits
+        the arm.
 
         Args:
             pose: camera-to-world, (4, 4).
 
         Returns:
-            (7,), within the joint limits and without a collision; None if none are found, from where the arm is or from
-            any of STARTS.
+            (7,), within the joint limits and without a collision; None if none are found, from
+            where the arm is or from any of STARTS.
         """
         asked = pose.tobytes(), self.joints.tobytes()
         if asked not in self._solved:
@@ -216,7 +260,8 @@ class Arm:
 
     def descend(self, pose: Float, start: Float) -> Float | None:
         """Differential inverse kinematics from some joints; None if it does not arrive."""
-        mink, arm = self._mink, self._mink.Configuration(self.model, start)
+        mink = self._mink
+        arm = self._mink.Configuration(self.model, start)
         for _ in range(ITERATIONS):
             here = arm.get_transform_frame_to_world("camera", "site").as_matrix()
             tilt = np.linalg.norm(here[:3, 2] - pose[:3, 2])
@@ -226,7 +271,9 @@ class Arm:
             target[:3, :3] = _turned_least(here[:3, :3], pose[:3, 2])
             self._aim.set_target(mink.SE3.from_matrix(target))
             try:
-                velocity = mink.solve_ik(arm, [self._aim, self._rest], 0.2, "daqp", limits=self._limits)
+                velocity = mink.solve_ik(
+                    arm, [self._aim, self._rest], 0.2, "daqp", limits=self._limits
+                )
             except mink.NoSolutionFound:
                 return None
             arm.integrate_inplace(velocity, 0.2)
@@ -239,13 +286,16 @@ class Arm:
         return self.way(pose) is not None
 
     def way(self, pose: Float) -> list[Float] | None:
-        """The joints at the corners of a way from here to a pose: straight in joint space, or by HOME; None if both
-        are blocked."""
+        """The joints at the corners of a way from here to a pose: straight in joint space, or by
+        HOME; None if both are blocked."""
         end = self.solve(pose)
         if end is None:
             return None
         ways = ([self.joints, end], [self.joints, HOME, end])
-        return next((way for way in ways if not any(self.touches(joints) for joints in along(way, FINE))), None)
+        return next(
+            (way for way in ways if not any(self.touches(joints) for joints in along(way, FINE))),
+            None,
+        )
 
     def travel_cost(self, here: Float, there: Float) -> float:
         """Seconds from where the arm is to a pose; infinity where there is no way."""
@@ -275,9 +325,13 @@ class Arm:
         return Frame(measured, k, pose, pixel_centre=0.5)
 
     def things(self) -> list[tuple[Triangles, Float]]:
-        """All that can be seen, with the arm as it is: vertices (N, 3), metres, faces (F, 3), and colour (3,)."""
+        """All that can be seen, with the arm as it is: vertices (N, 3), metres, faces (F, 3),
+        and colour (3,).
+        """
         self._place(self.joints)
-        model, data, found = self.model, self.data, []
+        model = self.model
+        data = self.data
+        found = []
         for k in range(model.ngeom):
             if model.geom_group[k] != 3:  # those are hulls, for collisions
                 vertices, faces = _triangles(model, k, self._mujoco)
@@ -285,7 +339,9 @@ class Arm:
                 found.append(((placed, faces), model.geom_rgba[k, :3].astype(float)))
         return found
 
-    def run(self, session: Session, looked: Callable[[], None] = lambda: None, costs: bool = True) -> Recognition:
+    def run(
+        self, session: Session, looked: Callable[[], None] = lambda: None, costs: bool = True
+    ) -> Recognition:
         """Go on with a session to its end: look, and move to where it asks, if there is a way.
 
         Args:
@@ -296,7 +352,8 @@ class Arm:
         Raises:
             ObservationError: the object is not found in the very first frame.
         """
-        session.reachable, session.travel_cost = self.can_reach, self.travel_cost if costs else None
+        session.reachable = self.can_reach
+        session.travel_cost = self.travel_cost if costs else None
         session.update(self.look())
         looked()
         while not session.done:
@@ -312,19 +369,25 @@ class Arm:
 
 
 def first_joints(arm: Arm, elevation: float, azimuth: float, distance: float) -> Float | None:
-    """Joints with which the camera looks at the middle of ``OBJECT`` from some angles, radians, and metres; or None."""
+    """Joints with which the camera looks at the middle of ``OBJECT`` from some angles, radians,
+    and metres; or None.
+    """
     pose = look_at_origin(elevation, azimuth, distance)
     pose[:3, 3] += [*OBJECT, 0.08]
     return arm.solve(pose)
 
 
 def seconds_of(way: Sequence[Float]) -> float:
-    """How long a way in joint space takes at the joints' velocity limits: on each leg the slowest joint counts."""
+    """How long a way in joint space takes at the joints' velocity limits: on each leg the
+    slowest joint counts.
+    """
     return float(sum((np.abs(b - a) / FASTEST).max() for a, b in pairwise(way)))
 
 
 def along(way: Sequence[Float], step: float) -> list[Float]:
-    """Joints along a way, no joint farther apart than a step, radians; with its first and its last."""
+    """Joints along a way, no joint farther apart than a step, radians; with its first and its
+    last.
+    """
     found = [way[0]]
     for a, b in pairwise(way):
         n = max(1, int(np.ceil(np.abs(b - a).max() / step)))
@@ -333,18 +396,36 @@ def along(way: Sequence[Float], step: float) -> list[Float]:
 
 
 def _turned_least(rotation: Float, forward: Float) -> Float:
-    """A rotation, (3, 3), turned by the least angle that takes its z axis to a direction, (3,) (Rodrigues' formula)."""
+    """A rotation, (3, 3), turned by the least angle that takes its z axis to a direction, (3,)
+    (Rodrigues' formula).
+    """
     now = rotation[:, 2]
     cosine = now @ forward
     if cosine < -1 + 1e-9:  # it looks the other way: any axis across it will do
         return rotation * [1, -1, -1]
-    across = np.outer(forward, now) - np.outer(now, forward)  # times a vector: its cross product with the axis
+    # times a vector: its cross product with the axis
+    across = np.outer(forward, now) - np.outer(now, forward)
     return (np.eye(3) + across + across @ across / (1 + cosine)) @ rotation
 
 
 CORNERS = np.stack(np.meshgrid([-1.0, 1], [-1.0, 1], [-1.0, 1], indexing="ij"), -1).reshape(8, 3)
-SIDES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6],
-                  [0, 6, 4], [1, 5, 7], [1, 7, 3]], np.int32)  # fmt: skip
+SIDES = np.array(
+    [
+        [0, 1, 3],
+        [0, 3, 2],
+        [4, 6, 7],
+        [4, 7, 5],
+        [0, 4, 5],
+        [0, 5, 1],
+        [2, 3, 7],
+        [2, 7, 6],
+        [0, 2, 6],
+        [0, 6, 4],
+        [1, 5, 7],
+        [1, 7, 3],
+    ],
+    np.int32,
+)
 
 
 def _triangles(model: Any, geom: int, mujoco: Any) -> Triangles:
@@ -352,6 +433,11 @@ def _triangles(model: Any, geom: int, mujoco: Any) -> Triangles:
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
         return CORNERS * model.geom_size[geom], SIDES
     mesh = model.geom_dataid[geom]
-    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-    begin, faces = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-    return model.mesh_vert[first : first + count].astype(float), model.mesh_face[begin : begin + faces]
+    first = model.mesh_vertadr[mesh]
+    count = model.mesh_vertnum[mesh]
+    begin = model.mesh_faceadr[mesh]
+    faces = model.mesh_facenum[mesh]
+    return (
+        model.mesh_vert[first : first + count].astype(float),
+        model.mesh_face[begin : begin + faces],
+    )

@@ -1,4 +1,6 @@
-"""Depth measures of the object alone: how its depth is spread, how far it reaches (thesis, section 3.4.3)."""
+"""Depth measures of the object alone: how its depth is spread, how far it reaches (thesis,
+section 3.4.3).
+"""
 
 from __future__ import annotations
 
@@ -11,10 +13,11 @@ BIN = 0.01
 
 
 def depth_distribution(view: MeasuredView) -> float:
-    """One minus the sum of the squared normalised depth histogram, over the pixels that show the object.
+    """One minus the sum of the squared normalised depth histogram, over the pixels that show the
+    object.
 
-    It is the chance that two of them lie at different depths. Secord et al. 2011 ("depth distribution"); thesis,
-    equation 5.
+    It is the chance that two of them lie at different depths. Secord et al. 2011 ("depth
+    distribution"); thesis, equation 5.
 
     Returns:
         0 where all is at one depth or nothing is seen, less than 1.

@@ -1,4 +1,5 @@
-"""True maps beside predicted ones, of five objects of each class from the best to the worst (thesis, figures 24 to 28).
+"""True maps beside predicted ones, of five objects of each class from the best to the worst
+(thesis, figures 24 to 28).
 
 python -m research.example_maps test.npz lem lem.png [--split test]
 """
@@ -31,21 +32,35 @@ from nextview.files import check_new, new_file
 from nextview.session import style
 from nextview.session.style import ACCENT, INK
 
-EXAMPLES, ROWS = 5, 12
+EXAMPLES = 5
+ROWS = 12
 """Examples of maps of each class, and classes at most."""
-TRUE_PEAK: dict[str, Any] = {"marker": "o", "color": "white", "markeredgecolor": INK, "markersize": 6.5}
-PREDICTED_PEAK: dict[str, Any] = {"marker": "x", "color": ACCENT, "markeredgewidth": 1.8, "markersize": 5}
+TRUE_PEAK: dict[str, Any] = {
+    "marker": "o",
+    "color": "white",
+    "markeredgecolor": INK,
+    "markersize": 6.5,
+}
+PREDICTED_PEAK: dict[str, Any] = {
+    "marker": "x",
+    "color": ACCENT,
+    "markeredgewidth": 1.8,
+    "markersize": 5,
+}
 
 
 def example_maps(p: Predictions, name: str, rng: np.random.Generator) -> Figure:
-    """True maps (left) beside predicted ones (thesis, figures 25 to 28), a row a class, from the best to the worst.
+    """True maps (left) beside predicted ones (thesis, figures 25 to 28), a row a class, from the
+    best to the worst.
 
-    One random view of every object is drawn; those shown stand at equal steps of its squared error. Of many classes,
-    those shown stand at equal steps of the class's mean error.
+    One random view of every object is drawn; those shown stand at equal steps of its squared error.
+    Of many classes, those shown stand at equal steps of the class's mean error.
     """
     kept = judged_objects(p, name)
-    view, labels = rng.integers(len(p.sphere), size=len(kept)), p.labels[kept]
-    true, predicted = true_map(p, name)[kept, view], p.maps[name][kept, view]
+    view = rng.integers(len(p.sphere), size=len(kept))
+    labels = p.labels[kept]
+    true = true_map(p, name)[kept, view]
+    predicted = p.maps[name][kept, view]
     error = ((true.astype(np.float64) - predicted) ** 2).mean((1, 2))
     classes = np.unique(labels)
     order = np.argsort([error[labels == index].mean() for index in classes], kind="stable")
@@ -53,11 +68,15 @@ def example_maps(p: Predictions, name: str, rng: np.random.Generator) -> Figure:
     gap = np.full((true.shape[1], 1), np.nan)
     with matplotlib.rc_context(style.STYLE):
         figure = style.PlainFigure((9.6, 0.6 + 1.3 * len(classes)))
-        grid = figure.subplots(len(classes), EXAMPLES, squeeze=False, gridspec_kw={"hspace": 0.35, "wspace": 0.12})
+        grid = figure.subplots(
+            len(classes), EXAMPLES, squeeze=False, gridspec_kw={"hspace": 0.35, "wspace": 0.12}
+        )
     for axes in grid.flat:
         axes.set_axis_off()
     for row, index in zip(grid, classes, strict=True):
-        row[0].text(-0.1, 0.5, words(p.classes[index]), ha="right", va="center", transform=row[0].transAxes)
+        row[0].text(
+            -0.1, 0.5, words(p.classes[index]), ha="right", va="center", transform=row[0].transAxes
+        )
         here = np.flatnonzero(labels == index)
         here = here[np.argsort(error[here], kind="stable")]
         for axes, at in zip(row, here[_steps(len(here), EXAMPLES)], strict=False):
@@ -65,11 +84,15 @@ def example_maps(p: Predictions, name: str, rng: np.random.Generator) -> Figure:
             axes.imshow(pair, cmap="viridis", vmin=0, vmax=1, origin="lower", aspect="auto")
             for values, look in ((true[at], TRUE_PEAK), (predicted[at], PREDICTED_PEAK)):
                 ring, column = np.unravel_index(values.argmax(), values.shape)
-                axes.plot([column, column + values.shape[1] + 1], [ring, ring], linestyle="", **look)
+                axes.plot(
+                    [column, column + values.shape[1] + 1], [ring, ring], linestyle="", **look
+                )
             thing = p.names[kept[at]].removeprefix(p.classes[index]).strip("_") or p.names[kept[at]]
             axes.set_title(f"{thing[-12:]} view {view[at]}: {error[at]:.3f}", fontsize=7.5)
     marks = [Line2D([], [], linestyle="", **look) for look in (TRUE_PEAK, PREDICTED_PEAK)]
-    figure.legend(marks, ["true peak", "predicted peak"], loc="upper right", ncols=2, bbox_to_anchor=(0.9, 1))
+    figure.legend(
+        marks, ["true peak", "predicted peak"], loc="upper right", ncols=2, bbox_to_anchor=(0.9, 1)
+    )
     return figure
 
 
@@ -86,7 +109,8 @@ def draw(
     seed: int = 0,
     overwrite: bool = False,
 ) -> None:
-    """Draw examples of a map: one random view of each object, the true map left, the predicted one right.
+    """Draw examples of a map: one random view of each object, the true map left, the predicted one
+    right.
 
     Args:
         predictions: made by nextview predict.

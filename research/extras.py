@@ -15,7 +15,9 @@ PROJECT = "./research"
 
 
 def require(extra: str) -> None:
-    """End a script with the sentence that says what to install, see ``nextview.cli.ending.require``."""
+    """End a script with the sentence that says what to install, see
+    ``nextview.cli.ending.require``.
+    """
     ending.require(extra, EXTRAS, PROJECT)
 
 

@@ -1,4 +1,6 @@
-"""Light and shadow for a film: things on a table under a lamp and a sky, cast by Embree without a graphics card."""
+"""Light and shadow for a film: things on a table under a lamp and a sky, cast by Embree without
+a graphics card.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,11 @@ from nextview.geometry.viewsphere import LAYOUTS, great_circle, level_pose, look
 from nextview.policies.discriminate import Rivals
 from nextview.session.style import heat
 
-Array, Colour = np.ndarray, tuple[int, int, int]
-KEY, SUN, SKY = np.array([-0.62, -0.30, 0.72]), np.array([1.30, 1.22, 1.08]), np.array([0.46, 0.50, 0.56])
+Array = np.ndarray
+Colour = tuple[int, int, int]
+KEY = np.array([-0.62, -0.30, 0.72])
+SUN = np.array([1.30, 1.22, 1.08])
+SKY = np.array([0.46, 0.50, 0.56])
 """Where the lamp is, how bright it is and the sky: red, green, blue."""
 SAMPLES = 12
 """Rays to the lamp and to the sky from each point of a still."""
@@ -27,12 +32,17 @@ REACH = 2.0
 
 
 class Stage:
-    """Things in the light of a lamp and a sky: Embree casts what is seen, the shadows and the sky's share."""
+    """Things in the light of a lamp and a sky: Embree casts what is seen, the shadows and the
+    sky's share.
+    """
 
     def __init__(self, things: list[tuple[Array, Array, tuple]]) -> None:
-        self.scene, self.things = EmbreeScene(), []
+        self.scene = EmbreeScene()
+        self.things = []
         for vertices, faces, colour in things:
-            TriangleMesh(self.scene, vertices.astype(np.float32), np.ascontiguousarray(faces, np.int32))
+            TriangleMesh(
+                self.scene, vertices.astype(np.float32), np.ascontiguousarray(faces, np.int32)
+            )
             normals = np.zeros_like(vertices)
             of_faces = np.cross(*(vertices[faces[:, i]] - vertices[faces[:, 0]] for i in (1, 2)))
             for i in range(3):
@@ -49,15 +59,21 @@ class Stage:
     def hits(self, eye: Array, rays: Array) -> tuple[Array, Array, Array, Array]:
         """Which rays (N, 3) hit, and of these points, normals and colours."""
         origins = np.broadcast_to(eye, rays.shape)
-        found = self.scene.run(*(np.ascontiguousarray(x, np.float32) for x in (origins, rays)), output=1)
+        found = self.scene.run(
+            *(np.ascontiguousarray(x, np.float32) for x in (origins, rays)), output=1
+        )
         hit = found["primID"] >= 0
         points = eye + rays[hit] * found["tfar"][hit, None]
-        normals, colours = np.zeros_like(points), np.zeros_like(points)
-        u, v = found["u"][hit, None], found["v"][hit, None]
+        normals = np.zeros_like(points)
+        colours = np.zeros_like(points)
+        u = found["u"][hit, None]
+        v = found["v"][hit, None]
         for k, (faces, of_vertices, colour) in enumerate(self.things):
             own = found["geomID"][hit] == k
             corner = of_vertices[faces[found["primID"][hit][own]]]
-            normals[own] = (1 - u - v)[own] * corner[:, 0] + u[own] * corner[:, 1] + v[own] * corner[:, 2]
+            normals[own] = (
+                (1 - u - v)[own] * corner[:, 0] + u[own] * corner[:, 1] + v[own] * corner[:, 2]
+            )
             colours[own] = colour
         normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12
         normals *= np.where((normals * rays[hit]).sum(1, keepdims=True) > 0, -1, 1)
@@ -67,14 +83,27 @@ class Stage:
         self, points: Array, normals: Array, colours: Array, rng: np.random.Generator, samples: int
     ) -> tuple[Array, Array]:
         """The light of the sky, and of the lamp, that comes from each point."""
-        start, sky, lamp = points + 1e-4 * normals, np.zeros(len(points)), np.zeros(len(points))
+        start = points + 1e-4 * normals
+        sky = np.zeros(len(points))
+        lamp = np.zeros(len(points))
         for k in range(samples):
             turn = 2 * np.pi * (k / samples + rng.random((len(points), 1)))
             height = 1 - 2 * ((k + rng.random((len(points), 1))) / samples)
-            ball = np.hstack([np.sqrt(1 - height**2) * np.cos(turn), np.sqrt(1 - height**2) * np.sin(turn), height])
+            ball = np.hstack(
+                [
+                    np.sqrt(1 - height**2) * np.cos(turn),
+                    np.sqrt(1 - height**2) * np.sin(turn),
+                    height,
+                ]
+            )
             up = normals + 0.999 * ball
             sky += (
-                np.where(self.blocked(start, up), 0.22, 0.75 + 0.25 * up[:, 2] / np.linalg.norm(up, axis=1)) / samples
+                np.where(
+                    self.blocked(start, up),
+                    0.22,
+                    0.75 + 0.25 * up[:, 2] / np.linalg.norm(up, axis=1),
+                )
+                / samples
             )
             lamp += ~self.blocked(start, KEY + 0.11 * ball) / samples
         facing = np.maximum(normals @ KEY / np.linalg.norm(KEY), 0)
@@ -85,12 +114,16 @@ def toned(light: Array) -> Array:
     """Light as sRGB, uint8: filmic (Narkowicz's fit of ACES)."""
     x = 0.82 * light
     x = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1)
-    return (255 * np.where(x < 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055) + 0.5).astype(np.uint8)
+    return (255 * np.where(x < 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055) + 0.5).astype(
+        np.uint8
+    )
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A still of one thing, and what is needed to draw on it: light of sky and lamp, points, and the camera."""
+    """A still of one thing, and what is needed to draw on it: light of sky and lamp, points, and
+    the camera.
+    """
 
     sky: Array
     lamp: Array
@@ -108,15 +141,22 @@ class Shot:
 
 
 def rays_of(pose: Array, focal: float, width: int, height: int) -> Array:
-    x, y = np.meshgrid((np.arange(width) + 0.5 - width / 2) / focal, (np.arange(height) + 0.5 - height / 2) / focal)
+    x, y = np.meshgrid(
+        (np.arange(width) + 0.5 - width / 2) / focal, (np.arange(height) + 0.5 - height / 2) / focal
+    )
     return np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3) @ pose[:3, :3].T
 
 
 def wood(points: Array) -> Array:
     """How light the table's boards are, beside their mean."""
-    board, along = np.floor(points[:, 1] / 0.16), points[:, 0] + 0.37 * np.floor(points[:, 1] / 0.16)
+    board = np.floor(points[:, 1] / 0.16)
+    along = points[:, 0] + 0.37 * np.floor(points[:, 1] / 0.16)
     across = points[:, 1] + 0.006 * np.sin(9 * along + 2 * board) + 0.003 * np.sin(23 * along)
-    fine = np.sin(900 * across) + np.sin(1490 * across + 3 * along) + np.sin(370 * across + 1.3 * along)
+    fine = (
+        np.sin(900 * across)
+        + np.sin(1490 * across + 3 * along)
+        + np.sin(370 * across + 1.3 * along)
+    )
     joint = 1 - 0.35 * np.exp(-(((0.5 - np.abs(points[:, 1] / 0.16 % 1 - 0.5)) / 0.006) ** 2))
     return (1 + 0.014 * fine + 0.05 * np.sin(2.4 * board + 1)) * joint
 
@@ -124,11 +164,14 @@ def wood(points: Array) -> Array:
 def shot(stage: Stage, r: float, centre: Array, size: tuple[int, int]) -> Shot:
     """A still of a thing of radius ``r`` from before the table."""
     (width, height), rng = size, np.random.default_rng(0)
-    pose, focal = look_at_origin(np.radians(23), np.radians(-63), 13 * r), width / 2 / (2.6 / 13)
+    pose = look_at_origin(np.radians(23), np.radians(-63), 13 * r)
+    focal = width / 2 / (2.6 / 13)
     pose[:3, 3] += centre + np.array([0, 0, 0.5 * r])
     rays = rays_of(pose, focal, width, height)
     hit, points, normals, colours = stage.hits(pose[:3, 3], rays)
-    sky, lamp, where = np.tile(SKY * 0.9, (len(rays), 1)), np.zeros_like(rays), np.full_like(rays, np.inf)
+    sky = np.tile(SKY * 0.9, (len(rays), 1))
+    lamp = np.zeros_like(rays)
+    where = np.full_like(rays, np.inf)
     light = stage.lit(points, normals, colours, rng, SAMPLES)
     grain = np.where(points[:, 2:] < 1e-4, wood(points)[:, None], 1)
     light = [x * grain for x in light]
@@ -146,7 +189,9 @@ def unit(x: Array) -> Array:
 
 @dataclass(frozen=True)
 class Look:
-    """A view and what followed: the leading classes with their belief, what views are worth, and the leading two."""
+    """A view and what followed: the leading classes with their belief, what views are worth, and
+    the leading two.
+    """
 
     direction: Array
     picture: Array
@@ -158,8 +203,11 @@ class Look:
 
 
 def gadget() -> tuple[Array, Array]:
-    """A camera at the end of a wrist, looking along z; one is its distance from a thing's middle to its surface."""
-    box, lens = trimesh.creation.box((0.62, 0.26, 0.22)), trimesh.creation.cylinder(0.11, 0.14, 40)
+    """A camera at the end of a wrist, looking along z; one is its distance from a thing's middle
+    to its surface.
+    """
+    box = trimesh.creation.box((0.62, 0.26, 0.22))
+    lens = trimesh.creation.cylinder(0.11, 0.14, 40)
     lens.apply_translation((0.14, 0, 0.17))
     second = lens.copy()
     second.apply_translation((-0.30, 0, 0))
@@ -171,13 +219,20 @@ def gadget() -> tuple[Array, Array]:
 
 def scene(shot: Shot, colour: Colour, looks: list[Look], at: int, progress: float) -> Image.Image:
     """The table: what views are worth, the way so far, and the camera on its way to look ``at``."""
-    look, before = looks[at], looks[max(at - 1, 0)]
+    look = looks[at]
+    before = looks[max(at - 1, 0)]
     way = great_circle(before.direction, look.direction, 25)
     here = way[round(24 * progress)]
     pose = level_pose(here, REACH)
     vertices, faces = gadget()
     hand = Stage(
-        [((0.36 * vertices @ pose[:3, :3].T + pose[:3, 3]) * shot.radius + shot.centre, faces, (0.05, 0.055, 0.065))]
+        [
+            (
+                (0.36 * vertices @ pose[:3, :3].T + pose[:3, 3]) * shot.radius + shot.centre,
+                faces,
+                (0.05, 0.055, 0.065),
+            )
+        ]
     )
     middle = pose[:3, 3] * shot.radius + shot.centre
     to_lamp = KEY / np.linalg.norm(KEY)
@@ -191,12 +246,26 @@ def scene(shot: Shot, colour: Colour, looks: list[Look], at: int, progress: floa
     draw = ImageDraw.Draw(picture, "RGBA")
     dots(draw, shot, before if progress < 1 else look, colour)
     stood = [great_circle(a.direction, b.direction) for a, b in pairwise(looks[:at])]
-    path = np.concatenate([*stood, way[: round(24 * progress) + 1]])[::2] * REACH * shot.radius + shot.centre
+    path = (
+        np.concatenate([*stood, way[: round(24 * progress) + 1]])[::2] * REACH * shot.radius
+        + shot.centre
+    )
     draw.line([tuple(p) for p in shot.place(path)[0]], (*colour, 230), 5, "curve")
     for past in looks[: at + (progress == 1)]:
-        circle(draw, shot.place((past.direction * REACH * shot.radius + shot.centre)[None])[0][0], 8, (*colour, 255))
+        circle(
+            draw,
+            shot.place((past.direction * REACH * shot.radius + shot.centre)[None])[0][0],
+            8,
+            (*colour, 255),
+        )
     if progress == 1:
-        corners = [middle, *(shot.centre + 0.62 * shot.radius * (pose[:3, 0] * x + pose[:3, 1] * y) for x, y in SQUARE)]
+        corners = [
+            middle,
+            *(
+                shot.centre + 0.62 * shot.radius * (pose[:3, 0] * x + pose[:3, 1] * y)
+                for x, y in SQUARE
+            ),
+        ]
         flat = [tuple(p) for p in shot.place(np.array(corners))[0]]
         for a, b in zip(flat[1:], [*flat[2:], flat[1]], strict=True):
             draw.polygon([flat[0], a, b], (*colour, 26))
@@ -224,7 +293,12 @@ def dots(draw: ImageDraw.ImageDraw, shot: Shot, look: Look, colour: Colour) -> N
 
 
 def circle(
-    draw: ImageDraw.ImageDraw, at: Array, r: float, fill: tuple | None, outline: tuple | None = None, width: int = 1
+    draw: ImageDraw.ImageDraw,
+    at: Array,
+    r: float,
+    fill: tuple | None,
+    outline: tuple | None = None,
+    width: int = 1,
 ) -> None:
     draw.ellipse((at[0] - r, at[1] - r, at[0] + r, at[1] + r), fill, outline, width)
 
@@ -238,19 +312,28 @@ def pasted(picture: Image.Image, shot: Shot, hand: Stage, middle: Array) -> None
     width, height = picture.size
     x0, x1, y0, y1 = (
         int(np.clip(v, 0, m))
-        for v, m in ((x - reach, width), (x + reach, width), (y - reach, height), (y + reach, height))
+        for v, m in (
+            (x - reach, width),
+            (x + reach, width),
+            (y - reach, height),
+            (y + reach, height),
+        )
     )
     if x0 >= x1 or y0 >= y1:
         return
-    rays = rays_of(shot.pose, shot.focal, width, height).reshape(height, width, 3)[y0:y1, x0:x1].reshape(-1, 3)
+    rays = (
+        rays_of(shot.pose, shot.focal, width, height)
+        .reshape(height, width, 3)[y0:y1, x0:x1]
+        .reshape(-1, 3)
+    )
     hit, points, normals, colours = hand.hits(shot.pose[:3, 3], rays)
     light = sum(hand.lit(points, normals, colours, np.random.default_rng(0), 6))
     shine = np.maximum((normals * unit(unit(KEY) - unit(rays[hit]))).sum(1), 0) ** 30
     light += 0.25 * shine[:, None]
     eye = shot.pose[:3, 3]
-    behind = np.linalg.norm(shot.points[y0:y1, x0:x1].reshape(-1, 3)[hit] - eye, axis=1) < np.linalg.norm(
-        points - eye, axis=1
-    )
+    behind = np.linalg.norm(
+        shot.points[y0:y1, x0:x1].reshape(-1, 3)[hit] - eye, axis=1
+    ) < np.linalg.norm(points - eye, axis=1)
     pixels = np.asarray(picture).copy()
     part = pixels[y0:y1, x0:x1].reshape(-1, 3)
     part[np.flatnonzero(hit)[~behind]] = toned(light)[~behind]
@@ -261,7 +344,9 @@ def pasted(picture: Image.Image, shot: Shot, hand: Stage, middle: Array) -> None
 @cache
 def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
     weight = "bold" if bold else "normal"
-    return ImageFont.truetype(font_manager.findfont(font_manager.FontProperties("DejaVu Sans", weight=weight)), size)
+    return ImageFont.truetype(
+        font_manager.findfont(font_manager.FontProperties("DejaVu Sans", weight=weight)), size
+    )
 
 
 def tag(draw: ImageDraw.ImageDraw, text: str, at: tuple[int, int], colour: Colour) -> None:

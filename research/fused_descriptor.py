@@ -1,4 +1,6 @@
-"""The fused descriptor of surface complexity of Ding et al.: variance, information entropy and Vollath's measure."""
+"""The fused descriptor of surface complexity of Ding et al.: variance, information entropy and
+Vollath's measure.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +14,14 @@ LEVELS = 256
 
 
 def fused_descriptor(view: MeasuredView) -> float:
-    """Mean of variance, entropy and Vollath's autocorrelation of the depth image, each scaled to 0 .. 1.
+    """Mean of variance, entropy and Vollath's autocorrelation of the depth image, each scaled to 0
+    .. 1.
 
-    Ding et al., as the thesis describes it (section 3.5): they predict surface complexity by these three. The image is
-    1 at the nearest visible point, 1/256 two object radii behind it, and 0 where there is no object. The variance is
-    divided by its largest value, 1/4; the entropy of the grey levels by 8 bits; Vollath's F4 (Vollath 1987), the sum of
-    products of neighbours less that of neighbours but one along the rows, by the sum of squares.
+    Ding et al., as the thesis describes it (section 3.5): they predict surface complexity by these
+    three. The image is 1 at the nearest visible point, 1/256 two object radii behind it, and 0
+    where there is no object. The variance is divided by its largest value, 1/4; the entropy of the
+    grey levels by 8 bits; Vollath's F4 (Vollath 1987), the sum of products of neighbours less that
+    of neighbours but one along the rows, by the sum of squares.
 
     Returns:
         Between 0 and 1; 0 where nothing is seen.
@@ -32,7 +36,8 @@ def fused_descriptor(view: MeasuredView) -> float:
     image[view.seen] = grey
     counts = np.bincount(level.astype(np.int64), minlength=LEVELS + 1)
     counts[0] = n - len(level)
-    total, squares = grey.sum(), grey @ grey
+    total = grey.sum()
+    squares = grey @ grey
     variance = squares / n - (total / n) ** 2
     nearer, farther = (np.einsum("hw,hw->", image[:, :-k], image[:, k:]) for k in (1, 2))
     vollath = nearer - farther

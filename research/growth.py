@@ -1,9 +1,11 @@
-"""How a memory grows: time and memory of a view among 10 to 10,000 things, exactly and by an index of faiss.
+"""How a memory grows: time and memory of a view among 10 to 10,000 things, exactly and by an index
+of faiss.
 
     python -m research.growth
 
-The things beyond the bundled YCB scans are made of these: remembered views of two poses, one turned about, mixed in a
-drawn share, with a little noise. Held-out views of the scans ask. Needs ``pip install 'nextview[large]'``.
+The things beyond the bundled YCB scans are made of these: remembered views of two poses, one turned
+about, mixed in a drawn share, with a little noise. Held-out views of the scans ask. Needs ``pip
+install 'nextview[large]'``.
 """
 
 import resource
@@ -37,7 +39,9 @@ COLUMNS = (
 
 
 def grown(views: np.ndarray, poses: int, rng: np.random.Generator) -> np.ndarray:
-    """Remembered views, (H, rings, azimuths, F), and so many more as to be of ``poses`` resting poses."""
+    """Remembered views, (H, rings, azimuths, F), and so many more as to be of ``poses`` resting
+    poses.
+    """
     found = [views[:poses]]
     while (missing := poses - sum(map(len, found))) > 0:
         a, b = rng.integers(len(views), size=(2, min(len(views), missing)))
@@ -47,7 +51,9 @@ def grown(views: np.ndarray, poses: int, rng: np.random.Generator) -> np.ndarray
     return np.concatenate(found)
 
 
-def main(things: tuple[int, ...] = (10, 100, 1_000, 10_000), views: int = 100, seed: int = 0) -> None:
+def main(
+    things: tuple[int, ...] = (10, 100, 1_000, 10_000), views: int = 100, seed: int = 0
+) -> None:
     """Print a table, a row for each number of things.
 
     Args:
@@ -75,7 +81,9 @@ def main(things: tuple[int, ...] = (10, 100, 1_000, 10_000), views: int = 100, s
         print(f"| {' | '.join([*row, f'{peak:.1f}'])} |", flush=True)
 
 
-def timed(rings: np.ndarray, asked: Sequence[tuple[np.ndarray, np.ndarray]], by_index: bool) -> Iterator[str]:
+def timed(
+    rings: np.ndarray, asked: Sequence[tuple[np.ndarray, np.ndarray]], by_index: bool
+) -> Iterator[str]:
     """The cells of a row: exactly, and with an index where there is to be one.
 
     Args:

@@ -1,4 +1,5 @@
-"""Pictures of a view store: one object from all sides, or the whole data set, whose numbers are printed.
+"""Pictures of a view store: one object from all sides, or the whole data set, whose numbers are
+printed.
 
 python -m research.inspect_store views.zarr [views.png] [--object-name table_0399]
 """
@@ -31,9 +32,11 @@ CELL = 112
 
 
 def object_figure(store: ViewStore, i: int) -> Figure:
-    """Shaded images and depth of all views of object i, and the map of every measure that the store holds of it.
+    """Shaded images and depth of all views of object i, and the map of every measure that the store
+    holds of it.
 
-    Rows are rings, the horizon lowest; columns are azimuths. A dot marks the view that measures most.
+    Rows are rings, the horizon lowest; columns are azimuths. A dot marks the view that measures
+    most.
     """
     sphere = store.sphere
     names = [name for name in store.measures if store.has(f"measures/{name}", i)]
@@ -48,7 +51,9 @@ def object_figure(store: ViewStore, i: int) -> Figure:
 
     left, right = top.subplots(rows, columns)
     step = -(-store.image(i).shape[-1] // CELL)
-    image, depth = (_mosaic(views[:, ::step, ::step], sphere) for views in (store.image(i), store.depth(i)))
+    image, depth = (
+        _mosaic(views[:, ::step, ::step], sphere) for views in (store.image(i), store.depth(i))
+    )
     left.imshow(image, cmap="gray", vmin=0, vmax=255)
     shown = right.imshow(np.ma.masked_equal(depth, 0), cmap="viridis_r")
     right.set_facecolor("black")
@@ -65,13 +70,21 @@ def object_figure(store: ViewStore, i: int) -> Figure:
         elevation, azimuth = sphere.angles(best)
         axes.set_title(name.replace("_", " "), fontsize=11)
         axes.set_xlabel(f"most from {azimuth:g}°, {elevation:g}° up", fontsize=9)
-        axes.plot(best % sphere.azimuths, best // sphere.azimuths, "o", color="white", markeredgecolor="black")
+        axes.plot(
+            best % sphere.azimuths,
+            best // sphere.azimuths,
+            "o",
+            color="white",
+            markeredgecolor="black",
+        )
     return figure
 
 
 def store_figure(store: ViewStore) -> Figure:
     """Objects of each class and split, and the mean depth entropy of the views."""
-    figure = PlainFigure(figsize=(14, max(5.5, 0.24 * len(store.classes) + 1.5)), layout="constrained")
+    figure = PlainFigure(
+        figsize=(14, max(5.5, 0.24 * len(store.classes) + 1.5)), layout="constrained"
+    )
     figure.suptitle(store.path.name, fontsize=14)
     left, right = np.asarray(figure.subfigures(1, 2, width_ratios=[1.5, 1], wspace=0.04))
     _class_bars(left.subplots(), store)
@@ -85,7 +98,9 @@ def store_figure(store: ViewStore) -> Figure:
 def summary(store: ViewStore) -> dict[str, str]:
     """What a store holds, in words."""
     size = sum(file.stat().st_size for file in store.path.rglob("*") if file.is_file())
-    rendered, views, side = int(store.done.sum()), len(store.sphere), store.attributes.size
+    rendered = int(store.done.sum())
+    views = len(store.sphere)
+    side = store.attributes.size
     copies = sum(map(len, store.duplicates)) - len(store.duplicates)
     conflicting = sum(len(set(store.labels[group])) > 1 for group in store.duplicates)
     shown = {
@@ -96,24 +111,33 @@ def summary(store: ViewStore) -> dict[str, str]:
         "views": f"{rendered * views:,}  ({views} of {side} x {side} each)",
         "byte-identical copies": f"{copies:,}  ({conflicting} with several labels)",
         "size on disk": f"{size / 1e9:.2f} GB" if size > 1e9 else f"{size / 1e6:.1f} MB",
-        "median radius, m": ", ".join(f"{name} {radius:.2f}" for name, radius in median_radii(store).items()),
+        "median radius, m": ", ".join(
+            f"{name} {radius:.2f}" for name, radius in median_radii(store).items()
+        ),
     }
     return {what: value for what, value in shown.items() if value}
 
 
 def median_radii(store: ViewStore) -> dict[str, float]:
     """Of the objects of each class, metres; empty where the unit of the meshes is not known."""
-    radii, labels = store.radii, store.labels
+    radii = store.radii
+    labels = store.labels
     known = store.done & np.isfinite(radii)
-    return {store.classes[c]: float(np.median(radii[known & (labels == c)])) for c in np.unique(labels[known])}
+    return {
+        store.classes[c]: float(np.median(radii[known & (labels == c)]))
+        for c in np.unique(labels[known])
+    }
 
 
 def _class_bars(axes: Axes, store: ViewStore) -> None:
-    labels, splits, done = store.labels, store.splits, store.done
+    labels = store.labels
+    splits = store.splits
+    done = store.done
     rows = np.arange(len(store.classes))
     start = np.zeros(len(rows))
     parts = [
-        (name, done & (splits == name), colour) for name, colour in (("train", BLUE), ("test", ORANGE), ("", BLUE))
+        (name, done & (splits == name), colour)
+        for name, colour in (("train", BLUE), ("test", ORANGE), ("", BLUE))
     ]
     for name, select, colour in [*parts, ("not rendered", ~done, "lightgrey")]:
         counts = np.bincount(labels[select], minlength=len(rows))
@@ -123,7 +147,8 @@ def _class_bars(axes: Axes, store: ViewStore) -> None:
     for row, count in enumerate(start):
         axes.text(count, row, f" {int(count):,}", va="center", fontsize=9)
     axes.set_yticks(rows, store.classes)
-    axes.set_ylim(max(len(rows), 6) - 0.5, -0.5)  # a few classes get bars no thicker than those of many
+    # a few classes get bars no thicker than those of many
+    axes.set_ylim(max(len(rows), 6) - 0.5, -0.5)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlim(0, start.max() * 1.1)
     axes.set_xlabel("objects")
@@ -133,7 +158,9 @@ def _class_bars(axes: Axes, store: ViewStore) -> None:
 
 def _draw_map(axes: Axes, sphere: ViewSphere, values: NDArray[np.floating]) -> int:
     """Values of the views, (V,), by ring and azimuth; returns the view of the highest."""
-    shown = axes.imshow(values.reshape(sphere.rings, sphere.azimuths), origin="lower", aspect="auto")
+    shown = axes.imshow(
+        values.reshape(sphere.rings, sphere.azimuths), origin="lower", aspect="auto"
+    )
     axes.figure.colorbar(shown, ax=axes, pad=0.02)
     _ticks(axes, sphere)
     return int(values.argmax())
@@ -148,16 +175,21 @@ def _mosaic(views: NDArray, sphere: ViewSphere) -> NDArray:
 
 def _ticks(axes: Axes, sphere: ViewSphere, side: float = 1, downwards: bool = False) -> None:
     """Azimuths and elevations, at the middle of cells of a side."""
-    middle, every = side / 2 - 0.5, 2 if sphere.azimuths > 6 else 1
+    middle = side / 2 - 0.5
+    every = 2 if sphere.azimuths > 6 else 1
     elevations = [f"{e:g}°" for e in sphere.elevations]
     azimuths = [f"{360 * k / sphere.azimuths:g}°" for k in range(sphere.azimuths)]
-    axes.set_xticks((middle + side * np.arange(sphere.azimuths))[::every], azimuths[::every], fontsize=8)
+    axes.set_xticks(
+        (middle + side * np.arange(sphere.azimuths))[::every], azimuths[::every], fontsize=8
+    )
     rows = elevations[::-1] if downwards else elevations
     axes.set_yticks(middle + side * np.arange(sphere.rings), rows, fontsize=8)
     axes.tick_params(length=0)
 
 
-def inspect(store: Path, out: Path | None = None, /, object_name: str | None = None, overwrite: bool = False) -> None:
+def inspect(
+    store: Path, out: Path | None = None, /, object_name: str | None = None, overwrite: bool = False
+) -> None:
     """Draw what a view store holds: classes, counts, failures; or one object from all sides.
 
     Args:
@@ -172,11 +204,14 @@ def inspect(store: Path, out: Path | None = None, /, object_name: str | None = N
     if object_name is not None:
         if object_name not in views.names:
             near = get_close_matches(object_name, views.names, 3, 0) or views.names[:3]
-            raise DatasetError(f"{store}: has no object {object_name!r}; there are {', '.join(near)} and others")
+            raise DatasetError(
+                f"{store}: has no object {object_name!r}; there are {', '.join(near)} and others"
+            )
         row = views.names.index(object_name)
         if not views.done[row]:
             raise DatasetError(
-                f"{store}: {object_name} is not rendered ({views.attributes.failures.get(object_name, 'not yet')})"
+                f"{store}: {object_name} is not rendered"
+                f" ({views.attributes.failures.get(object_name, 'not yet')})"
             )
         figure = object_figure(views, row)
     else:

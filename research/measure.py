@@ -39,26 +39,37 @@ def measure(
 ) -> Iterator[tuple[int, int]]:
     """As ``nextview.data.measures.measure``, with views that know which face each pixel shows.
 
-    ``meshes`` is the dataset folder, as the store was rendered from it; ``max_faces`` are those of a mesh at most.
+    ``meshes`` is the dataset folder, as the store was rendered from it; ``max_faces`` are those of
+    a mesh at most.
     """
     store = ViewStore.open(path)
     files = {entry.name: entry.path.absolute() for entry in list_dataset(meshes)}
     if store.attributes.sensor is not None:
-        raise DatasetError(f"{path}: was rendered through a sensor, whose depth does not tell which face is seen")
+        raise DatasetError(
+            f"{path}: was rendered through a sensor, whose depth does not tell which face is seen"
+        )
     lacking = [store.names[i] for i in np.flatnonzero(store.done) if store.names[i] not in files]
     if lacking:
-        raise DatasetError(f"{meshes}: holds no mesh called {lacking[0]}, of which {path} has views")
+        raise DatasetError(
+            f"{meshes}: holds no mesh called {lacking[0]}, of which {path} has views"
+        )
     views = partial(_mesh_views, files, max_faces)
     yield from measures.measure(path, names, workers, scheduler, objects, overwrite, views)
 
 
-def _mesh_views(files: dict[str, Path], max_faces: int, store: ViewStore, i: int) -> Iterator[MeshView]:
+def _mesh_views(
+    files: dict[str, Path], max_faces: int, store: ViewStore, i: int
+) -> Iterator[MeshView]:
     """Object i of a store, from all its views."""
-    depths, name, hashes = store.read("depth", i), store.names[i], store.attributes.sha256
+    depths = store.read("depth", i)
+    name = store.names[i]
+    hashes = store.attributes.sha256
     if hashes and sha256_of(files[name]) != hashes[i]:
         raise DatasetError(f"{files[name]}: is not the mesh that {store.path} was rendered from")
     mesh = deformed(
-        store, load_mesh(files[name], max_faces=max_faces, largest_part=store.attributes.largest_part), name
+        store,
+        load_mesh(files[name], max_faces=max_faces, largest_part=store.attributes.largest_part),
+        name,
     )
     camera = FaceCamera(mesh, depths.shape[-1], store.sphere.distance)
     for depth, pose in zip(depths, store.sphere.poses, strict=True):
@@ -78,7 +89,8 @@ def main(
     scheduler: str | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Compute view measures of every rendered object and keep them in the store. Resumes where it was.
+    """Compute view measures of every rendered object and keep them in the store. Resumes where it
+    was.
 
     Args:
         store: view store made by nextview render.
@@ -86,7 +98,8 @@ def main(
         measures: names (see nextview list measures), all, or MODULE:FUNCTION.
         max_faces: of a mesh, as for nextview render.
         split: only this split.
-        held_out: only the objects that this model, bundled or a card (NAME.json), calls held out of its training.
+        held_out: only the objects that this model, bundled or a card (NAME.json), calls held out of
+            its training.
         objects: only so many of these, spread evenly; twice as many later hold the same.
         workers: processes; one for each core by default.
         scheduler: address of a dask.distributed scheduler to use instead.

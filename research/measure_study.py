@@ -1,20 +1,25 @@
-"""Which measure of a view serves recognition? Every measure that a store holds, against what a recogniser says.
+"""Which measure of a view serves recognition? Every measure that a store holds, against what a
+recogniser says.
 
-    python -m research.measure_study views.zarr measures [--meshes data/ModelNet10] [--objects 300] [--runs 10]
-        [--policies random-all volumetric mvselect.json gain] [--test test.npz --validation validation.npz]
+    python -m research.measure_study views.zarr measures [--meshes data/ModelNet10] [--objects 300]
+        [--runs 10] [--policies random-all volumetric mvselect.json gain] [--test test.npz
+        --validation validation.npz]
 
-From the view store alone: what the models say of its views is predicted, and what the measures say is measured, where
-that is not there yet. Writes into the folder the table (measures.md, table.csv and table.tex), measures.csv (every
-number in a row of its own), and the figure (measures.png, .pdf and .svg). Stopped, it goes on where it was.
+From the view store alone: what the models say of its views is predicted, and what the measures say
+is measured, where that is not there yet. Writes into the folder the table (measures.md, table.csv
+and table.tex), measures.csv (every number in a row of its own), and the figure (measures.png, .pdf
+and .svg). Stopped, it goes on where it was.
 
-For each measure: the rank correlation, over the views of an object, of its value with the log-probability that the
-recogniser gives the true class there, as the mean over objects, of all classes and of each; how often its best view is
-the recogniser's best one, or next to it; and accuracy and travel of the policy that climbs its true map in the local
-window, after fixed numbers of views. That policy sees what no robot can, and so is an oracle by name; what it does not
-see is the class: it goes to the valley for those that it believes in at that moment and for which the valley gained on
-the validation objects. Other policies can stand beside, under the names that nextview benchmark has for them. Intervals
-are 95 % bootstrap intervals over objects; p is McNemar's test against random choice in the window, over objects,
-corrected by Holm's method for all measures, policies and numbers of views together.
+For each measure: the rank correlation, over the views of an object, of its value with the
+log-probability that the recogniser gives the true class there, as the mean over objects, of all
+classes and of each; how often its best view is the recogniser's best one, or next to it; and
+accuracy and travel of the policy that climbs its true map in the local window, after fixed numbers
+of views. That policy sees what no robot can, and so is an oracle by name; what it does not see is
+the class: it goes to the valley for those that it believes in at that moment and for which the
+valley gained on the validation objects. Other policies can stand beside, under the names that
+nextview benchmark has for them. Intervals are 95 % bootstrap intervals over objects; p is McNemar's
+test against random choice in the window, over objects, corrected by Holm's method for all measures,
+policies and numbers of views together.
 """
 
 from __future__ import annotations
@@ -65,10 +70,13 @@ CONFIDENCE = "confidence"
 AGREEMENT = {"best": "best view is the recogniser's", "best_near": "or next to it"}
 
 
-def correlations(values: NDArray[np.floating], reference: NDArray[np.floating]) -> NDArray[np.float64]:
+def correlations(
+    values: NDArray[np.floating], reference: NDArray[np.floating]
+) -> NDArray[np.float64]:
     """Spearman's rank correlation along the rows, (N,); 0 where one of the two is constant."""
     a, b = (rankdata(x, axis=1) for x in (values, reference))
-    a, b = a - a.mean(1, keepdims=True), b - b.mean(1, keepdims=True)
+    a = a - a.mean(1, keepdims=True)
+    b = b - b.mean(1, keepdims=True)
     spread = np.sqrt((a**2).sum(1) * (b**2).sum(1))
     return np.divide((a * b).sum(1), spread, out=np.zeros(len(a)), where=spread > 0)
 
@@ -79,14 +87,19 @@ def of_true_class(p: Predictions) -> NDArray[np.float64]:
 
 
 def agreement(p: Predictions, values: NDArray[np.floating]) -> dict[str, NDArray[np.float64]]:
-    """Whether each object's best view by a measure is the recogniser's, or at most a cell away, (N,) each.
+    """Whether each object's best view by a measure is the recogniser's, or at most a cell away,
+    (N,) each.
 
-    Several best views count by the share of them: a measure that is constant agrees as often as chance does.
+    Several best views count by the share of them: a measure that is constant agrees as often as
+    chance does.
     """
     theirs = of_true_class(p).argmax(1)
     best = values >= values.max(1, keepdims=True)
     away = p.sphere.travel[theirs]
-    return {name: (best & (away <= reach)).sum(1) / best.sum(1) for name, reach in (("best", 0), ("best_near", 1))}
+    return {
+        name: (best & (away <= reach)).sum(1) / best.sum(1)
+        for name, reach in (("best", 0), ("best_near", 1))
+    }
 
 
 def valleys_of(validation: Predictions, measure: str) -> tuple[int, ...]:
@@ -97,9 +110,16 @@ def valleys_of(validation: Predictions, measure: str) -> tuple[int, ...]:
 
 
 def study(
-    test: Predictions, validation: Predictions, measures: list[str], policies: tuple[str, ...],
-    n_views: tuple[int, ...], runs: int, samples: int, seed: int, rows: list[tuple],
-) -> Iterator[int]:  # fmt: skip
+    test: Predictions,
+    validation: Predictions,
+    measures: list[str],
+    policies: tuple[str, ...],
+    n_views: tuple[int, ...],
+    runs: int,
+    samples: int,
+    seed: int,
+    rows: list[tuple],
+) -> Iterator[int]:
     """Compute everything; yields how many entries are done.
 
     Args:
@@ -120,7 +140,9 @@ def study(
     def note(name: str, quantities: dict[str, NDArray[np.float64]], labels: bool = False) -> None:
         top = np.stack(list(quantities.values()), 1)
         groups = [("", np.ones(len(test), bool))]
-        groups += [(test.classes[c], test.labels == c) for c in np.unique(test.labels)] if labels else []
+        groups += (
+            [(test.classes[c], test.labels == c) for c in np.unique(test.labels)] if labels else []
+        )
         for label, here in groups:
             low, high = interval(ratio(top[here], np.ones_like(top[here]), weights[:, here]))
             for i, quantity in enumerate(quantities):
@@ -128,20 +150,36 @@ def study(
 
     for done, name in enumerate([RANDOM, *measures, *policies], 1):
         if name not in measures:
-            entry, valleys = name, None
+            entry = name
+            valleys = None
         else:
             values = true_measure(test, name) if name != CONFIDENCE else np.exp(reference)
             note(name, {"correlation": correlations(values, reference)}, labels=True)
             note(name, agreement(test, values))
-            entry, valleys = f"true-{map_name(name)}", valleys_of(validation, name)
-            rows.append((name, ", ".join(test.classes[c] for c in valleys), "valleys", len(valleys), *[np.nan] * 3))
+            entry = f"true-{map_name(name)}"
+            valleys = valleys_of(validation, name)
+            rows.append(
+                (
+                    name,
+                    ", ".join(test.classes[c] for c in valleys),
+                    "valleys",
+                    len(valleys),
+                    *[np.nan] * 3,
+                )
+            )
         given = {} if valleys is None else {map_name(name): tuple(test.classes[c] for c in valleys)}
         specs = make_specs(replace(test, valley_classes=given or test.valley_classes), runs, seed)
         paths = replay(entry, specs, max(n_views), seed)
         for k in n_views:
             right[name, k] = (paths.answers[:, k - 1] == specs.labels).reshape(runs, -1)
             accuracy = right[name, k].mean(0)
-            note(name, {f"accuracy_{k}": accuracy, f"travel_{k}": paths.travel[:, k - 1].reshape(runs, -1).mean(0)})
+            note(
+                name,
+                {
+                    f"accuracy_{k}": accuracy,
+                    f"travel_{k}": paths.travel[:, k - 1].reshape(runs, -1).mean(0),
+                },
+            )
             if name != RANDOM:
                 note(name, {f"over_random_{k}": accuracy - right[RANDOM, k].mean(0)})
                 rows[-1] = (*rows[-1][:-1], mcnemar(right[name, k], right[RANDOM, k]))
@@ -150,15 +188,28 @@ def study(
 
 def readable(table: pd.DataFrame, n_views: tuple[int, ...]) -> pd.DataFrame:
     """The table as it is read, the highest correlation first."""
-    found = {(r.measure, r.quantity): r for r in table.itertuples() if not r.label or r.quantity == "valleys"}
+    found = {
+        (r.measure, r.quantity): r
+        for r in table.itertuples()
+        if not r.label or r.quantity == "valleys"
+    }
     names = [*ordered(table)[::-1], *others(table)]
     at = ", ".join(map(str, n_views))
-    head = ["measure", "correlation", *AGREEMENT.values(), f"accuracy at {at} views", f"points over random at {at}",
-            f"travel at {at}", "valley for"]  # fmt: skip
+    head = [
+        "measure",
+        "correlation",
+        *AGREEMENT.values(),
+        f"accuracy at {at} views",
+        f"points over random at {at}",
+        f"travel at {at}",
+        "valley for",
+    ]
     rows = []
     for name in [RANDOM, *names]:
         r = found.get((name, "correlation"))
-        cells = [name.replace("_", " ") if r else Path(name).stem if name.endswith(".json") else name]
+        cells = [
+            name.replace("_", " ") if r else Path(name).stem if name.endswith(".json") else name
+        ]
         if r is None:
             cells += [""] * 3
         else:
@@ -194,20 +245,30 @@ def ordered(table: pd.DataFrame) -> list[str]:
 
 def others(table: pd.DataFrame) -> list[str]:
     """The policies that are beside the measures, as they were named."""
-    return [name for name in table["measure"].unique() if name != RANDOM and name not in ordered(table)]
+    return [
+        name for name in table["measure"].unique() if name != RANDOM and name not in ordered(table)
+    ]
 
 
 def figure(table: pd.DataFrame, n_views: tuple[int, ...]) -> Figure:
     """Correlation overall, by class, and what the policies gain, one row a measure."""
     names = ordered(table)
-    classes = [label for label in table[table["quantity"] == "correlation"]["label"].unique() if label]
+    classes = [
+        label for label in table[table["quantity"] == "correlation"]["label"].unique() if label
+    ]
     with matplotlib.rc_context(STYLE):
         made = PlainFigure((13, 0.34 * len(names) + 1.9), layout="constrained")
-        left, middle, right = made.subplots(1, 3, sharey=True, width_ratios=[1, 0.11 * len(classes) + 0.6, 1])
+        left, middle, right = made.subplots(
+            1, 3, sharey=True, width_ratios=[1, 0.11 * len(classes) + 0.6, 1]
+        )
     y = np.arange(len(names))
 
     def numbers(quantity: str) -> pd.DataFrame:
-        return table[(table["quantity"] == quantity) & (table["label"] == "")].set_index("measure").loc[names]
+        return (
+            table[(table["quantity"] == quantity) & (table["label"] == "")]
+            .set_index("measure")
+            .loc[names]
+        )
 
     overall = numbers("correlation")
     left.hlines(y, overall["low"], overall["high"], color=INK)
@@ -218,33 +279,55 @@ def figure(table: pd.DataFrame, n_views: tuple[int, ...]) -> Figure:
 
     of_class = table[(table["quantity"] == "correlation") & (table["label"] != "")]
     cells = of_class.pivot(index="measure", columns="label", values="value").loc[names, classes]
-    reach = max(float(np.abs(cells.drop(index=CONFIDENCE, errors="ignore").to_numpy()).max(initial=0)), 1e-9)
-    shown = middle.imshow(cells, cmap="RdBu_r", vmin=-reach, vmax=reach, aspect="auto", origin="lower")
+    reach = max(
+        float(np.abs(cells.drop(index=CONFIDENCE, errors="ignore").to_numpy()).max(initial=0)), 1e-9
+    )
+    shown = middle.imshow(
+        cells, cmap="RdBu_r", vmin=-reach, vmax=reach, aspect="auto", origin="lower"
+    )
     for (i, j), value in np.ndenumerate(cells.to_numpy()):
         faint = abs(value) > 0.6 * reach
-        middle.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color="white" if faint else INK)
-    middle.set_xticks(range(len(classes)), [name.replace("_", " ") for name in classes], rotation=45, ha="right")
+        middle.text(
+            j,
+            i,
+            f"{value:.2f}",
+            ha="center",
+            va="center",
+            fontsize=7,
+            color="white" if faint else INK,
+        )
+    middle.set_xticks(
+        range(len(classes)), [name.replace("_", " ") for name in classes], rotation=45, ha="right"
+    )
     middle.grid(False)
     middle.set_xlabel("the same, by class")
     made.colorbar(shown, ax=middle, location="top", shrink=0.6, aspect=30)
 
-    for step, (k, colour) in enumerate(zip(n_views, (BLUE, "#c2571a", "#00805a", "#7a6fd0"), strict=False)):
+    for step, (k, colour) in enumerate(
+        zip(n_views, (BLUE, "#c2571a", "#00805a", "#7a6fd0"), strict=False)
+    ):
         over = numbers(f"over_random_{k}")
         at = y + 0.22 * (len(n_views) - 1) / 2 - 0.22 * step
         right.hlines(at, 100 * over["low"], 100 * over["high"], color=colour)
         right.plot(100 * over["value"], at, "o", color=colour, markersize=4, label=f"{k} views")
     right.axvline(0, color=INK, linewidth=0.8)
-    right.set_xlabel("accuracy of the policy that climbs the true map,\npoints over a random view of the window")
+    right.set_xlabel(
+        "accuracy of the policy that climbs the true map,\npoints over a random view of the window"
+    )
     right.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=len(n_views))
     return made
 
 
-def predicted(out: Path, store: Path, models: str, split: Split, workers: int | None) -> Predictions:
+def predicted(
+    out: Path, store: Path, models: str, split: Split, workers: int | None
+) -> Predictions:
     """What models say of a split of a store; of the training split only of what they held out."""
     if not out.exists():
         recogniser = find_card(find_models(models).recogniser)
         held_out = None if split == "test" else recogniser
-        steps = predicting.predict(store, out, recogniser, {}, split, held_out, size=False, workers=workers)
+        steps = predicting.predict(
+            store, out, recogniser, {}, split, held_out, size=False, workers=workers
+        )
         follow(steps, f"predicting {out.name}")
     return Predictions.load(out)
 
@@ -270,11 +353,15 @@ def main(
     Args:
         store: view store made by nextview render.
         out: folder of the results.
-        meshes: the dataset folder that the store was rendered from, for measures that need the mesh.
-        models: bundled models by name, or a folder with models of your own; of these the recogniser.
-        test: predictions of the test split, if there are some; else OUT/test.npz, made by the models.
+        meshes: the dataset folder that the store was rendered from, for measures that need the
+            mesh.
+        models: bundled models by name, or a folder with models of your own; of these the
+            recogniser.
+        test: predictions of the test split, if there are some; else OUT/test.npz, made by the
+            models.
         validation: of training objects that the recogniser has not seen; else OUT/validation.npz.
-        measures: names, or MODULE:FUNCTION of your own; by default all that the store then holds, and the confidence.
+        measures: names, or MODULE:FUNCTION of your own; by default all that the store then holds,
+            and the confidence.
         policies: others in the same table, as nextview benchmark names them.
         objects: only so many of each split, as nextview measure and research.plan spread them.
         views: after which policies are compared.
@@ -287,7 +374,10 @@ def main(
         raise UsageError("policies are compared after two views or more")
     out.mkdir(parents=True, exist_ok=True)
     given: list[tuple[Path | None, Split]] = [(test, "test"), (validation, "train")]
-    found = [path or out / f"{name}.npz" for (path, _), name in zip(given, ("test", "validation"), strict=True)]
+    found = [
+        path or out / f"{name}.npz"
+        for (path, _), name in zip(given, ("test", "validation"), strict=True)
+    ]
     tables = [
         Predictions.load(path) if path else predicted(to, store, models, split, workers)
         for (path, split), to in zip(given, found, strict=True)
@@ -295,10 +385,15 @@ def main(
     tables = [p.of_objects(sample(np.arange(len(p)), objects)) for p in tables]
     tables = [replace(p, store=str(store.resolve())) for p in tables]
     if set(tables[0].names) & set(tables[1].names):
-        raise UsageError(f"{found[1]}: holds objects of {found[0]}: peak or valley would be chosen on what is judged")
+        raise UsageError(
+            f"{found[1]}: holds objects of {found[0]}: peak or valley would be chosen on what is"
+            " judged"
+        )
     if tables[0].classes != tables[1].classes:
         raise UsageError(f"{found[1]}: is of other classes than {found[0]}")
-    rows = np.flatnonzero(np.isin(ViewStore.open(store).names, [*tables[0].names, *tables[1].names]))
+    rows = np.flatnonzero(
+        np.isin(ViewStore.open(store).names, [*tables[0].names, *tables[1].names])
+    )
     wanted = [name for name in measures if name != CONFIDENCE]
     if meshes is not None:
         steps = measure_meshes(store, meshes, wanted or ["all"], workers, objects=rows)
@@ -310,9 +405,12 @@ def main(
     numbers: list[tuple] = []
     comparing = study(*tables, names, policies, views, runs, samples, seed, numbers)
     track(comparing, 1 + len(names) + len(policies), "comparing measures")
-    table = pd.DataFrame(numbers, columns=["measure", "label", "quantity", "value", "low", "high", "p"])
+    table = pd.DataFrame(
+        numbers, columns=["measure", "label", "quantity", "value", "low", "high", "p"]
+    )
     table["p_holm"] = holm(table["p"].to_numpy())
-    drawn, wide = figure(table, views), readable(table, views)
+    drawn = figure(table, views)
+    wide = readable(table, views)
     text = markdown(wide)
     write_figures(out, {"measures": drawn}, {"table": wide}, overwrite=True)
     with new_file(out / "measures.csv", True) as part:
@@ -321,7 +419,10 @@ def main(
         part.write_text(text, encoding="utf-8")
     to_png(drawn, out / "measures.png")
     print(text, end="")
-    console.print(f"{out}: measures.md, table.csv, table.tex, measures.csv and the figure measures.png are written")
+    console.print(
+        f"{out}: measures.md, table.csv, table.tex, measures.csv and the figure measures.png are"
+        " written"
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""The measures of the thesis's chapter 3, and one that it suggests, with what each needs and which values are good.
+"""The measures of the thesis's chapter 3, and one that it suggests, with what each needs and which
+values are good.
 
 nextview measure views.zarr --measures research.measures:view_area
 """

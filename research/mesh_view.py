@@ -1,4 +1,6 @@
-"""A view of an object whose mesh is known: which face each pixel shows, for the measures that need the surface."""
+"""A view of an object whose mesh is known: which face each pixel shows, for the measures that
+need the surface.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ from nextview.geometry.viewsphere import DISTANCE
 from nextview.simulation.simulated import SimulatedCamera
 
 APART = 4  # pixels of a row between those that are asked first which face they show; a power of 2
-LEVEL = 2e-4  # what stands no farther before a face is not told from it, object radii: two steps of a store's depth
+# what stands no farther before a face is not told from it, object radii: two steps of a store's
+# depth
+LEVEL = 2e-4
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,9 @@ class MeshView(MeasuredView):
 
     @cached_property
     def faces(self) -> NDArray[np.int32]:
-        """The face that each of the pixels shows that show the object, (n,), row by row; -1 for none."""
+        """The face that each of the pixels shows that show the object, (n,), row by row; -1 for
+        none.
+        """
         return self.face_ids[self.box][self.seen]
 
     @cached_property
@@ -74,10 +80,13 @@ class MeshView(MeasuredView):
 
 
 class FaceCamera:
-    """Tells which face of a mesh each pixel of a ``SimulatedCamera`` shows; ``size`` and ``distance`` are as there."""
+    """Tells which face of a mesh each pixel of a ``SimulatedCamera`` shows; ``size`` and
+    ``distance`` are as there.
+    """
 
     def __init__(self, mesh: Mesh, size: int = 224, distance: float = DISTANCE) -> None:
-        self.surface, self.intrinsics = Surface(mesh.vertices, mesh.faces), pinhole(size, distance)
+        self.surface = Surface(mesh.vertices, mesh.faces)
+        self.intrinsics = pinhole(size, distance)
         self._scene = embree_scene([(mesh.vertices, mesh.faces)])
         focal, centre = self.intrinsics[0, [0, 2]]  # in single precision, as in ``SimulatedCamera``
         across = (np.arange(size, dtype=np.float32) + np.float32(0.5 - centre)) / np.float32(focal)
@@ -85,17 +94,22 @@ class FaceCamera:
         self._rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
 
     def view(self, pose: NDArray[np.float64], depth: NDArray[np.floating]) -> MeshView:
-        """What a measure is handed of the depth image, (H, W), object radii, from a pose, (4, 4), object frame."""
+        """What a measure is handed of the depth image, (H, W), object radii, from a pose, (4,
+        4), object frame.
+        """
         return MeshView(depth, pose, self.intrinsics, self.surface, self.face_ids(pose, depth))
 
     def face_ids(self, pose: NDArray[np.float64], depth: NDArray[np.floating]) -> NDArray[np.int32]:
-        """Which face of the mesh each pixel shows, (H, W) int32, -1 for none; arguments as of ``view``.
+        """Which face of the mesh each pixel shows, (H, W) int32, -1 for none; arguments as of
+        ``view``.
 
-        Where two pixels of a row show one face, so does all between them, unless the depth tells that something stands
-        before it: half of the rays are saved.
+        Where two pixels of a row show one face, so does all between them, unless the depth tells
+        that something stands before it: half of the rays are saved.
         """
-        pose, z = checked_pose(pose), depth.astype(np.float32, copy=False)
-        found, seen = np.full(z.shape, -1, np.int32), z > 0
+        pose = checked_pose(pose)
+        z = depth.astype(np.float32, copy=False)
+        found = np.full(z.shape, -1, np.int32)
+        seen = z > 0
         self._cast(pose, seen, found, slice(0, None, APART))
         for step in (APART >> k for k in range(1, APART.bit_length())):
             _fill(found, z, step)
@@ -103,9 +117,15 @@ class FaceCamera:
         return found
 
     def _cast(
-        self, pose: NDArray[np.float64], where: NDArray[np.bool_], found: NDArray[np.int32], columns: slice
+        self,
+        pose: NDArray[np.float64],
+        where: NDArray[np.bool_],
+        found: NDArray[np.int32],
+        columns: slice,
     ) -> None:
-        """Look what some pixels show, of some columns; the nearest face alone: distances and normals cost more."""
+        """Look what some pixels show, of some columns; the nearest face alone: distances and
+        normals cost more.
+        """
         chosen = np.zeros(where.shape, bool)
         chosen[:, columns] = where[:, columns]
         pixels = np.flatnonzero(chosen)
@@ -117,19 +137,26 @@ class FaceCamera:
 
 
 def _fill(found: NDArray[np.int32], z: NDArray[np.float32], step: int) -> None:
-    """Fill every other of the columns that are ``step`` apart, where both neighbours show one face and it does, too.
+    """Fill every other of the columns that are ``step`` apart, where both neighbours show one face
+    and it does, too.
 
     The inverse depth of a plane changes evenly over the picture.
     """
     reach = (found.shape[1] - 1) // (2 * step) * 2 * step  # the last column that was asked
     left, middle, right = (slice(begin, begin + reach, 2 * step) for begin in (0, step, 2 * step))
-    one, before, after = found[:, left], z[:, left], z[:, right]
+    one = found[:, left]
+    before = z[:, left]
+    after = z[:, right]
     both = before + after
     off = np.abs(z[:, middle] * both - 2 * before * after)
     same = (one == found[:, right]) & (one >= 0) & (off < LEVEL * both)
     np.copyto(found[:, middle], one, where=same)
 
 
-def view_of(mesh: Mesh, pose: NDArray[np.float64], size: int = 224, distance: float = DISTANCE) -> MeshView:
+def view_of(
+    mesh: Mesh, pose: NDArray[np.float64], size: int = 224, distance: float = DISTANCE
+) -> MeshView:
     """What a measure is handed of a mesh, seen from a pose, (4, 4), object frame, object radii."""
-    return FaceCamera(mesh, size, distance).view(pose, SimulatedCamera(mesh, size, distance).observe(pose).depth)
+    return FaceCamera(mesh, size, distance).view(
+        pose, SimulatedCamera(mesh, size, distance).observe(pose).depth
+    )

@@ -1,4 +1,5 @@
-"""How much that is unseen would be seen from elsewhere: volume, and surface, by a z-buffer of voxels.
+"""How much that is unseen would be seen from elsewhere: volume, and surface, by a z-buffer of
+voxels.
 
 Only where the cameras stand counts: they are taken to have the whole region in their picture.
 """
@@ -22,11 +23,13 @@ TOGETHER = 100_000
 def new_volume(
     occupancy: Occupancy, positions: NDArray[np.floating], region: NDArray[np.bool_] | None = None
 ) -> NDArray[np.float64]:
-    """Unseen volume that no occupied voxel hides from each position: the volumetric information gain.
+    """Unseen volume that no occupied voxel hides from each position: the volumetric information
+    gain.
 
-    What is unseen is taken to be transparent, so this is the most that can come into view; the count of unseen voxels
-    along the rays up to the first occupied one of Delmerico et al., "A comparison of volumetric information gain
-    metrics for active 3D object reconstruction" (Autonomous Robots 42, 2018), but in volume instead of per ray.
+    What is unseen is taken to be transparent, so this is the most that can come into view; the
+    count of unseen voxels along the rays up to the first occupied one of Delmerico et al., "A
+    comparison of volumetric information gain metrics for active 3D object reconstruction"
+    (Autonomous Robots 42, 2018), but in volume instead of per ray.
 
     Args:
         occupancy: what is known.
@@ -39,9 +42,11 @@ def new_volume(
     Raises:
         UsageError: a camera stands within the region, or these are no cameras and no region.
     """
-    grid, cells = occupancy.grid, occupancy.cells.reshape(-1)
+    grid = occupancy.grid
+    cells = occupancy.cells.reshape(-1)
     counts = (cells == UNSEEN) & region_of(grid, region).reshape(-1)
-    asked, blockers = _middles(grid, counts), _middles(grid, cells >= OCCLUDER)
+    asked = _middles(grid, counts)
+    blockers = _middles(grid, cells >= OCCLUDER)
     found: list[int] = []
     for eyes in _eyes(asked, blockers, positions, grid.pitch):
         u, v, z = eyes.project(asked)
@@ -55,16 +60,18 @@ def new_volume(
 def new_surface(
     occupancy: Occupancy, positions: NDArray[np.floating], region: NDArray[np.bool_] | None = None
 ) -> NDArray[np.float64]:
-    """Area of the picture in which the border of unseen space shows, where new surface may come to light.
+    """Area of the picture in which the border of unseen space shows, where new surface may come to
+    light.
 
-    What is unseen is taken to be solid, the opposite of ``new_volume``: the object is at most what no view has seen
-    to be free. Its border that is unseen counts where nothing hides it, as large as it appears: surface that is seen
-    at a low angle says less.
+    What is unseen is taken to be solid, the opposite of ``new_volume``: the object is at most what
+    no view has seen to be free. Its border that is unseen counts where nothing hides it, as large
+    as it appears: surface that is seen at a low angle says less.
 
     Args:
         occupancy: what is known.
         positions: of the cameras, in the grid's frame and unit, (V, 3).
-        region: voxels where the object can be, (n, n, n) bool; by default those in the ball that the grid holds.
+        region: voxels where the object can be, (n, n, n) bool; by default those in the ball that
+            the grid holds.
 
     Returns:
         (V,) float64, squares of the grid's unit at the distance of the border's middle.
@@ -72,11 +79,13 @@ def new_surface(
     Raises:
         UsageError: a camera stands within the region.
     """
-    grid, cells = occupancy.grid, occupancy.cells
+    grid = occupancy.grid
+    cells = occupancy.cells
     solid = (cells != FREE) & region_of(grid, region) | (cells >= OCCLUDER)
     border = (solid & ~_enclosed(solid)).reshape(-1)
     unseen = border & (cells.reshape(-1) == UNSEEN)
-    asked, blockers = _middles(grid, unseen), _middles(grid, border & ~unseen)
+    asked = _middles(grid, unseen)
+    blockers = _middles(grid, border & ~unseen)
     found: list[int] = []
     for eyes in _eyes(asked, blockers, positions, grid.pitch):
         u, v, z = eyes.project(asked)
@@ -104,8 +113,14 @@ def _middles(grid: VoxelGrid, cells: NDArray[np.bool_]) -> Float:
 
 def _enclosed(solid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Solid voxels all of whose six neighbours are solid; nothing is outside of the grid."""
-    padded, inner = np.pad(solid, 1), slice(1, -1)
-    sides = [padded[:-2, inner, inner], padded[2:, inner, inner], padded[inner, :-2, inner], padded[inner, 2:, inner]]
+    padded = np.pad(solid, 1)
+    inner = slice(1, -1)
+    sides = [
+        padded[:-2, inner, inner],
+        padded[2:, inner, inner],
+        padded[inner, :-2, inner],
+        padded[inner, 2:, inner],
+    ]
     return np.logical_and.reduce([*sides, padded[inner, inner, :-2], padded[inner, inner, 2:]])
 
 
@@ -127,21 +142,29 @@ class _Frame:
 
     @classmethod
     def around(cls, u: Float, v: Float) -> _Frame:
-        """Those that hold points at some pixel coordinates, (E, P) each, and a pixel beside them."""
+        """Those that hold points at some pixel coordinates, (E, P) each, and a pixel beside
+        them.
+        """
         left, top = (c.min(1, keepdims=True) - 1 for c in (u, v))
-        rows, columns = ((c.max(1, keepdims=True) - c0).astype(np.int64) + 2 for c, c0 in ((v, top), (u, left)))
+        rows, columns = (
+            (c.max(1, keepdims=True) - c0).astype(np.int64) + 2 for c, c0 in ((v, top), (u, left))
+        )
         return cls(left, top, rows, columns, (int(rows.max()), int(columns.max())))
 
     @property
     def inside(self) -> NDArray[np.bool_]:
         """Pixels of pictures of that shape that belong to each, (E, rows, columns)."""
-        rows, columns = (np.arange(side) < own for side, own in zip(self.shape, (self.rows, self.columns), strict=True))
+        rows, columns = (
+            np.arange(side) < own
+            for side, own in zip(self.shape, (self.rows, self.columns), strict=True)
+        )
         return rows[:, :, None] & columns[:, None]
 
 
 @dataclass(frozen=True)
 class _Eyes:
-    """E cameras that look at the middle of what they are asked about; there a pixel is as wide as a voxel.
+    """E cameras that look at the middle of what they are asked about; there a pixel is as wide as a
+    voxel.
 
     Attributes:
         positions: (E, 3).
@@ -167,31 +190,42 @@ class _Eyes:
         return np.divide(x, z, out=x), np.divide(y, z, out=y), z
 
     def hidden(self, blockers: Float, frame: _Frame) -> Float:
-        """Depth of the nearest of some voxels, (3, Q), at each pixel; those that do not lie ahead are left out."""
+        """Depth of the nearest of some voxels, (3, Q), at each pixel; those that do not lie
+        ahead are left out.
+        """
         x, y, z = self._turned(blockers)
         z[z <= np.float32(self.pitch)] = np.inf
         return self.z_buffer(np.divide(x, z, out=x), np.divide(y, z, out=y), z, frame)
 
     def z_buffer(self, u: Float, v: Float, z: Float, frame: _Frame) -> Float:
-        """Depth of the nearest of voxels that were projected at each pixel, infinity for none, (E, rows, columns).
+        """Depth of the nearest of voxels that were projected at each pixel, infinity for none, (E,
+        rows, columns).
 
-        Each is drawn over the four pixels around its middle, so that walls have no holes: the middles of the voxels of
-        a wall are at most sqrt(2) sides apart, and these are less than two pixels. Nearer ones, which are farther apart
-        in the picture, are drawn in pixels of twice the width, or four times, and so on.
+        Each is drawn over the four pixels around its middle, so that walls have no holes: the
+        middles of the voxels of a wall are at most sqrt(2) sides apart, and these are less than two
+        pixels. Nearer ones, which are farther apart in the picture, are drawn in pixels of twice
+        the width, or four times, and so on.
         """
         u, v, picture = u - frame.left, v - frame.top, np.arange(len(u))[:, None]
         shape = (len(u), *frame.shape)
-        wide = np.sqrt(0.5) * self.distances.astype(np.float64)[:, None]  # what is nearer is drawn wider
+        # what is nearer is drawn wider
+        wide = np.sqrt(0.5) * self.distances.astype(np.float64)[:, None]
         widest = (wide[:, 0] / z.min(1, initial=np.inf)).max()
         if widest <= 1:
             return _drawn(u, v, z, picture, shape, 1)
         near = z < wide
         found = _drawn(u, v, np.where(near, np.float32(np.inf), z), picture, shape, 1)
         at = np.nonzero(near)
-        u, v, z, wide, picture, width = u[at], v[at], z[at], wide[at[0], 0], at[0], 2
+        u = u[at]
+        v = v[at]
+        z = z[at]
+        wide = wide[at[0], 0]
+        picture = at[0]
+        width = 2
         while width < 2 * widest:
             here = (width * z >= wide) & (width * z < 2 * wide)
-            i, j = v[here] / np.float32(width), u[here] / np.float32(width)
+            i = v[here] / np.float32(width)
+            j = u[here] / np.float32(width)
             np.minimum(found, _drawn(j, i, z[here], picture[here], shape, width), out=found)
             width *= 2
         return found
@@ -203,18 +237,27 @@ class _Eyes:
         return found[:, 0], found[:, 1], found[:, 2]
 
 
-def _drawn(u: Float, v: Float, z: Float, picture: NDArray[np.int64], shape: tuple[int, int, int], width: int) -> Float:
+def _drawn(
+    u: Float,
+    v: Float,
+    z: Float,
+    picture: NDArray[np.int64],
+    shape: tuple[int, int, int],
+    width: int,
+) -> Float:
     """Pictures of the nearest depths of points, (E, rows, columns), drawn in pixels of some width.
 
     Args:
-        u, v: where they are drawn, in pixels of that width, counted from the corner of their picture.
+        u, v: where they are drawn, in pixels of that width, counted from the corner of their
+            picture.
         z: their depth.
         picture: which it is.
         shape: pictures, and rows and columns of each in pixels of width 1.
         width: in these.
     """
     # Row i of ``nearest`` stands for the line between the pixels i - 1 and i.
-    i, j = v + np.float32(0.5), u + np.float32(0.5)
+    i = v + np.float32(0.5)
+    j = u + np.float32(0.5)
     rows, columns = (side // width + 3 for side in shape[1:])
     inside = (i >= 0) & (i < rows - 1) & (j >= 0) & (j < columns - 1)
     nearest = np.full((shape[0], rows, columns), np.inf, np.float32)
@@ -226,7 +269,9 @@ def _drawn(u: Float, v: Float, z: Float, picture: NDArray[np.int64], shape: tupl
     return nearest[:, : shape[1], : shape[2]]
 
 
-def _pixels(i: Float, j: Float, picture: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.int64]:
+def _pixels(
+    i: Float, j: Float, picture: NDArray[np.int64], shape: tuple[int, int]
+) -> NDArray[np.int64]:
     """Indices of rows and columns of pictures of a shape that lie in memory one after the other."""
     rows, columns = shape
     pixels = i.astype(np.int64)
@@ -236,8 +281,11 @@ def _pixels(i: Float, j: Float, picture: NDArray[np.int64], shape: tuple[int, in
     return pixels
 
 
-def _eyes(asked: Float, blockers: Float, positions: NDArray[np.floating], pitch: float) -> Iterator[_Eyes]:
-    """Cameras at some positions, (V, 3), that look at the middle of points, (3, P); none if there are no points.
+def _eyes(
+    asked: Float, blockers: Float, positions: NDArray[np.floating], pitch: float
+) -> Iterator[_Eyes]:
+    """Cameras at some positions, (V, 3), that look at the middle of points, (3, P); none if there
+    are no points.
 
     They come in groups, the larger the fewer points there are.
     """
@@ -259,5 +307,6 @@ def _eyes(asked: Float, blockers: Float, positions: NDArray[np.floating], pitch:
 
 def _cross(a: Float, b: Float) -> Float:
     """Cross products of rows, (V, 3): np.cross takes longer for few than all else here."""
-    ahead, behind = [1, 2, 0], [2, 0, 1]
+    ahead = [1, 2, 0]
+    behind = [2, 0, 1]
     return a[:, ahead] * b[:, behind] - a[:, behind] * b[:, ahead]

@@ -1,4 +1,5 @@
-"""Overlap: how much of what one view shows is seen from each other view (the thesis's point correspondence, 5.2).
+"""Overlap: how much of what one view shows is seen from each other view (the thesis's point
+correspondence, 5.2).
 
 python -m research.overlap views.zarr figure14 [--label chair]
 """
@@ -25,25 +26,33 @@ from nextview.geometry.viewsphere import ViewSphere
 from nextview.session.style import PlainFigure
 
 TOLERANCE = 0.003
-"""How far behind the visible surface a point may lie and still count as seen, object radii. Against rays cast from the
-camera to each point, this one and a pixel's four neighbours differ least; much more sees through table tops."""
+"""How far behind the visible surface a point may lie and still count as seen, object radii. Against
+rays cast from the camera to each point, this one and a pixel's four neighbours differ least; much
+more sees through table tops."""
 
 overlap_maps = normalise_per_object
-"""The thesis's maps: each view's row of (..., V, V) scaled so that the least is 0 and the most, itself, is 1."""
+"""The thesis's maps: each view's row of (..., V, V) scaled so that the least is 0 and the most,
+itself, is 1.
+"""
 
 
 def shared_points(
-    points: NDArray[np.float32], depth: NDArray[np.float32], poses: NDArray[np.float64], intrinsics: NDArray[np.float64]
+    points: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    poses: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
 ) -> NDArray[np.float32]:
     """Share of the points visible from each view that each view sees.
 
-    A point is seen if it is not hidden behind the depth of the pixel that it falls on, or of one beside it: on slopes
-    and on the silhouette, half a pixel would decide.
+    A point is seen if it is not hidden behind the depth of the pixel that it falls on, or of one
+    beside it: on slopes and on the silhouette, half a pixel would decide.
 
-    ``points`` (V, P, 3), object frame, are visible from each view; ``depth`` is (V, H, W); ``poses`` (V, 4, 4).
+    ``points`` (V, P, 3), object frame, are visible from each view; ``depth`` is (V, H, W);
+    ``poses`` (V, 4, 4).
 
     Returns:
-        (V, V) float32: row = view whose points they are, column = view that sees them; 0 for a view of nothing.
+        (V, V) float32: row = view whose points they are, column = view that sees them; 0 for a view
+        of nothing.
     """
     v, count, _ = points.shape
     height, width = depth.shape[1:]
@@ -51,10 +60,20 @@ def shared_points(
     share = np.zeros((v, v), np.float32)
     for other in range(v):
         p = np.pad(depth[other], 1)  # the largest depth of each pixel and the four beside it
-        reach = np.maximum.reduce([depth[other], p[:-2, 1:-1], p[2:, 1:-1], p[1:-1, :-2], p[1:-1, 2:]])
+        reach = np.maximum.reduce(
+            [depth[other], p[:-2, 1:-1], p[2:, 1:-1], p[1:-1, :-2], p[1:-1, 2:]]
+        )
         x, y, z = ((cloud - poses[other, :3, 3]) @ poses[other, :3, :3]).T
-        column = np.floor(x / z * intrinsics[0, 0] + intrinsics[0, 2]).astype(np.int64).clip(0, width - 1)
-        row = np.floor(y / z * intrinsics[1, 1] + intrinsics[1, 2]).astype(np.int64).clip(0, height - 1)
+        column = (
+            np.floor(x / z * intrinsics[0, 0] + intrinsics[0, 2])
+            .astype(np.int64)
+            .clip(0, width - 1)
+        )
+        row = (
+            np.floor(y / z * intrinsics[1, 1] + intrinsics[1, 2])
+            .astype(np.int64)
+            .clip(0, height - 1)
+        )
         share[:, other] = (z < reach[row, column] + TOLERANCE).reshape(v, count).mean(1)
     return share * np.any(depth, axis=(1, 2))[:, None]
 
@@ -69,14 +88,17 @@ def overlap_figure(maps: NDArray[np.floating], sphere: ViewSphere, title: str) -
 
     ``maps`` are (V, V) from 0 to 1; row = the view, column = the other view.
     """
-    rings, azimuths = sphere.rings, sphere.azimuths
+    rings = sphere.rings
+    azimuths = sphere.azimuths
     figure = PlainFigure(figsize=(1.65 * azimuths + 1.2, 1.15 * rings + 1.3), layout="constrained")
     figure.suptitle(title, fontsize=13)
     panels = figure.subplots(rings, azimuths, squeeze=False)
     for view in range(len(sphere)):
         ring, azimuth = divmod(view, azimuths)
         axes = panels[rings - 1 - ring, azimuth]
-        shown = axes.imshow(maps[view].reshape(rings, azimuths), origin="lower", vmin=0, vmax=1, aspect="auto")
+        shown = axes.imshow(
+            maps[view].reshape(rings, azimuths), origin="lower", vmin=0, vmax=1, aspect="auto"
+        )
         axes.plot(azimuth, ring, "o", color="white", markeredgecolor="black", markersize=5)
         axes.set(xticks=[], yticks=[])
         if ring == 0:
@@ -85,7 +107,9 @@ def overlap_figure(maps: NDArray[np.floating], sphere: ViewSphere, title: str) -
             axes.set_ylabel(f"{sphere.angles(view)[0]:g}°")
     figure.supxlabel("azimuth", fontsize=11)
     figure.supylabel("elevation", fontsize=11)
-    figure.colorbar(shown, ax=panels, label="share of the view's points, scaled", shrink=0.8, pad=0.01)
+    figure.colorbar(
+        shown, ax=panels, label="share of the view's points, scaled", shrink=0.8, pad=0.01
+    )
     return figure
 
 
@@ -100,8 +124,8 @@ def overlap(
 ) -> None:
     """How much of what one view shows is seen from each other view, averaged over the objects.
 
-    OUT.npz gets the mean ``share`` (V, V) and the mean ``maps``, each row of an object scaled to [0, 1] first, and
-    OUT.png the picture.
+    OUT.npz gets the mean ``share`` (V, V) and the mean ``maps``, each row of an object scaled to
+    [0, 1] first, and OUT.png the picture.
 
     Args:
         store: view store made by nextview render.
@@ -111,14 +135,20 @@ def overlap(
         scheduler: address of a dask.distributed scheduler to use instead.
         overwrite: replace the two files if they exist.
     """
-    views, arrays, picture = ViewStore.open(store), Path(f"{out}.npz"), Path(f"{out}.png")
+    views = ViewStore.open(store)
+    arrays = Path(f"{out}.npz")
+    picture = Path(f"{out}.png")
     for path in (arrays, picture):
         check_new(path, overwrite)
     if label is not None and label not in views.classes:
         raise DatasetError(f"{store}: has no class {label!r}; there are {', '.join(views.classes)}")
-    select = np.flatnonzero(views.done & (True if label is None else views.labels == views.classes.index(label)))
+    select = np.flatnonzero(
+        views.done & (True if label is None else views.labels == views.classes.index(label))
+    )
     if len(select) == 0:
-        raise DatasetError(f"{store}: holds no rendered object" + (f" of the class {label!r}" if label else ""))
+        raise DatasetError(
+            f"{store}: holds no rendered object" + (f" of the class {label!r}" if label else "")
+        )
     share, maps = np.zeros((2, len(views.sphere), len(views.sphere)))
 
     def sums() -> Iterator[int]:
@@ -131,7 +161,9 @@ def overlap(
             yield count
 
     track(sums(), len(select), f"overlap in {store.name}")
-    title = f"Overlap of views, mean over {len(select):,} objects" + (f" of the class {label}" if label else "")
+    title = f"Overlap of views, mean over {len(select):,} objects" + (
+        f" of the class {label}" if label else ""
+    )
     with new_file(arrays, overwrite) as part:
         np.savez(part, share=share, maps=maps, objects=len(select))
     with new_file(picture, overwrite) as part:

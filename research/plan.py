@@ -1,9 +1,12 @@
-"""Where policies that decide by the depth seen so far go, from every first view of every object, into a store.
+"""Where policies that decide by the depth seen so far go, from every first view of every object,
+into a store.
 
-    python -m research.plan views.zarr research.volumetric:Volumetric research.volumetric:coverage [--split test]
+    python -m research.plan views.zarr research.volumetric:Volumetric research.volumetric:coverage
+    [--split test]
 
-The replay of predictions holds no depth. But the way of such a policy depends on nothing else: not on what the models
-say, nor on a threshold. So it is found once, by the episode loop itself, and the benchmark goes it.
+The replay of predictions holds no depth. But the way of such a policy depends on nothing else: not
+on what the models say, nor on a threshold. So it is found once, by the episode loop itself, and the
+benchmark goes it.
 """
 
 from __future__ import annotations
@@ -38,7 +41,8 @@ def plan(
     scheduler: str | None = None,
     objects: NDArray[np.int64] | None = None,
 ) -> Iterator[tuple[int, int]]:
-    """Put the views that policies take into a store, as ``plans/NAME`` (N, V, K) float32: row V from first view V.
+    """Put the views that policies take into a store, as ``plans/NAME`` (N, V, K) float32: row V
+    from first view V.
 
     Args:
         path: the store.
@@ -61,18 +65,21 @@ def plan(
         needs = tuple(make_policy(name, store.sphere).needs)
         if needs != ("observations",):
             raise DatasetError(
-                f"policy {name} needs {', '.join(needs) or 'nothing that was seen'}; planned are those that need the "
-                "depth that was seen and nothing else"
+                f"policy {name} needs {', '.join(needs) or 'nothing that was seen'}; planned are"
+                " those that need the depth that was seen and nothing else"
             )
     arrays = [f"plans/{name}" for name in names]
     yield from keep(path, arrays, partial(_plan, names), workers, scheduler, objects=objects)
 
 
 def _plan(names: tuple[str, ...], store: ViewStore, i: int) -> Made:
-    sphere, sight = store.sphere, SceneSight.of(store, [store.names[i]])
+    sphere = store.sphere
+    sight = SceneSight.of(store, [store.names[i]])
     scenes = None if sight is None else scene_views(store, i)
     views = [
-        Observation(depth, pose, store.intrinsics, scene=None if scenes is None else scenes.scene_view(view))
+        Observation(
+            depth, pose, store.intrinsics, scene=None if scenes is None else scenes.scene_view(view)
+        )
         for view, (depth, pose) in enumerate(zip(store.depth(i), sphere.poses, strict=True))
     ]
 
@@ -81,10 +88,13 @@ def _plan(names: tuple[str, ...], store: ViewStore, i: int) -> Made:
 
     found = {}
     for name in names:
-        starts, length = np.arange(len(sphere)), FixedLength(max_views=PLANNED)
+        starts = np.arange(len(sphere))
+        length = FixedLength(max_views=PLANNED)
         constrain, _ = sight_of(sight, np.zeros(len(sphere), np.int64))
         rng = np.random.default_rng(0)
-        episodes = run_episodes(observe, sphere, make_policy(name, sphere), starts, length, rng, constrain=constrain)
+        episodes = run_episodes(
+            observe, sphere, make_policy(name, sphere), starts, length, rng, constrain=constrain
+        )
         found[f"plans/{name}"] = episodes.outcome.views.astype(np.float32)
     return found
 
@@ -99,7 +109,8 @@ def main(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> None:
-    """Find the way of geometric policies from every first view of every object, and keep it in the store.
+    """Find the way of geometric policies from every first view of every object, and keep it in the
+    store.
 
     Resumes where it was.
 
@@ -107,12 +118,19 @@ def main(
         store: view store made by nextview render.
         names: of the policies, MODULE:CLASS or an installed one.
         split: only this split.
-        held_out: only the objects that this model, bundled or a card (NAME.json), calls held out of its training.
+        held_out: only the objects that this model, bundled or a card (NAME.json), calls held out of
+            its training.
         objects: only so many of these, spread evenly; twice as many later hold the same.
         workers: processes; one for each core by default.
         scheduler: address of a dask.distributed scheduler to use instead.
     """
-    steps = plan(store, names, workers, scheduler, some_objects(ViewStore.open(store), split, held_out, objects))
+    steps = plan(
+        store,
+        names,
+        workers,
+        scheduler,
+        some_objects(ViewStore.open(store), split, held_out, objects),
+    )
     before, total = follow(steps, f"planning {store.name}")
     say_done(store, "planned", before, total)
 

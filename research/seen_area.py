@@ -8,20 +8,25 @@ from numpy.typing import NDArray
 from research.mesh_view import MeshView
 
 GRAZING = 0.05
-"""Where a surface turns farther from the camera than this cosine, it counts as turned so far: one row of pixels more or
-less on a plane that is seen from its edge would else decide over as much area as all the rest."""
+"""Where a surface turns farther from the camera than this cosine, it counts as turned so far: one
+row of pixels more or less on a plane that is seen from its edge would else decide over as much area
+as all the rest."""
 
 
 def seen_area(view: MeshView) -> NDArray[np.float64]:
-    """How much is seen of each of the faces in ``view.pixels``, (k,), square object radii; computed once for a view.
+    """How much is seen of each of the faces in ``view.pixels``, (k,), square object radii; computed
+    once for a view.
 
-    A pixel shows z^2 / (fx fy |n . r|) of a face: z is its depth, n the face's unit normal, r the pixel's ray whose
-    z is 1. z |n . r| is how far the camera is from the face's plane. Pixels are samples: of a face smaller than
-    one, more may be counted than there is, and of others none; over many it evens out.
+    A pixel shows z^2 / (fx fy |n . r|) of a face: z is its depth, n the face's unit normal, r the
+    pixel's ray whose z is 1. z |n . r| is how far the camera is from the face's plane. Pixels are
+    samples: of a face smaller than one, more may be counted than there is, and of others none; over
+    many it evens out.
     """
     if "seen_area" not in view.__dict__:
-        faces, hits = view.pixels[0], view.faces >= 0
-        ids, z = view.faces[hits], view.depths[hits]
+        faces = view.pixels[0]
+        hits = view.faces >= 0
+        ids = view.faces[hits]
+        z = view.depths[hits]
         corners = view.surface.vertices[view.surface.faces[faces, 0]]
         apart = np.zeros(int(faces[-1]) + 1 if len(faces) else 0)
         apart[faces] = np.abs(((corners - view.pose[:3, 3]) * view.surface.normals[faces]).sum(1))

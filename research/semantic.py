@@ -7,18 +7,24 @@ import numpy as np
 from nextview.data.measures import MeasuredView
 from research.mesh_view import MeshView
 
-LIKED, SPREAD = 22.5, 45.0
-"""Elevation that people like best, and the width of their liking, degrees (Secord et al. 2011, after Blanz et al.)."""
-BASE, DOWN = 0.05, 0.7
-"""What belongs to the base: the lowest part of the object's height, of surfaces that face down at least so far: the
-cosine of 45 degrees."""
+LIKED = 22.5
+SPREAD = 45.0
+"""Elevation that people like best, and the width of their liking, degrees (Secord et al. 2011,
+after Blanz et al.).
+"""
+BASE = 0.05
+DOWN = 0.7
+"""What belongs to the base: the lowest part of the object's height, of surfaces that face down at
+least so far: the cosine of 45 degrees."""
 
 
 def above_preference(view: MeasuredView) -> float:
-    """How near the view is to the elevation that people choose: a normal curve about 22.5 degrees above the horizon.
+    """How near the view is to the elevation that people choose: a normal curve about 22.5 degrees
+    above the horizon.
 
-    Secord et al. 2011 ("above preference": mean 3/8 pi from the pole, standard deviation pi/4); thesis, section 3.4.5.
-    It knows nothing of the object, but where nothing is seen there is nothing to like.
+    Secord et al. 2011 ("above preference": mean 3/8 pi from the pole, standard deviation pi/4);
+    thesis, section 3.4.5. It knows nothing of the object, but where nothing is seen there is
+    nothing to like.
 
     Returns:
         1 at that elevation, less above and below; 0 where nothing is seen.
@@ -31,10 +37,11 @@ def above_preference(view: MeasuredView) -> float:
 
 
 def base_avoidance(view: MeshView) -> float:
-    """Share of the visible pixels that do not show the object's base: the underside of its lowest part.
+    """Share of the visible pixels that do not show the object's base: the underside of its lowest
+    part.
 
-    Secord et al. 2011 ("base"), turned round so that more is better; thesis, section 3.4.5. The base is seen from below
-    the horizon only: from the 40 views this is 1 always, or nearly.
+    Secord et al. 2011 ("base"), turned round so that more is better; thesis, section 3.4.5. The
+    base is seen from below the horizon only: from the 40 views this is 1 always, or nearly.
 
     Returns:
         Between 0 and 1; 0 where nothing is seen.
@@ -47,6 +54,7 @@ def base_avoidance(view: MeshView) -> float:
     towards = ((view.pose[:3, 3] - surface.vertices[surface.faces[faces]].mean(1)) * normals).sum(1)
     down = -normals[:, 2] * np.sign(towards)
     heights = surface.vertices[:, 2]
-    low, high = heights.min(), heights.max()
+    low = heights.min()
+    high = heights.max()
     base = (down > DOWN) & (heights[surface.faces[faces]].max(1) < low + BASE * (high - low))
     return float(1 - pixels[base].sum() / pixels.sum())

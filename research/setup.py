@@ -14,9 +14,16 @@ class BuildModules(build_py):
 
     def find_package_modules(self, package: str, package_dir: str) -> list[Any]:
         """Tuples of package, module and file."""
-        return [found for found in super().find_package_modules(package, package_dir) if found[1] != "setup"]
+        return [
+            found
+            for found in super().find_package_modules(package, package_dir)
+            if found[1] != "setup"
+        ]
 
 
 built = tempfile.mkdtemp(prefix="nextview-research-")
 atexit.register(shutil.rmtree, built, ignore_errors=True)
-setup(cmdclass={"build_py": BuildModules}, options={"build": {"build_base": built}, "egg_info": {"egg_base": built}})
+setup(
+    cmdclass={"build_py": BuildModules},
+    options={"build": {"build_base": built}, "egg_info": {"egg_base": built}},
+)

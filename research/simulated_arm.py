@@ -2,11 +2,12 @@
 
     python -m research.simulated_arm DATASET/ModelNet10 episodes.jsonl [--objects 50] [--runs 1]
 
-Test objects of 10 cm radius stand on a table, turned at random; the camera on the wrist is a simulated stereo camera
-(``cameras.sensors``, "stereo"), 0.4 m away. Each policy starts from the same places with the same errors, and goes
-only where the arm can: joints are found by inverse kinematics, nothing is touched, and a way of at most two straight
-lines in joint space leads there. What moves cost is seconds at the joints' velocity limits. Episodes are appended to
-the file; the same command goes on where it was stopped, and prints the table at the end.
+Test objects of 10 cm radius stand on a table, turned at random; the camera on the wrist is a
+simulated stereo camera (``cameras.sensors``, "stereo"), 0.4 m away. Each policy starts from the
+same places with the same errors, and goes only where the arm can: joints are found by inverse
+kinematics, nothing is touched, and a way of at most two straight lines in joint space leads there.
+What moves cost is seconds at the joints' velocity limits. Episodes are appended to the file; the
+same command goes on where it was stopped, and prints the table at the end.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ from research.arm import Arm, first_joints
 DISTANCE = 0.4
 """Of the camera from the object, metres."""
 HORIZON = 10.0
-"""Seconds of motion that an episode counts which does not end right; the longest one is printed with the table."""
+"""Seconds of motion that an episode counts which does not end right; the longest one is printed
+with the table.
+"""
 POLICIES = ("gain", "gain, in cells", "nearest", "random")
 
 
@@ -74,52 +77,73 @@ class Settings:
 def systems(models: str) -> dict[str, nextview.System]:
     """By policy."""
     gain = nextview.load(models, policy="gain", threads=1)
-    made = {"gain": gain, "gain, in cells": gain, "random": nextview.load(models, policy="random-all", threads=1)}
+    made = {
+        "gain": gain,
+        "gain, in cells": gain,
+        "random": nextview.load(models, policy="random-all", threads=1),
+    }
     return made | {"nearest": replace(gain, policy=Nearest(gain.sphere), policy_name="nearest")}
 
 
 def begin(mesh: nextview.Mesh, settings: Settings, which: tuple[int, int]) -> Arm:
     """The arm at a first view of an object: a direction that is drawn until one can be reached."""
     rng = np.random.default_rng([settings.seed, *which])
-    arm, joints = Arm(mesh, rng, settings.radius), None
+    arm = Arm(mesh, rng, settings.radius)
+    joints = None
     while joints is None:
-        joints = first_joints(arm, np.radians(rng.uniform(10, 60)), rng.uniform(0, 2 * np.pi), DISTANCE)
+        joints = first_joints(
+            arm, np.radians(rng.uniform(10, 60)), rng.uniform(0, 2 * np.pi), DISTANCE
+        )
     arm.joints = joints
     return arm
 
 
 def episode(arm: Arm, system: nextview.System, name: str, label: str, seed: int) -> dict[str, Any]:
-    """One episode: after each view the seconds moved so far, and whether the class believed most is right."""
+    """One episode: after each view the seconds moved so far, and whether the class believed most
+    is right.
+    """
     session = system.session(object=ObservedObject(life_size=False), distance=DISTANCE, seed=seed)
-    right, moved = [], []
+    right = []
+    moved = []
 
     def looked() -> None:
         right.append(session.models.classes[int(session.views[-1].belief.argmax())] == label)
         moved.append(arm.seconds)
 
     result = arm.run(session, looked, costs=name != "gain, in cells")
-    kept = len(right) - right[::-1].index(False) if False in right else 0  # the first view after which it stays right
+    # the first view after which it stays right
+    kept = len(right) - right[::-1].index(False) if False in right else 0
     until = moved[kept] if kept < len(right) else HORIZON
     return {
-        "right": right[-1], "confident": result.confident, "views": len(right), "moved": moved[-1],
-        "until": until, "refused": arm.refused,
-    }  # fmt: skip
+        "right": right[-1],
+        "confident": result.confident,
+        "views": len(right),
+        "moved": moved[-1],
+        "until": until,
+        "refused": arm.refused,
+    }
 
 
 def run(settings: Settings, done: dict[tuple[str, int, str], dict[str, Any]]) -> Iterator[int]:
     """Append what is missing; yields how many episodes are done."""
     entries = [entry for entry in list_dataset(settings.dataset) if entry.split == "test"]
     entries = entries[:: len(entries) // settings.objects][: settings.objects]
-    by_policy, count = systems(settings.models), 0
+    by_policy = systems(settings.models)
+    count = 0
     with settings.episodes.open("a", buffering=1) as file:
         for start in range(settings.runs):
             for i, entry in enumerate(entries):
                 asked = [(entry.path.stem, start, name) for name in POLICIES]
                 ended = next((done[each] for each in asked if each in done), {"views": 0})
-                for name in (each for *_, each in asked if (entry.path.stem, start, each) not in done):
-                    if ended["views"] != 1:  # the first view is the same for all, and no policy chose it
+                for name in (
+                    each for *_, each in asked if (entry.path.stem, start, each) not in done
+                ):
+                    # the first view is the same for all, and no policy chose it
+                    if ended["views"] != 1:
                         arm = begin(nextview.load_mesh(entry.path), settings, (i, start))
-                        ended = episode(arm, by_policy[name], name, entry.label, settings.seed + start)
+                        ended = episode(
+                            arm, by_policy[name], name, entry.label, settings.seed + start
+                        )
                     row = {"object": entry.path.stem, "start": start, **ended, "policy": name}
                     file.write(json.dumps(row) + "\n")
                 count += len(POLICIES)
@@ -127,7 +151,9 @@ def run(settings: Settings, done: dict[tuple[str, int, str], dict[str, Any]]) ->
 
 
 def table(rows: list[dict[str, Any]], samples: int = 2000) -> Iterator[str]:
-    """Means and 95 % intervals of a bootstrap over objects, and the difference to gain on the same starts."""
+    """Means and 95 % intervals of a bootstrap over objects, and the difference to gain on the
+    same starts.
+    """
     objects = sorted({row["object"] for row in rows})
     rng = np.random.default_rng(0)
     drawn = rng.integers(len(objects), size=(samples, len(objects)))
@@ -135,7 +161,10 @@ def table(rows: list[dict[str, Any]], samples: int = 2000) -> Iterator[str]:
     def of(policy: str, what: str) -> np.ndarray:
         """The mean of each object, (objects,)."""
         return np.array(
-            [np.mean([r[what] for r in rows if r["policy"] == policy and r["object"] == name]) for name in objects]
+            [
+                np.mean([r[what] for r in rows if r["policy"] == policy and r["object"] == name])
+                for name in objects
+            ]
         )
 
     def shown(values: np.ndarray, digits: int) -> str:
@@ -146,19 +175,33 @@ def table(rows: list[dict[str, Any]], samples: int = 2000) -> Iterator[str]:
     yield "|---|---|---|---|---|---|"
     for policy in POLICIES:
         less = "" if policy == "gain" else shown(of(policy, "until") - of("gain", "until"), 2)
-        cells = [shown(of(policy, "right"), 3), shown(of(policy, "views"), 2), shown(of(policy, "moved"), 2)]
+        cells = [
+            shown(of(policy, "right"), 3),
+            shown(of(policy, "views"), 2),
+            shown(of(policy, "moved"), 2),
+        ]
         yield f"| {policy} | {' | '.join(cells)} | {shown(of(policy, 'until'), 2)} | {less} |"
 
 
 def main(settings: Settings) -> None:
     """Run the episodes that the file lacks, and print the table."""
-    rows = [json.loads(line) for line in settings.episodes.open()] if settings.episodes.exists() else []
+    rows = (
+        [json.loads(line) for line in settings.episodes.open()]
+        if settings.episodes.exists()
+        else []
+    )
     done = {(row["object"], row["start"], row["policy"]): row for row in rows}
     track(run(settings, done), settings.objects * settings.runs * len(POLICIES), "recognising")
-    rows = [row for row in map(json.loads, settings.episodes.open()) if row["start"] < settings.runs]
+    rows = [
+        row for row in map(json.loads, settings.episodes.open()) if row["start"] < settings.runs
+    ]
     print("\n".join(table(rows)))
-    longest, moves = max(row["moved"] for row in rows), sum(row["views"] - 1 for row in rows)
-    print(f"{len(rows)} episodes; {moves} moves, the longest episode {longest:.1f} s; settings {asdict(settings)}")
+    longest = max(row["moved"] for row in rows)
+    moves = sum(row["views"] - 1 for row in rows)
+    print(
+        f"{len(rows)} episodes; {moves} moves, the longest episode {longest:.1f} s; settings"
+        f" {asdict(settings)}"
+    )
 
 
 if __name__ == "__main__":

@@ -1,14 +1,16 @@
-"""Make the features that taught things are remembered by: three frozen networks and a projection of what they say.
+"""Make the features that taught things are remembered by: three frozen networks and a projection of
+what they say.
 
-    python -m research.thing_features data/ModelNet10 efficientnet-lite0-57934424.pth features [--things 600]
+    python -m research.thing_features data/ModelNet10 efficientnet-lite0-57934424.pth features
+    [--things 600]
 
-The networks are the two of the bundled recogniser and an EfficientNet-Lite0 with the weights of ImageNet. The
-projection to 256 numbers begins as a linear discriminant of the same view without and with a sensor's errors. It is
-then trained so that a view through a sensor finds the mean of a clean view and one through another sensor among those
-of all things in the batch (InfoNCE). Half of the meshes are laid down first, a quarter stretched. Of three
-projections (the discriminant alone, this one, one trained against the views of all things at once) this one named
-most right of 60 objects of twelve Princeton classes and 26 chairs that no network was trained on. Writes
-features.onnx.
+The networks are the two of the bundled recogniser and an EfficientNet-Lite0 with the weights of
+ImageNet. The projection to 256 numbers begins as a linear discriminant of the same view without and
+with a sensor's errors. It is then trained so that a view through a sensor finds the mean of a clean
+view and one through another sensor among those of all things in the batch (InfoNCE). Half of the
+meshes are laid down first, a quarter stretched. Of three projections (the discriminant alone, this
+one, one trained against the views of all things at once) this one named most right of 60 objects of
+twelve Princeton classes and 26 chairs that no network was trained on. Writes features.onnx.
 """
 
 from __future__ import annotations
@@ -45,8 +47,12 @@ from nextview.recognition.network_input import from_observations
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
 
-VIEWS, SETUP, DIM = 16, 8, 256
-MIDDLE, SPREAD = 0.449, 0.226  # of ImageNet's pixels
+VIEWS = 16
+SETUP = 8
+DIM = 256
+# of ImageNet's pixels
+MIDDLE = 0.449
+SPREAD = 0.226
 LYING = ([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
 HIGHEST = np.sin(np.radians(75))
 NEAR = 0.35  # views are told from those of about the same elevation, radians
@@ -72,12 +78,22 @@ def networks(lite: Path) -> tuple[OnnxFile, OnnxFile]:
 
 
 def look(lite: Path, mesh: Path, seed: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Clean features (V, D), those through two sensors (2, V, D), where all is seen (V,), and elevations (V,)."""
-    rng, thing = np.random.default_rng(seed), load_mesh(mesh)
+    """Clean features (V, D), those through two sensors (2, V, D), where all is seen (V,), and
+    elevations (V,).
+    """
+    rng = np.random.default_rng(seed)
+    thing = load_mesh(mesh)
     if rng.random() < 0.5:
-        vertices = thing.vertices * np.exp(rng.uniform(-0.5, 0.5, 3)) if rng.random() < 0.5 else thing.vertices
-        thing = make_mesh(vertices @ np.array(LYING[rng.integers(2)]).T * rng.choice([-1, 1]), thing.faces)
-    elevation, azimuth = np.arcsin(rng.uniform(-0.05, HIGHEST, VIEWS)), rng.uniform(0, 2 * np.pi, VIEWS)
+        vertices = (
+            thing.vertices * np.exp(rng.uniform(-0.5, 0.5, 3))
+            if rng.random() < 0.5
+            else thing.vertices
+        )
+        thing = make_mesh(
+            vertices @ np.array(LYING[rng.integers(2)]).T * rng.choice([-1, 1]), thing.faces
+        )
+    elevation = np.arcsin(rng.uniform(-0.05, HIGHEST, VIEWS))
+    azimuth = rng.uniform(0, 2 * np.pi, VIEWS)
     poses = look_at_origin(elevation, azimuth)
     clean = SimulatedCamera(thing)
     seen = [[clean.observe(pose) for pose in poses]]
@@ -96,12 +112,15 @@ def look(lite: Path, mesh: Path, seed: int) -> tuple[NDArray, NDArray, NDArray, 
 
 
 def discriminant(clean: NDArray, sensed: NDArray, middle: NDArray) -> NDArray:
-    """Directions, (D, DIM), of much variance among all views and little between a view and itself through a sensor."""
+    """Directions, (D, DIM), of much variance among all views and little between a view and
+    itself through a sensor.
+    """
     d = clean.shape[-1]
     every = np.concatenate([clean.reshape(-1, d), sensed.reshape(-1, d)]) - middle
     pairs = (clean - sensed[:, 0], clean - sensed[:, 1], sensed[:, 0] - sensed[:, 1])
     same = np.concatenate([pair.reshape(-1, d) for pair in pairs])
-    total, within = every.T @ every / len(every), same.T @ same / len(same) / 2
+    total = every.T @ every / len(every)
+    within = same.T @ same / len(same) / 2
     values, axes = np.linalg.eigh(within + 0.1 * np.trace(total) / d * np.eye(d))
     white = axes / np.sqrt(values)
     return (white @ np.linalg.eigh(white.T @ total @ white)[1][:, ::-1][:, :DIM]).astype(np.float32)
@@ -111,13 +130,18 @@ def train(
     clean: NDArray, sensed: NDArray, seen: NDArray, elevation: NDArray, steps: int, seed: int
 ) -> tuple[NDArray, NDArray]:
     """The middle of the features, (D,), and the projection, (D, DIM)."""
-    rng, middle = np.random.default_rng(seed), np.concatenate([clean[:, None], sensed], 1).mean((0, 1, 2))
+    rng = np.random.default_rng(seed)
+    middle = np.concatenate([clean[:, None], sensed], 1).mean((0, 1, 2))
     first = torch.tensor(discriminant(clean, sensed, middle))
-    projection, scale = nn.Parameter(first.clone()), nn.Parameter(torch.tensor(np.log(20.0)))
+    projection = nn.Parameter(first.clone())
+    scale = nn.Parameter(torch.tensor(np.log(20.0)))
     rate = 0.02 * float(first.abs().mean())
     optimiser = torch.optim.Adam([{"params": [projection]}, {"params": [scale]}])
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, max_lr=[rate, 1e-2], total_steps=steps)
-    own, through = torch.tensor(clean - middle), torch.tensor(sensed - middle)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, max_lr=[rate, 1e-2], total_steps=steps
+    )
+    own = torch.tensor(clean - middle)
+    through = torch.tensor(sensed - middle)
 
     def project(x: torch.Tensor) -> torch.Tensor:
         return F.normalize(x @ projection, dim=1)
@@ -125,7 +149,9 @@ def train(
     for _ in range(steps):
         objects = np.repeat(rng.choice(len(clean), min(96, len(clean)), replace=False), 6)
         views = np.concatenate([rng.permutation(VIEWS)[:6] for _ in range(len(objects) // 6)])
-        memory = F.normalize(project(own[objects, views]) + project(through[objects, 1, views]), dim=1)
+        memory = F.normalize(
+            project(own[objects, views]) + project(through[objects, 1, views]), dim=1
+        )
         logits = project(through[objects, 0, views]) @ memory.T * scale.exp()
         e = torch.tensor(elevation[objects, views])
         logits = logits.masked_fill((e[:, None] - e).abs() > NEAR, -1e4)
@@ -142,15 +168,25 @@ def train(
 def joined(lite: Path, middle: NDArray, projection: NDArray, out: Path) -> None:
     """Write one network: both files side by side, then the projection to unit vectors."""
     part = out.with_suffix(".part.onnx")
-    utils.extract_model(str(read_card(BUNDLED / f"{RECOGNISER}.json").path), str(part), ["input"], ["features"])
-    graphs = [compose.add_prefix(onnx.load(path), name) for path, name in ((part, "pair_"), (lite, "lite_"))]
+    utils.extract_model(
+        str(read_card(BUNDLED / f"{RECOGNISER}.json").path), str(part), ["input"], ["features"]
+    )
+    graphs = [
+        compose.add_prefix(onnx.load(path), name)
+        for path, name in ((part, "pair_"), (lite, "lite_"))
+    ]
     part.unlink()
     nodes = [node for graph in graphs for node in graph.graph.node]
     for node in nodes:
-        node.input[:] = ["input" if name in ("pair_input", "lite_input") else name for name in node.input]
+        node.input[:] = [
+            "input" if name in ("pair_input", "lite_input") else name for name in node.input
+        ]
     constants = [numpy_helper.from_array(middle.astype(np.float32), "middle")]
     constants += [numpy_helper.from_array(projection.astype(np.float16), "small")]
-    constants += [numpy_helper.from_array(np.array([1]), "axis"), numpy_helper.from_array(np.float32(1e-9), "least")]
+    constants += [
+        numpy_helper.from_array(np.array([1]), "axis"),
+        numpy_helper.from_array(np.float32(1e-9), "least"),
+    ]
     made = [
         ("Concat", ["pair_features", "lite_features"], "joined", {"axis": 1}),
         ("Sub", ["joined", "middle"], "centred", {}),
@@ -160,23 +196,43 @@ def joined(lite: Path, middle: NDArray, projection: NDArray, out: Path) -> None:
         ("Max", ["length", "least"], "longer", {}),
         ("Div", ["projected", "longer"], "embedding", {}),
     ]
-    nodes += [helper.make_node(kind, inputs, [output], **more) for kind, inputs, output, more in made]
-    ends = (("input", TensorProto.UINT8, ["batch", 4, 112, 112]), ("embedding", TensorProto.FLOAT, ["batch", DIM]))
+    nodes += [
+        helper.make_node(kind, inputs, [output], **more) for kind, inputs, output, more in made
+    ]
+    ends = (
+        ("input", TensorProto.UINT8, ["batch", 4, 112, 112]),
+        ("embedding", TensorProto.FLOAT, ["batch", DIM]),
+    )
     given, gives = ([helper.make_tensor_value_info(*end)] for end in ends)
     weights = [w for graph in graphs for w in graph.graph.initializer] + constants
     graph = helper.make_graph(nodes, "features", given, gives, weights)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=graphs[0].ir_version)
+    model = helper.make_model(
+        graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=graphs[0].ir_version
+    )
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, out)
 
 
-def main(dataset: Path, checkpoint: Path, out: Path, things: int = 600, steps: int = 1200, seed: int = 0) -> None:
-    """Make features.onnx in a folder from the training meshes that the bundled recogniser was trained on."""
+def main(
+    dataset: Path, checkpoint: Path, out: Path, things: int = 600, steps: int = 1200, seed: int = 0
+) -> None:
+    """Make features.onnx in a folder from the training meshes that the bundled recogniser was
+    trained on.
+    """
     out.mkdir(parents=True, exist_ok=True)
     lite = out / "lite.onnx"
-    export_onnx(LiteFeatures(checkpoint), np.zeros((2, 4, 112, 112), np.uint8), "input", ["features"], lite, 8)
+    export_onnx(
+        LiteFeatures(checkpoint),
+        np.zeros((2, 4, 112, 112), np.uint8),
+        "input",
+        ["features"],
+        lite,
+        8,
+    )
     held_out = set(read_card(BUNDLED / f"{RECOGNISER}.json").held_out)
-    meshes = [e.path for e in list_dataset(dataset) if e.split == "train" and e.name not in held_out]
+    meshes = [
+        e.path for e in list_dataset(dataset) if e.split == "train" and e.name not in held_out
+    ]
     chosen = [meshes[i] for i in np.random.default_rng(seed).permutation(len(meshes))[:things]]
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
         found = list(pool.map(look, [lite] * len(chosen), chosen, range(len(chosen))))

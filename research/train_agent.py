@@ -1,11 +1,13 @@
-"""Learn to choose views by reinforcement: from predictions to a policy card, and its network as ONNX beside it.
+"""Learn to choose views by reinforcement: from predictions to a policy card, and its network as
+ONNX beside it.
 
     python -m research.train_agent ppo validation.npz agents/ppo.json [--steps 1000000 ...]
     python -m research.train_agent mvselect validation.npz agents/mvselect.json
 
-The card is one of a gain policy: the network takes and gives what that of ``Gain`` does, so it is read and run in the
-same way (``nextview benchmark test.npz --policies agents/ppo.json``). But its scores are the action values of
-Q-learning, or the logits of a policy gradient's actor, and the highest free view wins.
+The card is one of a gain policy: the network takes and gives what that of ``Gain`` does, so it is
+read and run in the same way (``nextview benchmark test.npz --policies agents/ppo.json``). But its
+scores are the action values of Q-learning, or the logits of a policy gradient's actor, and the
+highest free view wins.
 """
 
 from __future__ import annotations
@@ -62,8 +64,8 @@ def train_agent(
 ) -> TrainedAgent:
     """Train an agent on predictions of objects that the recogniser was not trained on.
 
-    One part of the objects is held out; the agent is judged on these from time to time, as it will be used, and the one
-    with the best objective less prices is kept.
+    One part of the objects is held out; the agent is judged on these from time to time, as it will
+    be used, and the one with the best objective less prices is kept.
 
     Args:
         predictions: of such objects of the training split.
@@ -74,7 +76,8 @@ def train_agent(
     Raises:
         UsageError: the card is not called NAME.json.
         ResultsError: it cannot be written.
-        PredictionsError: the predictions lack what the recipe takes, or hold no objects of the training split.
+        PredictionsError: the predictions lack what the recipe takes, or hold no objects of the
+            training split.
         DatasetError: the objects cannot be divided.
         ModelError: the ONNX file does not answer as the network does; nothing is written then.
     """
@@ -86,9 +89,13 @@ def train_agent(
     judging = hold_out(table.labels, table.depth_entropy, recipe.holdout, recipe.seed)[0]
     learning = np.setdiff1d(np.arange(len(table)), judging)
     rules = Rules(
-        recipe.inputs, recipe.frame, recipe.objective, recipe.max_views,
-        view_price=recipe.view_price, travel_price=recipe.travel_price,
-    )  # fmt: skip
+        recipe.inputs,
+        recipe.frame,
+        recipe.objective,
+        recipe.max_views,
+        view_price=recipe.view_price,
+        travel_price=recipe.travel_price,
+    )
     env = TaskVectorEnv(replayed(table.of_objects(learning), "train", True, rules), recipe.envs)
     judges = ReplayTable(for_fitting(table).of_objects(judging))
     steps, policy, value = _best(env, judges, recipe, track)
@@ -99,8 +106,8 @@ def train_agent(
         table.sphere.azimuths,
         table.classes,
         {},
-        f"{len(learning)} objects of the training split, classes drawn evenly, by {recipe.algorithm.upper()}; "
-        f"{steps} steps chosen on {len(judging)} others",
+        f"{len(learning)} objects of the training split, classes drawn evenly, by"
+        f" {recipe.algorithm.upper()}; {steps} steps chosen on {len(judging)} others",
         (LearnedFrom(sha256_of(predictions), table.models),),
         ((table.calibration.temperature, table.calibration.correlation),),
         asdict(recipe),
@@ -111,8 +118,12 @@ def train_agent(
     return TrainedAgent(card, len(learning), len(judging), value, steps)
 
 
-def _best(env: TaskVectorEnv, judges: ReplayTable, recipe: AgentRecipe, track: Track) -> tuple[int, Gain, Value]:
-    """The agent that was best on the objects held out, after how many steps, and what it reaches."""
+def _best(
+    env: TaskVectorEnv, judges: ReplayTable, recipe: AgentRecipe, track: Track
+) -> tuple[int, Gain, Value]:
+    """The agent that was best on the objects held out, after how many steps, and what it
+    reaches.
+    """
     found: list[tuple[float, int, Gain, Value]] = []
     model = learner(env, recipe)
 
@@ -132,10 +143,16 @@ def _best(env: TaskVectorEnv, judges: ReplayTable, recipe: AgentRecipe, track: T
 
 def _agent(env: TaskVectorEnv, layers: Layers, recipe: AgentRecipe) -> Gain:
     task = env.task
-    width, v = len(layers[0][0]), len(task.sphere)
+    width = len(layers[0][0])
+    v = len(task.sphere)
     # A mirror that leaves everything in its place: reinforcement has not learned what is alike.
-    weights, biases = ([torch.from_numpy(part)[None].float() for part in parts] for parts in zip(*layers, strict=True))
-    score = Score(Perceptrons(weights, [bias[None] for bias in biases], np.arange(width), np.arange(v)))
+    weights, biases = (
+        [torch.from_numpy(part)[None].float() for part in parts]
+        for parts in zip(*layers, strict=True)
+    )
+    score = Score(
+        Perceptrons(weights, [bias[None] for bias in biases], np.arange(width), np.arange(v))
+    )
     return Gain(task.sphere, len(task.classes), score, recipe.inputs, frame=recipe.frame)
 
 
@@ -152,19 +169,20 @@ def main(
     /,
     recipe: tyro.conf.OmitArgPrefixes[AgentRecipe] = AgentRecipe(),
 ) -> None:
-    """Train an agent of Stable-Baselines3 on predictions of objects that the recogniser was not trained on.
+    """Train an agent of Stable-Baselines3 on predictions of objects that the recogniser was not
+    trained on.
 
     Args:
-        predictions: of objects of the training split: those that validated the recogniser, or out-of-fold predictions
-            (nextview predict --held-out).
+        predictions: of objects of the training split: those that validated the recogniser, or
+            out-of-fold predictions (nextview predict --held-out).
         out: card of the policy (.json), the network beside it (.onnx).
         recipe: how to train.
     """
     made = train_agent(predictions, out, recipe, track=track)
     console.print(
-        f"learned from {made.objects} objects; on {made.held_out} others the {recipe.objective} after 2, 3, ... views "
-        f"is {', '.join(f'{x:.4f}' for x in made.value.mean)} for {made.value.travel[-1]:.2f} cells of travel; best "
-        f"after {made.steps} steps: {out}"
+        f"learned from {made.objects} objects; on {made.held_out} others the {recipe.objective}"
+        f" after 2, 3, ... views is {', '.join(f'{x:.4f}' for x in made.value.mean)} for"
+        f" {made.value.travel[-1]:.2f} cells of travel; best after {made.steps} steps: {out}"
     )
 
 
@@ -180,4 +198,6 @@ def mvselect(
 
 if __name__ == "__main__":
     with orderly_end("run the same command again"):
-        tyro.extras.subcommand_cli_from_dict({"ppo": main, "mvselect": mvselect}, description=__doc__)
+        tyro.extras.subcommand_cli_from_dict(
+            {"ppo": main, "mvselect": mvselect}, description=__doc__
+        )

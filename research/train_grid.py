@@ -1,4 +1,5 @@
-"""The published comparison of recognisers (thesis, table 6): train them all, and judge them on the test split.
+"""The published comparison of recognisers (thesis, table 6): train them all, and judge them on the
+test split.
 
 python -m research.train_grid views.zarr runs/table6 [--depths 18] [--batches 4]
 """
@@ -39,7 +40,8 @@ from nextview.learning.runs import is_first
 from nextview.session.style import ACCENT, BLUE, legend, new_figure, percent_axis, to_png
 from research.training_curves import draw_curves
 
-TABLE, FIGURE = "grid.csv", "grid.png"
+TABLE = "grid.csv"
+FIGURE = "grid.png"
 
 
 def train_grid(
@@ -52,9 +54,11 @@ def train_grid(
     hardware: Hardware = Hardware(),
     track: Track = silently,
 ) -> Path:
-    """Train the networks of table 6, each in a folder of its own. A second call resumes what was cut off.
+    """Train the networks of table 6, each in a folder of its own. A second call resumes what was
+    cut off.
 
-    The best epoch of each is chosen on validation; the test split is used once they all are trained.
+    The best epoch of each is chosen on validation; the test split is used once they all are
+    trained.
 
     Args:
         store: the view store.
@@ -66,8 +70,9 @@ def train_grid(
         track: follows the preparation of the inputs and the tests.
 
     Returns:
-        The table, ``out / "grid.csv"``: depth, batch_size, accuracy (from one view of the test split), class_accuracy,
-        validation_class_accuracy and published, with a row for each published accuracy or one without.
+        The table, ``out / "grid.csv"``: depth, batch_size, accuracy (from one view of the test
+        split), class_accuracy, validation_class_accuracy and published, with a row for each
+        published accuracy or one without.
 
     Raises:
         UsageError: the table holds no network of these depths and batch sizes.
@@ -77,7 +82,9 @@ def train_grid(
     views = ViewStore.open(store)
     cells = {
         (depth, batch): published
-        for (depth, batch), published in published_cells(tuple(views.classes), len(views.sphere)).items()
+        for (depth, batch), published in published_cells(
+            tuple(views.classes), len(views.sphere)
+        ).items()
         if depth in (depths or (depth,)) and batch in (batches or (batch,))
     }
     if not cells:
@@ -91,7 +98,9 @@ def train_grid(
     if is_first():
         rows: list[dict[str, Any]] = []
         for (run, own), published in zip(recipes.items(), cells.values(), strict=True):
-            cell = {"depth": own.layers, "batch_size": own.batch} | _scores(run, store, views, own, track)
+            cell = {"depth": own.layers, "batch_size": own.batch} | _scores(
+                run, store, views, own, track
+            )
             rows += [cell | {"published": accuracy} for accuracy in (published or (None,))]
         with new_file(out / TABLE, True) as part, part.open("w", newline="") as file:
             table = csv.DictWriter(file, list(rows[0]))
@@ -110,13 +119,17 @@ def read_grid(table: Path) -> list[dict[str, Any]]:
     try:
         with table.open(newline="") as file:
             rows = list(csv.DictReader(file))
-        return [{name: int(x) if name in whole else float(x) if x else None for name, x in row.items()} for row in rows]
+        return [
+            {name: int(x) if name in whole else float(x) if x else None for name, x in row.items()}
+            for row in rows
+        ]
     except (ValueError, TypeError, csv.Error):
         raise ResultsError(f"{table}: is no table that research.train_grid has written") from None
 
 
 def published_cells(classes: tuple[str, ...], views: int) -> dict[tuple[int, int], list[float]]:
-    """Depth and batch size of the networks of table 6, with their published accuracies; two are given for one of them.
+    """Depth and batch size of the networks of table 6, with their published accuracies; two are
+    given for one of them.
 
     For a data set that table 6 does not have, all of its networks, without accuracies.
 
@@ -128,7 +141,9 @@ def published_cells(classes: tuple[str, ...], views: int) -> dict[tuple[int, int
     for model, batch, accuracy in published_recognisers(classes, views):
         cells.setdefault((_depth(model), batch), []).append(accuracy)
     if not cells:
-        cells = {(_depth(row["model"]), int(row["batch_size"])): [] for row in read_rows("table6_resnet")}
+        cells = {
+            (_depth(row["model"]), int(row["batch_size"])): [] for row in read_rows("table6_resnet")
+        }
     return dict(sorted(cells.items()))
 
 
@@ -154,17 +169,24 @@ def count_right(
             yield int((network(x)[0].argmax(1) == int(labels[i])).sum())
 
 
-def _scores(run: Path, store: Path, views: ViewStore, recipe: RecogniserRecipe, track: Track) -> dict[str, float]:
-    """Accuracy from one view of the test split, over objects and over classes, kept in the run's folder."""
+def _scores(
+    run: Path, store: Path, views: ViewStore, recipe: RecogniserRecipe, track: Track
+) -> dict[str, float]:
+    """Accuracy from one view of the test split, over objects and over classes, kept in the run's
+    folder.
+    """
     kept = run / "scores.json"
     if kept.exists():
         return json.loads(kept.read_text())
     network = run_network(run, recipe, views)
-    objects, labels = np.flatnonzero(views.done & (views.splits == "test")), views.labels
+    objects = np.flatnonzero(views.done & (views.splits == "test"))
+    labels = views.labels
     right: list[int] = []
 
     def judged() -> Iterator[int]:
-        for count in count_right(network, load_inputs(store, recipe.size, recipe.input), objects, labels):
+        for count in count_right(
+            network, load_inputs(store, recipe.size, recipe.input), objects, labels
+        ):
             right.append(count)
             yield len(right)
 
@@ -175,7 +197,9 @@ def _scores(run: Path, store: Path, views: ViewStore, recipe: RecogniserRecipe, 
         validated = max(float(row["class_accuracy"]) for row in csv.DictReader(file))
     scores = {
         "accuracy": round(float(share.mean()), 4),
-        "class_accuracy": round(float(np.mean([share[own == label].mean() for label in np.unique(own)])), 4),
+        "class_accuracy": round(
+            float(np.mean([share[own == label].mean() for label in np.unique(own)])), 4
+        ),
         "validation_class_accuracy": round(validated, 4),
     }
     with new_file(kept, True) as part:
@@ -187,18 +211,24 @@ def grid_figure(rows: Sequence[dict[str, Any]]) -> Figure:
     """Accuracy from one view of the test split, a line for each network.
 
     Args:
-        rows: with "depth", "batch_size", "accuracy" and "published" (None where nothing was); a network may have
-            several published accuracies, each in a row of its own.
+        rows: with "depth", "batch_size", "accuracy" and "published" (None where nothing was); a
+            network may have several published accuracies, each in a row of its own.
     """
     networks = list(dict.fromkeys((row["depth"], row["batch_size"]) for row in rows))
     line = {network: y for y, network in enumerate(networks)}
     figure, axes = new_figure(4.6, 0.9 + 0.3 * len(networks))
     ours = {line[row["depth"], row["batch_size"]]: row["accuracy"] for row in rows}
     axes.plot(list(ours.values()), list(ours), "o", color=BLUE, markersize=6, label="ours")
-    published = [(row["published"], line[row["depth"], row["batch_size"]]) for row in rows if row["published"]]
+    published = [
+        (row["published"], line[row["depth"], row["batch_size"]])
+        for row in rows
+        if row["published"]
+    ]
     if published:
         axes.plot(*zip(*published, strict=True), "D", color=ACCENT, markersize=5, label="published")
-    axes.set_yticks(range(len(networks)), [f"ResNet-{depth}, batch {batch}" for depth, batch in networks])
+    axes.set_yticks(
+        range(len(networks)), [f"ResNet-{depth}, batch {batch}" for depth, batch in networks]
+    )
     axes.set_ylim(len(networks) - 0.5, -0.5)
     axes.tick_params(axis="y", length=0)
     percent_axis(axes.xaxis)
@@ -220,10 +250,11 @@ def main(
     recipe: tyro.conf.OmitArgPrefixes[RecogniserRecipe] = THESIS_RECOGNISER,
     hardware: tyro.conf.OmitArgPrefixes[Hardware] = Hardware(),
 ) -> None:
-    """Train the recognisers of the thesis's table 6 and set them beside the published ones. Resumes if it was cut off.
+    """Train the recognisers of the thesis's table 6 and set them beside the published ones. Resumes
+    if it was cut off.
 
-    Every network is trained in a folder of its own by the published recipe; its best epoch is chosen on validation. The
-    test split is used once they all are trained.
+    Every network is trained in a folder of its own by the published recipe; its best epoch is
+    chosen on validation. The test split is used once they all are trained.
 
     Args:
         store: view store made by nextview render.
@@ -233,7 +264,9 @@ def main(
         recipe: how to train; network, layers and batch are those of the table.
         hardware: on what.
     """
-    table = train_grid(store, out, recipe, depths=depths, batches=batches, hardware=hardware, track=progress)
+    table = train_grid(
+        store, out, recipe, depths=depths, batches=batches, hardware=hardware, track=progress
+    )
     if is_first():
         draw_curves(sorted(out.glob("resnet*-batch*")))
         with new_file(out / FIGURE, True) as part:

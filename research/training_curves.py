@@ -1,4 +1,5 @@
-"""How trainings went, epoch by epoch (thesis, figure 20): the log of each run is drawn as its curves.png.
+"""How trainings went, epoch by epoch (thesis, figure 20): the log of each run is drawn as its
+curves.png.
 
 python -m research.training_curves runs/lem [runs/other ...]
 """
@@ -44,11 +45,26 @@ def training_curves(log: dict[str, list[float]]) -> Figure:
     selected = next((name for name in SELECTED if name in log), None)
     with matplotlib.rc_context(STYLE):
         figure = PlainFigure((4.6, 0.4 + 1.5 * len(panels)), layout="constrained")
-        for axes, name in zip(figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0], panels, strict=True):
+        for axes, name in zip(
+            figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0], panels, strict=True
+        ):
             for line, colour in ((name, LIGHT_BLUE), (f"{VALIDATION}{name}", ACCENT)):
                 if line in log:
-                    part = "validation" if line != name else "training" if f"{VALIDATION}{name}" in log else None
-                    axes.plot(log["epoch"], log[line], color=colour, marker="o", markersize=2.5, label=part)
+                    part = (
+                        "validation"
+                        if line != name
+                        else "training"
+                        if f"{VALIDATION}{name}" in log
+                        else None
+                    )
+                    axes.plot(
+                        log["epoch"],
+                        log[line],
+                        color=colour,
+                        marker="o",
+                        markersize=2.5,
+                        label=part,
+                    )
                 if selected == line:
                     best = SELECTED[line](log[line])
                     epoch = log["epoch"][log[line].index(best)]

@@ -1,4 +1,6 @@
-"""Policies that look where most is still unseen, by the voxels that the depth seen so far leaves unseen."""
+"""Policies that look where most is still unseen, by the voxels that the depth seen so far leaves
+unseen.
+"""
 
 from __future__ import annotations
 
@@ -21,28 +23,40 @@ Gain = Callable[[Occupancy, NDArray[np.floating], NDArray[np.bool_]], NDArray[np
 GRID = VoxelGrid(64)
 """Around the object's unit sphere."""
 SCENE_SIZE = 2.0
-"""So many times as wide is the grid, of as many voxels, where other things stand around the object."""
+"""So many times as wide is the grid, of as many voxels, where other things stand around the
+object.
+"""
 
 
 def occupancy_of(observations: Sequence[Observation], grid: VoxelGrid) -> Occupancy:
-    """What is known of the space around an object after some views of it, object frame, object radii.
+    """What is known of the space around an object after some views of it, object frame, object
+    radii.
 
-    Observations without their scene show the object alone: what is no object in them is taken to be free, as is all
-    beyond its radius. With their scene everything beside the object is an occluder, and unseen before it was seen.
+    Observations without their scene show the object alone: what is no object in them is taken to be
+    free, as is all beyond its radius. With their scene everything beside the object is an occluder,
+    and unseen before it was seen.
     """
     scenes = [seen for seen in observations if seen.scene is not None]
     if scenes:
-        observations, grid = scenes, replace(grid, half=SCENE_SIZE * grid.half)
+        observations = scenes
+        grid = replace(grid, half=SCENE_SIZE * grid.half)
     told = [_told(seen, grid) for seen in observations]
-    return reduce(Occupancy.and_also, told) if told else Occupancy.unseen(grid, _ball(grid, grid.half))
+    return (
+        reduce(Occupancy.and_also, told) if told else Occupancy.unseen(grid, _ball(grid, grid.half))
+    )
 
 
 @lru_cache(maxsize=64)
 def _told(seen: Observation, grid: VoxelGrid) -> Occupancy:
-    """What one view tells. Kept, because what it tells does not depend on the others, and it is asked at each step."""
+    """What one view tells.
+
+    Kept, because what it tells does not depend on the others, and it is asked at each step.
+    """
     if seen.scene is not None:
         return SeenScene.unseen(grid).seen(seen.scene).occupancy
-    return Occupancy.unseen(grid, _ball(grid, grid.half)).seen(seen.depth, seen.pose, seen.intrinsics)
+    return Occupancy.unseen(grid, _ball(grid, grid.half)).seen(
+        seen.depth, seen.pose, seen.intrinsics
+    )
 
 
 @lru_cache(maxsize=4)
@@ -53,18 +67,21 @@ def _ball(grid: VoxelGrid, radius: float) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Volumetric:
-    """The free view from which most that is unseen comes into view; of equal ones that with the shortest travel.
+    """The free view from which most that is unseen comes into view; of equal ones that with the
+    shortest travel.
 
     With ``new_volume``, the volumetric information gain of active grasping (Breyer et al.,
-    "Closed-loop next-best-view planning for target-driven grasping", IROS 2022, the system active_grasp) and the model
-    analysis of McGreavy, Kunze and Hawes, "Next best view planning for object recognition in mobile robotics"
-    (PlanSIG 2016). Simplified: the unseen space around the object stands in for McGreavy's known 3D model, and their
-    environment analysis, which views are in reach, is ``EpisodeState.free``.
+    "Closed-loop next-best-view planning for target-driven grasping", IROS 2022, the system
+    active_grasp) and the model analysis of McGreavy, Kunze and Hawes, "Next best view planning for
+    object recognition in mobile robotics" (PlanSIG 2016). Simplified: the unseen space around the
+    object stands in for McGreavy's known 3D model, and their environment analysis, which views are
+    in reach, is ``EpisodeState.free``.
 
-    With ``new_surface`` (``coverage``), the aim of Mendoza et al., "Supervised learning of the next-best-view for
-    3D object reconstruction" (Pattern Recognition Letters 133, 2020): the view that adds most surface. Simplified: they
-    train a 3D-CNN on a probabilistic grid to name that view; here the border of unseen space on such a grid stands for
-    the surface that is behind it, and the overlap that they need for registration is not asked for, as poses are known.
+    With ``new_surface`` (``coverage``), the aim of Mendoza et al., "Supervised learning of the
+    next-best-view for 3D object reconstruction" (Pattern Recognition Letters 133, 2020): the view
+    that adds most surface. Simplified: they train a 3D-CNN on a probabilistic grid to name that
+    view; here the border of unseen space on such a grid stands for the surface that is behind it,
+    and the overlap that they need for registration is not asked for, as poses are known.
 
     Attributes:
         sphere: the viewpoints.
@@ -78,11 +95,15 @@ class Volumetric:
     needs: tuple[str, ...] = ("observations",)
 
     def view_values(self, state: EpisodeState) -> NDArray[np.float64]:
-        """Unseen volume or surface that comes into view, cubes or squares of the object radius, (B, V)."""
+        """Unseen volume or surface that comes into view, cubes or squares of the object radius,
+        (B, V).
+        """
         if state.observations is None:
             raise PolicyError("this policy needs the depth that was seen")
-        positions, found = self.sphere.poses[:, :3, 3], dict[frozenset[int], NDArray[np.float64]]()
-        sets = [frozenset(map(id, views)) for views in state.observations]  # their order makes no difference
+        positions = self.sphere.poses[:, :3, 3]
+        found = dict[frozenset[int], NDArray[np.float64]]()
+        # their order makes no difference
+        sets = [frozenset(map(id, views)) for views in state.observations]
         for key, views in zip(sets, state.observations, strict=True):
             if key not in found:
                 known = occupancy_of(views, self.grid)

@@ -1,4 +1,7 @@
-"""The command ``nextview``. Outside the package, so that Ctrl-C ends it quietly while the package is imported, too."""
+"""The command ``nextview``.
+
+Outside the package, so that Ctrl-C ends it quietly while the package is imported, too.
+"""
 
 import os
 import signal

@@ -1,7 +1,8 @@
-"""Fixtures that all tests share: one tiny pipeline, built once per run, also by several pytest-xdist workers.
+"""Fixtures that all tests share: one tiny pipeline, built once per run, also by several
+pytest-xdist workers.
 
-A test that alters a file of it copies the file first. And: the order of the files; Hypothesis without deadlines (slow
-is not wrong); tests that take minutes run where NEXTVIEW_TESTS=all.
+A test that alters a file of it copies the file first. And: the order of the files; Hypothesis
+without deadlines (slow is not wrong); tests that take minutes run where NEXTVIEW_TESTS=all.
 """
 
 import os
@@ -68,12 +69,17 @@ def scans(shared) -> Path:
 @pytest.fixture(scope="session")
 def taught(shared, scans) -> Path:
     """The models that know them."""
-    return shared("taught", lambda folder: learn(scans, folder / "mine", upright=True, workers=0)) / "mine"
+    return (
+        shared("taught", lambda folder: learn(scans, folder / "mine", upright=True, workers=0))
+        / "mine"
+    )
 
 
 @pytest.fixture(scope="session")
 def furniture(shared) -> Path:
-    """Meshes of boxes: FURNITURE's 3 classes, 4 for training and 2 for tests of each, CLASS/SPLIT/CLASS_K.off."""
+    """Meshes of boxes: FURNITURE's 3 classes, 4 for training and 2 for tests of each,
+    CLASS/SPLIT/CLASS_K.off.
+    """
     return shared("furniture", pipeline.write_furniture)
 
 
@@ -90,7 +96,9 @@ def views(shared, furniture) -> Path:
 
 @pytest.fixture(scope="session")
 def models(shared) -> Path:
-    """A folder of tiny networks for FURNITURE: tiny.json (recogniser, 8 azimuth bins, calibrated), tiny-lem.json."""
+    """A folder of tiny networks for FURNITURE: tiny.json (recogniser, 8 azimuth bins,
+    calibrated), tiny-lem.json.
+    """
 
     def make(folder: Path) -> None:
         card = pipeline.make_recogniser(folder, pipeline.FURNITURE, size=32, azimuth_bins=8)
@@ -125,21 +133,30 @@ def predictions(shared, views, models) -> Path:
 
 @pytest.fixture(scope="session")
 def results(shared) -> Path:
-    """A benchmark of ``some_predictions(40, seed=2)``: p.npz and the folder out. Two objects are conflicting."""
+    """A benchmark of ``some_predictions(40, seed=2)``: p.npz and the folder out.
+
+    Two objects are conflicting.
+    """
     pytest.importorskip("pandas")
     from dataclasses import replace
 
     def make(folder: Path) -> None:
         conflicting = np.isin(np.arange(40), (3, 8))
-        replace(pipeline.some_predictions(40, seed=2), conflicting=conflicting).save(folder / "p.npz")
-        pipeline.benchmark(folder / "p.npz", folder / "out", thresholds=(0.7, 0.9), runs=3, samples=200)
+        replace(pipeline.some_predictions(40, seed=2), conflicting=conflicting).save(
+            folder / "p.npz"
+        )
+        pipeline.benchmark(
+            folder / "p.npz", folder / "out", thresholds=(0.7, 0.9), runs=3, samples=200
+        )
 
     return shared("results", make)
 
 
 @pytest.fixture(scope="session")
 def cluttered(shared, furniture) -> Path:
-    """A folder of six cluttered scenes with objects of ``furniture``: one of each split at each level."""
+    """A folder of six cluttered scenes with objects of ``furniture``: one of each split at each
+    level.
+    """
     from nextview.data.scene_drawing import draw_scenes
 
     def make(folder: Path) -> None:

@@ -1,6 +1,8 @@
-"""Environments with nothing but what is asked for, linked from the environment of the tests: made in a second.
+"""Environments with nothing but what is asked for, linked from the environment of the tests: made
+in a second.
 
-What is not asked for cannot be imported there, as after a plain ``pip install``, and nothing is fetched.
+What is not asked for cannot be imported there, as after a plain ``pip install``, and nothing is
+fetched.
 """
 
 import sysconfig
@@ -16,7 +18,8 @@ ROOT = Path(__file__).resolve().parents[1]
 OWN = ("nextview", "nextview-research")  # what is installed from this repository
 COMMAND = "import sys; from nextview_command import main; sys.exit(main())"
 
-Found = dict[tuple[str, str], Distribution]  # by the name, in lower case, and the extra of it that is asked for
+# by the name, in lower case, and the extra of it that is asked for
+Found = dict[tuple[str, str], Distribution]
 
 
 def empty_environment(folder: Path) -> tuple[Path, Path]:
@@ -62,14 +65,20 @@ def link(installed: Distribution, packages: Path) -> None:
                 if not (place / inner.name).exists():
                     (place / inner.name).symlink_to(inner)
         elif not place.exists() and (home / name).exists():
-            if (home / name).is_dir() and not (home / name / "__init__.py").exists() and "-" not in name:
+            if (
+                (home / name).is_dir()
+                and not (home / name / "__init__.py").exists()
+                and "-" not in name
+            ):
                 place.mkdir()  # several distributions may share a namespace
                 link(installed, packages)
             else:
                 place.symlink_to(home / name)
 
 
-def installation(folder: Path, extras: Iterable[str] = (), research: Iterable[str] | None = None) -> Path:
+def installation(
+    folder: Path, extras: Iterable[str] = (), research: Iterable[str] | None = None
+) -> Path:
     """Make an environment in which this clone is installed, with its command; returns its Python.
 
     Args:
@@ -78,7 +87,8 @@ def installation(folder: Path, extras: Iterable[str] = (), research: Iterable[st
         research: extras of the package research; None if that is not installed.
 
     Raises:
-        PackageNotFoundError: something that is asked for is not installed in the environment of the tests.
+        PackageNotFoundError: something that is asked for is not installed in the environment of the
+            tests.
     """
     python, packages = empty_environment(folder)
     paths = [ROOT / "src"]
@@ -92,7 +102,9 @@ def installation(folder: Path, extras: Iterable[str] = (), research: Iterable[st
     for name in OWN[: len(paths)]:
         about = f"{name.replace('-', '_')}-{distribution(name).version}.dist-info"
         (packages / about).symlink_to(distribution(name).locate_file(about))
-    (packages / "this_clone.pth").write_text("".join(f"{path}\n" for path in paths), encoding="utf-8")
+    (packages / "this_clone.pth").write_text(
+        "".join(f"{path}\n" for path in paths), encoding="utf-8"
+    )
 
     command = python.parent / "nextview"
     command.write_text(f"#!{python}\n{COMMAND}\n", encoding="utf-8")
@@ -107,4 +119,6 @@ def _requirements(project: Path, extras: Iterable[str]) -> list[tuple[str, str]]
     for extra in extras:
         asked += map(Requirement, table["optional-dependencies"][extra])
     own = {extra for needed in asked if needed.name == "nextview" for extra in needed.extras}
-    return [(str(needed), "") for needed in asked] + (_requirements(ROOT / "pyproject.toml", own) if own else [])
+    return [(str(needed), "") for needed in asked] + (
+        _requirements(ROOT / "pyproject.toml", own) if own else []
+    )

@@ -1,4 +1,5 @@
-"""What tests share: tiny furniture, tiny networks, made-up predictions, and small scenes before a camera.
+"""What tests share: tiny furniture, tiny networks, made-up predictions, and small scenes before a
+camera.
 
 ``conftest.py`` makes fixtures of whole pipelines from it.
 """
@@ -75,12 +76,17 @@ def write_off(path: Path, mesh: Mesh) -> Path:
 
 
 def write_furniture(folder: Path, train: int = 4, test: int = 2, seed: int = 0) -> Path:
-    """Chairs, monitors and tables of boxes, each stretched at random, as ``folder/CLASS/SPLIT/CLASS_K.off``."""
+    """Chairs, monitors and tables of boxes, each stretched at random, as
+    ``folder/CLASS/SPLIT/CLASS_K.off``.
+    """
     rng = np.random.default_rng(seed)
     for label in FURNITURE:
         for k in range(train + test):
             scale = rng.uniform(0.8, 1.25, 3)
-            boxes = [tuple(tuple(np.multiply(corner, scale)) for corner in box) for box in SAMPLES[label]()]
+            boxes = [
+                tuple(tuple(np.multiply(corner, scale)) for corner in box)
+                for box in SAMPLES[label]()
+            ]
             split = "train" if k < train else "test"
             write_off(folder / label / split / f"{label}_{k}.off", boxes_mesh(boxes, label))
     return folder
@@ -89,7 +95,9 @@ def write_furniture(folder: Path, train: int = 4, test: int = 2, seed: int = 0) 
 # Networks of a few weights with the interface of the real ones
 
 
-def make_recogniser(folder: Path, classes: list[str], size: int = 16, seed: int = 0, azimuth_bins: int = 0) -> Path:
+def make_recogniser(
+    folder: Path, classes: list[str], size: int = 16, seed: int = 0, azimuth_bins: int = 0
+) -> Path:
     """A recogniser whose answers are random linear maps of each channel's mean over the image."""
     weights = np.random.default_rng(seed).normal(size=(4, len(classes))).astype(np.float32) / 16
     weights -= weights.mean(0)
@@ -103,7 +111,11 @@ def make_recogniser(folder: Path, classes: list[str], size: int = 16, seed: int 
     outputs = [helper.make_tensor_value_info("logits", TensorProto.FLOAT, ["batch", len(classes)])]
     outputs += [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["batch", 4])]
     constants = {"weights": weights, "image": np.array([2, 3])}
-    card: dict = {"kind": "recogniser", "classes": classes, "input": {"kind": "geometry", "size": size}}
+    card: dict = {
+        "kind": "recogniser",
+        "classes": classes,
+        "input": {"kind": "geometry", "size": size},
+    }
     if azimuth_bins:
         nodes += [
             helper.make_node("MatMul", ["features", "side_weights"], ["flat"]),
@@ -112,13 +124,19 @@ def make_recogniser(folder: Path, classes: list[str], size: int = 16, seed: int 
         ]
         shape = ["batch", len(classes), azimuth_bins]
         outputs += [helper.make_tensor_value_info(BINS_OUTPUT, TensorProto.FLOAT, shape)]
-        side_weights = np.random.default_rng(seed + 1).normal(size=(4, len(classes) * azimuth_bins)).astype(np.float32)
+        side_weights = (
+            np.random.default_rng(seed + 1)
+            .normal(size=(4, len(classes) * azimuth_bins))
+            .astype(np.float32)
+        )
         constants |= {"side_weights": side_weights / 16, "side_shape": np.array([-1, *shape[1:]])}
         card["azimuth_bins"] = azimuth_bins
     return _save(folder / "tiny.json", nodes, inputs, outputs, constants, card)
 
 
-def make_map_network(folder: Path, name: str = "lem", rings: int = 5, valleys: tuple[str, ...] = ()) -> Path:
+def make_map_network(
+    folder: Path, name: str = "lem", rings: int = 5, valleys: tuple[str, ...] = ()
+) -> Path:
     """A map network whose cells are a random linear map of the cloud's middle."""
     weights = np.random.default_rng(1).normal(size=(3, 3 * rings)).astype(np.float32)
     nodes = [
@@ -134,8 +152,12 @@ def make_map_network(folder: Path, name: str = "lem", rings: int = 5, valleys: t
     return _save(folder / f"tiny-{name}.json", nodes, inputs, outputs, constants, card)
 
 
-def _save(path: Path, nodes: list, inputs: list, outputs: list, constants: dict, card: dict) -> Path:
-    initial = [numpy_helper.from_array(np.asarray(values), name) for name, values in constants.items()]
+def _save(
+    path: Path, nodes: list, inputs: list, outputs: list, constants: dict, card: dict
+) -> Path:
+    initial = [
+        numpy_helper.from_array(np.asarray(values), name) for name, values in constants.items()
+    ]
     graph = helper.make_graph(nodes, "tiny", inputs, outputs, initial)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
     weights = path.with_suffix(".onnx")
@@ -156,30 +178,65 @@ def some_predictions(n: int = 6, seed: int = 0) -> Predictions:
     """Random logits and maps of ``n`` objects of three classes."""
     rng = np.random.default_rng(seed)
     return Predictions(
-        rng.normal(size=(n, 40, 3)).astype(np.float32), {"lem": rng.random((n, 40, 5, 3)).astype(np.float32)},
-        rng.random((n, 40)).astype(np.float32), tuple(f"thing_{i}" for i in range(n)), np.arange(n) % 3, tuple(CLASSES),
-        np.array(["test"] * n), np.zeros(n, bool), SPHERE, {"recogniser": ("r", "0" * 64), "lem": ("l", "1" * 64)},
+        rng.normal(size=(n, 40, 3)).astype(np.float32),
+        {"lem": rng.random((n, 40, 5, 3)).astype(np.float32)},
+        rng.random((n, 40)).astype(np.float32),
+        tuple(f"thing_{i}" for i in range(n)),
+        np.arange(n) % 3,
+        tuple(CLASSES),
+        np.array(["test"] * n),
+        np.zeros(n, bool),
+        SPHERE,
+        {"recogniser": ("r", "0" * 64), "lem": ("l", "1" * 64)},
         {"lem": ("box",)},
-    )  # fmt: skip
+    )
 
 
 def train_predictions(logits, labels, sphere, classes, azimuth_bins=None, **fields) -> Predictions:
     """Predictions of objects of the training split of which nothing but this is known."""
     n, v, _ = logits.shape
-    entropy, splits, conflicting = np.zeros((n, v), np.float32), np.array(["train"] * n), np.zeros(n, bool)
-    given = logits, {}, entropy, tuple(map(str, range(n))), labels, classes, splits, conflicting, sphere, {}, {}
+    entropy, splits, conflicting = (
+        np.zeros((n, v), np.float32),
+        np.array(["train"] * n),
+        np.zeros(n, bool),
+    )
+    given = (
+        logits,
+        {},
+        entropy,
+        tuple(map(str, range(n))),
+        labels,
+        classes,
+        splits,
+        conflicting,
+        sphere,
+        {},
+        {},
+    )
     return replace(Predictions(*given, azimuth_bins=azimuth_bins), **fields)
 
 
 def scene_predictions(store: Path, classes: Sequence[str]) -> Predictions:
-    """Random logits of a store of cluttered scenes. A view that hardly shows the target says nothing."""
+    """Random logits of a store of cluttered scenes.
+
+    A view that hardly shows the target says nothing.
+    """
     opened, rng = ViewStore.open(store), np.random.default_rng(0)
     shows = opened.measure("visible_share") > 0.3
-    logits = np.where(shows[..., None], 2 * rng.normal(size=(len(opened), 40, len(classes))), 0).astype(np.float32)
+    logits = np.where(
+        shows[..., None], 2 * rng.normal(size=(len(opened), 40, len(classes))), 0
+    ).astype(np.float32)
     return replace(
-        some_predictions(len(opened)), logits=logits, classes=tuple(classes), names=tuple(opened.names), maps={},
-        valley_classes={}, depth_entropy=opened.measure(), store=str(store), calibration=Calibration(1.0, 0.3),
-    )  # fmt: skip
+        some_predictions(len(opened)),
+        logits=logits,
+        classes=tuple(classes),
+        names=tuple(opened.names),
+        maps={},
+        valley_classes={},
+        depth_entropy=opened.measure(),
+        store=str(store),
+        calibration=Calibration(1.0, 0.3),
+    )
 
 
 def benchmark(predictions: Path, out: Path, **settings):
@@ -189,7 +246,9 @@ def benchmark(predictions: Path, out: Path, **settings):
 
 
 def store_of(path: Path, names, labels, sphere: ViewSphere, size: int = 16, **arrays) -> ViewStore:
-    """A store whose objects are rendered, if only these arrays of it hold anything: depth_entropy, image."""
+    """A store whose objects are rendered, if only these arrays of it hold anything:
+    depth_entropy, image.
+    """
     both = zip(names, map(str, labels), strict=True)
     entries = [Entry(Path(f"{name}.off"), name, label, "train") for name, label in both]
     store = ViewStore.create(path, describe(entries, sphere, size, {}))
@@ -220,11 +279,15 @@ def rays(intrinsics, shape) -> np.ndarray:
     return np.stack([column, row, np.ones_like(row)], -1) @ np.linalg.inv(intrinsics).T
 
 
-def cast(meshes: Sequence[trimesh.Trimesh], pose, intrinsics=INTRINSICS, shape=SHAPE) -> tuple[np.ndarray, np.ndarray]:
+def cast(
+    meshes: Sequence[trimesh.Trimesh], pose, intrinsics=INTRINSICS, shape=SHAPE
+) -> tuple[np.ndarray, np.ndarray]:
     """Depth (H, W) float32, 0 = nothing, and which mesh is seen, -1 for none."""
     scene = EmbreeScene()
     for mesh in meshes:
-        TriangleMesh(scene, mesh.vertices.astype(np.float32), np.ascontiguousarray(mesh.faces, np.int32))
+        TriangleMesh(
+            scene, mesh.vertices.astype(np.float32), np.ascontiguousarray(mesh.faces, np.int32)
+        )
     directions = (rays(intrinsics, shape).reshape(-1, 3) @ pose[:3, :3].T).astype(np.float32)
     origins = np.tile(np.asarray(pose)[:3, 3].astype(np.float32), (len(directions), 1))
     hits = scene.run(origins, directions, output=1)
@@ -234,15 +297,21 @@ def cast(meshes: Sequence[trimesh.Trimesh], pose, intrinsics=INTRINSICS, shape=S
 
 
 def ball_depth(pose, intrinsics, size, radius=1.0, centre=(0, 0, 0)) -> np.ndarray:
-    """Depth image of a ball, (size, size): the smaller root of a quadratic equation, 0 where there is none."""
+    """Depth image of a ball, (size, size): the smaller root of a quadratic equation, 0 where
+    there is none.
+    """
     d, o = rays(intrinsics, (size, size)) @ pose[:3, :3].T, pose[:3, 3] - np.array(centre)
     a, b, c = (d * d).sum(-1), d @ o, o @ o - radius**2
     inside = b * b - a * c
     return np.where(inside > 0, (-b - np.sqrt(np.maximum(inside, 0))) / a, 0)
 
 
-def pose_at(elevation, azimuth, distance, target=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0)) -> np.ndarray:
-    """A camera (degrees, metres) that looks at a target and is then turned about its own axes, degrees."""
+def pose_at(
+    elevation, azimuth, distance, target=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0)
+) -> np.ndarray:
+    """A camera (degrees, metres) that looks at a target and is then turned about its own axes,
+    degrees.
+    """
     pose = look_at_origin(np.radians(elevation), np.radians(azimuth), distance)
     pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
     pose[:3, 3] += target

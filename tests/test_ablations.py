@@ -18,13 +18,16 @@ def cells(line: str) -> list[str]:
 
 
 def test_views_that_agree_on_the_azimuth_bin_settle_what_logits_leave_open(tmp_path, capsys):
-    """Only in the true class do all views point the same way: the logits say nothing, the bins everything."""
+    """Only in the true class do all views point the same way: the logits say nothing, the bins
+    everything.
+    """
     rng, p = np.random.default_rng(0), some_predictions(60)
     seen = (p.sphere.azimuth_index[None] - rng.integers(0, 8, (60, 1))) % 8
     bins = np.repeat(rng.integers(0, 8, (60, 40, 1)), 3, axis=2)
     bins[np.arange(60), :, p.labels] = seen
     azimuth_bins = np.log(np.where(np.arange(8) == bins[..., None], 0.93, 0.01)).astype(np.float32)
-    logits = np.broadcast_to(np.float32([0.01, 0, 0]), p.logits.shape)  # always the first class, if barely
+    # always the first class, if barely
+    logits = np.broadcast_to(np.float32([0.01, 0, 0]), p.logits.shape)
     p = replace(p, logits=logits, azimuth_bins=azimuth_bins)
     replace(p, splits=np.array(["train"] * 60)).save(tmp_path / "validation.npz")
     p.save(tmp_path / "test.npz")
@@ -49,8 +52,12 @@ def test_azimuth_bins_are_right_exactly_or_up_to_a_half_turn(tmp_path):
     features[:3] += 4  # the wrong way round
     features[3] += 1
     azimuth_bins = np.zeros((10, 40, 3, 8), np.float32)
-    np.put_along_axis(azimuth_bins, np.repeat((features % 8)[:, :, None, None], 3, axis=2), 5, axis=3)
-    assert ABLATIONS["bins_told"](replace(p, azimuth_bins=azimuth_bins), store) == pytest.approx((0.6, 0.9))
+    np.put_along_axis(
+        azimuth_bins, np.repeat((features % 8)[:, :, None, None], 3, axis=2), 5, axis=3
+    )
+    assert ABLATIONS["bins_told"](replace(p, azimuth_bins=azimuth_bins), store) == pytest.approx(
+        (0.6, 0.9)
+    )
     with pytest.raises(PredictionsError, match="tell no azimuth bins"):
         ABLATIONS["bins_told"](p, store)
 

@@ -9,7 +9,15 @@ from scipy.special import log_softmax, softmax
 from scipy.stats import multivariate_normal
 
 from nextview.errors import NextviewError, RiskError
-from nextview.recognition.belief import Calibration, RiskBounds, SizeEvidence, Stopping, fuse, log_evidence_of, reorient
+from nextview.recognition.belief import (
+    Calibration,
+    RiskBounds,
+    SizeEvidence,
+    Stopping,
+    fuse,
+    log_evidence_of,
+    reorient,
+)
 
 STEP = np.pi / 4
 
@@ -24,7 +32,9 @@ logits = npst.arrays(
 def test_belief_is_the_softmax_of_the_sum(values):
     belief = fuse(values)
     assert belief.dtype == np.float64
-    np.testing.assert_allclose(belief, softmax(values.astype(np.float64).sum(-2), axis=-1), rtol=1e-12, atol=1e-300)
+    np.testing.assert_allclose(
+        belief, softmax(values.astype(np.float64).sum(-2), axis=-1), rtol=1e-12, atol=1e-300
+    )
     np.testing.assert_allclose(belief.sum(-1), 1)
 
 
@@ -35,12 +45,15 @@ def test_huge_logits_do_not_overflow():
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.9])
 def test_calibrated_belief_is_the_posterior_of_equally_correlated_looks(correlation):
-    # Two classes, each view a Gaussian measurement around -1 or +1 whose noise is correlated between views.
+    # Two classes, each view a Gaussian measurement around -1 or +1 whose noise is correlated
+    # between views.
     rng, spread = np.random.default_rng(0), 1.7
     for n_views in (1, 2, 5, 20):
         noise = spread**2 * ((1 - correlation) * np.eye(n_views) + correlation)
         seen = rng.multivariate_normal(np.ones(n_views), noise, size=6)
-        likelihood = np.stack([multivariate_normal(np.full(n_views, m), noise).logpdf(seen) for m in (-1, 1)], -1)
+        likelihood = np.stack(
+            [multivariate_normal(np.full(n_views, m), noise).logpdf(seen) for m in (-1, 1)], -1
+        )
         of_each = np.stack([-((seen - m) ** 2) / (2 * spread**2) for m in (-1, 1)], -1)
         belief = fuse(of_each, Calibration(1.0, correlation).temperature_after(n_views))
         np.testing.assert_allclose(belief, softmax(likelihood, -1), atol=1e-9)
@@ -77,7 +90,9 @@ def test_with_a_decline_of_its_correlation_a_calibrated_belief_stops_where_the_p
     plain = fuse(logits).max(-1) >= Stopping(threshold_at).threshold_at(n_views)
     belief = fuse(logits, Calibration(1.0, c).temperature_after(n_views)).max(-1)
     near = np.abs(belief - Stopping(threshold_at, 8, c).threshold_at(n_views)) < 1e-9
-    np.testing.assert_array_equal((belief >= Stopping(threshold_at, 8, c).threshold_at(n_views)) | near, plain | near)
+    np.testing.assert_array_equal(
+        (belief >= Stopping(threshold_at, 8, c).threshold_at(n_views)) | near, plain | near
+    )
 
 
 def test_what_is_said_of_sides_is_said_of_where_side_0_points():
@@ -107,7 +122,9 @@ def some_views(n_views, classes=3, azimuth_bins=8):
 
 @pytest.mark.parametrize("n_views", [1, 2, 5])
 def test_looks_that_agree_on_the_side_are_believed_as_bayes_would(n_views):
-    """Independent looks at an object of which neither class nor azimuth is known, each as likely as any other."""
+    """Independent looks at an object of which neither class nor azimuth is known, each as likely
+    as any other.
+    """
     logits, azimuth_bins, azimuth = some_views(n_views)
     belief = Calibration(0.7, 0.0, bin_correlation=0.0).belief(
         log_evidence_of(logits, azimuth_bins, azimuth * STEP).sum(0), n_views, 3
@@ -126,7 +143,9 @@ def test_where_sides_shall_not_count_the_sum_of_logits_is_believed():
     logits, azimuth_bins, azimuth = some_views(3)
     total = log_evidence_of(logits, azimuth_bins, azimuth * STEP).sum(0)
     for calibration in (Calibration(), Calibration(0.7, 0.5)):
-        np.testing.assert_allclose(calibration.belief(total, 3, 3), fuse(logits, calibration.temperature_after(3)))
+        np.testing.assert_allclose(
+            calibration.belief(total, 3, 3), fuse(logits, calibration.temperature_after(3))
+        )
     np.testing.assert_array_equal(log_evidence_of(logits, None, azimuth * STEP), logits)
     with pytest.raises(ValueError, match="not a finite number"):
         Calibration().belief(total + np.nan, 3, 3)
@@ -141,4 +160,6 @@ def test_what_makes_no_sense_is_refused():
 def test_sizes_between_two_radii_are_interpolated_and_unknown_ones_say_nothing():
     evidence = SizeEvidence((1.0, 4.0), ((0.0, 2.0), (1.0, 1.0)), 0.5)
     found = evidence.logits(np.array([1.0, 2.0, 4.0, 100.0, 0.001, np.nan]))
-    np.testing.assert_allclose(found, [[0, 0.5], [0.5, 0.5], [1, 0.5], [1, 0.5], [0, 0.5], [0, 0]], atol=1e-6)
+    np.testing.assert_allclose(
+        found, [[0, 0.5], [0.5, 0.5], [1, 0.5], [1, 0.5], [0, 0.5], [0, 0]], atol=1e-6
+    )

@@ -1,4 +1,6 @@
-"""The benchmark from predictions to a folder of results, against pandas, plain loops and the thesis's own tables."""
+"""The benchmark from predictions to a folder of results, against pandas, plain loops and the
+thesis's own tables.
+"""
 
 import runpy
 from dataclasses import replace
@@ -48,7 +50,10 @@ def test_every_episode_is_a_row_and_is_what_it_says(results, predictions):
             assert row.stop == "fixed views"
         else:
             assert row.stop == ("confident" if belief.max() >= row.threshold else "views ran out")
-            before = [np.exp(predictions.logits[i, views[:k]].astype(float).sum(0)) for k in range(1, len(views))]
+            before = [
+                np.exp(predictions.logits[i, views[:k]].astype(float).sum(0))
+                for k in range(1, len(views))
+            ]
             assert all((b / b.sum()).max() < row.threshold for b in before)
 
 
@@ -56,7 +61,9 @@ def test_the_summary_is_what_pandas_makes_of_the_episodes(results, predictions):
     rows = pd.read_parquet(results / "out" / "episodes.parquet")
     rows["right"] = rows["answer"].astype(str) == rows["label"].astype(str)
     rows["clean"] = ~rows["object"].isin(np.array(predictions.names)[predictions.conflicting])
-    summary = pd.read_csv(results / "out" / "summary.csv").set_index(["policy", "threshold", "measure"])["value"]
+    summary = pd.read_csv(results / "out" / "summary.csv").set_index(
+        ["policy", "threshold", "measure"]
+    )["value"]
     for (policy, threshold), cell in rows.groupby(["policy", "threshold"], observed=True):
         moved, sure = cell[cell.n_views > 1], cell[cell.stop == "confident"]
         by_class = cell.groupby("label", observed=True)
@@ -72,18 +79,39 @@ def test_the_summary_is_what_pandas_makes_of_the_episodes(results, predictions):
             "arc_all": cell.arc.mean(),
             "confident": len(sure) / len(cell),
             "confident_accuracy": sure.right.mean(),
-            "calibration_error": calibration_error(cell.confidence.to_numpy(), cell.right.to_numpy()),
+            "calibration_error": calibration_error(
+                cell.confidence.to_numpy(), cell.right.to_numpy()
+            ),
         }
         for measure, value in wanted.items():
-            assert summary[policy, threshold, measure] == pytest.approx(value, nan_ok=True), (policy, measure)
+            assert summary[policy, threshold, measure] == pytest.approx(value, nan_ok=True), (
+                policy,
+                measure,
+            )
 
 
 def test_python_and_the_command_give_the_same_numbers(predictions, tmp_path):
-    """Replay cut by the rule of the recogniser's calibration is what the command writes, the threshold's decay too."""
+    """Replay cut by the rule of the recogniser's calibration is what the command writes, the
+    threshold's decay too.
+    """
     p = replace(predictions, calibration=Calibration(0.8, 0.5))
     p.save(tmp_path / "p.npz")
-    main(["benchmark", str(tmp_path / "p.npz"), str(tmp_path / "out"), "--policies", "lem", "spread",
-          "--runs", "3", "--samples", "20", "--thresholds", "0.7"])  # fmt: skip
+    main(
+        [
+            "benchmark",
+            str(tmp_path / "p.npz"),
+            str(tmp_path / "out"),
+            "--policies",
+            "lem",
+            "spread",
+            "--runs",
+            "3",
+            "--samples",
+            "20",
+            "--thresholds",
+            "0.7",
+        ]
+    )
     found, specs = load(tmp_path / "out"), make_specs(p, runs=3, seed=0)
     stopping = Stopping.of(p.calibration, 0.7, max_views=5)
     assert stopping.threshold_decay == 0.5
@@ -93,16 +121,37 @@ def test_python_and_the_command_give_the_same_numbers(predictions, tmp_path):
         for column in ("n_views", "confidence", "travel", "arc"):
             np.testing.assert_array_equal(getattr(ends, column), rows[column])
         np.testing.assert_array_equal(np.array(p.classes)[ends.answer], rows["answer"].astype(str))
-        assert truncate(paths, Stopping(0.7)).n_views.mean() > ends.n_views.mean()  # a threshold that stays
+        # a threshold that stays
+        assert truncate(paths, Stopping(0.7)).n_views.mean() > ends.n_views.mean()
 
 
 def test_a_stopping_rule_of_ones_own_decides_in_the_command(predictions, tmp_path, capsys):
     predictions.save(tmp_path / "p.npz")
-    main(["benchmark", str(tmp_path / "p.npz"), str(tmp_path / "out"), "--policies", "lem", "--runs", "2",
-          "--samples", "20", "--thresholds", "0.6", "--stopping", "test_replay:uncertain"])  # fmt: skip
-    specs, rule = make_specs(predictions, runs=2, seed=0), own_stopping("test_replay:uncertain", 0.6, 5)
+    main(
+        [
+            "benchmark",
+            str(tmp_path / "p.npz"),
+            str(tmp_path / "out"),
+            "--policies",
+            "lem",
+            "--runs",
+            "2",
+            "--samples",
+            "20",
+            "--thresholds",
+            "0.6",
+            "--stopping",
+            "test_replay:uncertain",
+        ]
+    )
+    specs, rule = (
+        make_specs(predictions, runs=2, seed=0),
+        own_stopping("test_replay:uncertain", 0.6, 5),
+    )
     ends = truncate(replay("lem", specs, 5, 0, beliefs=True), rule)
-    np.testing.assert_array_equal(ends.n_views, load(tmp_path / "out").episodes("lem", 0.6)["n_views"])
+    np.testing.assert_array_equal(
+        ends.n_views, load(tmp_path / "out").episodes("lem", 0.6)["n_views"]
+    )
     assert len(set(ends.n_views)) > 1
     wrong = ("benchmark", tmp_path / "p.npz", tmp_path / "no", "--stopping", "test_replay:nothing")
     assert "stopping rule test_replay:nothing cannot be made" in refused(capsys, *wrong)
@@ -112,14 +161,25 @@ def test_a_policy_of_ones_own_runs_beside_the_reference_and_one_that_fails_takes
     results, tmp_path, capsys
 ):
     names = ("test_replay:Asked", "test_replay:Raises", "lcm", "best-99")
-    sentences = refused(capsys, "benchmark", results / "p.npz", tmp_path / "own", "--policies", *names, "--runs", "1")
+    sentences = refused(
+        capsys,
+        "benchmark",
+        results / "p.npz",
+        tmp_path / "own",
+        "--policies",
+        *names,
+        "--runs",
+        "1",
+    )
     assert all(part in sentences for part in ("Raises", "thing_11", "lcm", "best-99"))
     found = load(tmp_path / "own")
     assert set(found.tables.summary.policy) == {"random", "test_replay:Asked"}
     assert set(found.settings["failures"]) == {"test_replay:Raises", "lcm", "best-99"}
 
 
-def test_a_risk_is_run_at_its_threshold_and_the_calibration_can_be_left_out(results, predictions, tmp_path):
+def test_a_risk_is_run_at_its_threshold_and_the_calibration_can_be_left_out(
+    results, predictions, tmp_path
+):
     bounds = RiskBounds((0.6, 0.8), tuple((0.2, 0.1) for _ in range(5)), 0.1)
     replace(predictions, calibration=Calibration(0.7, 0.5, bounds)).save(tmp_path / "c.npz")
     settings = {"policies": ("random",), "thresholds": (0.9,), "runs": 2, "samples": 20}
@@ -129,12 +189,16 @@ def test_a_risk_is_run_at_its_threshold_and_the_calibration_can_be_left_out(resu
     assert found.settings["risks"] == {"0.15": 0.8}
     row = found.episodes("random", 0.9).iloc[0]
     i = predictions.names.index(row.object)
-    total = predictions.logits[i, list(row.views)].astype(float).sum(0) / (0.7 * (1 + 0.5 * (row.n_views - 1)))
+    total = predictions.logits[i, list(row.views)].astype(float).sum(0) / (
+        0.7 * (1 + 0.5 * (row.n_views - 1))
+    )
     assert row.confidence == pytest.approx((np.exp(total) / np.exp(total).sum()).max())
 
     benchmark(tmp_path / "c.npz", tmp_path / "plain", uncalibrated=True, **settings)
     benchmark(results / "p.npz", tmp_path / "as published", **settings)
-    plain, published = (load(tmp_path / name).episodes("random", 0.9) for name in ("plain", "as published"))
+    plain, published = (
+        load(tmp_path / name).episodes("random", 0.9) for name in ("plain", "as published")
+    )
     pd.testing.assert_frame_equal(plain, published)
 
 
@@ -143,7 +207,14 @@ def test_training_objects_are_never_mixed_with_test_objects(predictions, tmp_pat
     both.save(tmp_path / "both.npz")
     with pytest.raises(ValueError, match="choose one with --split"):
         benchmark(tmp_path / "both.npz", tmp_path / "mixed")
-    half = benchmark(tmp_path / "both.npz", tmp_path / "half", split="test", policies=("random",), runs=1, samples=20)
+    half = benchmark(
+        tmp_path / "both.npz",
+        tmp_path / "half",
+        split="test",
+        policies=("random",),
+        runs=1,
+        samples=20,
+    )
     assert half.predictions.names == both.names[1::2]
 
 
@@ -151,23 +222,41 @@ def test_the_page_of_the_reproduction_says_what_the_tables_say(results, tmp_path
     page = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "reproduction.py"))["page"]
     text = page(results / "p.npz", samples=200)
     benchmark(results / "p.npz", tmp_path / "full", samples=200)
-    summary = pd.read_csv(tmp_path / "full" / "summary.csv").set_index(["policy", "threshold", "measure"])["value"]
-    tests = pd.read_csv(tmp_path / "full" / "tests.csv").set_index(["policy", "threshold", "measure"])
+    summary = pd.read_csv(tmp_path / "full" / "summary.csv").set_index(
+        ["policy", "threshold", "measure"]
+    )["value"]
+    tests = pd.read_csv(tmp_path / "full" / "tests.csv").set_index(
+        ["policy", "threshold", "measure"]
+    )
     for name in ("lem", "oracle-gain"):
-        row = next(line for line in text.split("## Every policy")[1].splitlines() if line.startswith(f"| {name} |"))
-        for cell, measure in zip(row.split("|")[2:], ["accuracy", "clean_accuracy", "n_views"], strict=False):
+        row = next(
+            line
+            for line in text.split("## Every policy")[1].splitlines()
+            if line.startswith(f"| {name} |")
+        )
+        for cell, measure in zip(
+            row.split("|")[2:], ["accuracy", "clean_accuracy", "n_views"], strict=False
+        ):
             assert float(cell.split()[0]) == pytest.approx(summary[name, 0.97, measure], abs=0.0051)
         test = tests.loc[(name, 0.97, "accuracy")]
-        assert f"{100 * test.difference:+.1f} ({100 * test.low:+.1f} to {100 * test.high:+.1f}" in text
+        assert (
+            f"{100 * test.difference:+.1f} ({100 * test.low:+.1f} to {100 * test.high:+.1f}" in text
+        )
     assert "LCM from a predicted map; no such network" in text
 
 
-@pytest.mark.parametrize(("policy", "column"), [("oracle-valley", "LEM10"), ("furthest", "furthest")])
+@pytest.mark.parametrize(
+    ("policy", "column"), [("oracle-valley", "LEM10"), ("furthest", "furthest")]
+)
 def test_the_published_tables_agree_with_each_other(policy, column):
     # Table 5 prints the class averages of tables 8 and 9.
     table5 = read_table("table5_nbv_modelnet10")
-    assert published(policy, 0.99, "class_accuracy", TEN) == pytest.approx(table5["class_accuracy"][column], abs=2e-4)
-    assert published(policy, 0.99, "class_travel_moved", TEN) == pytest.approx(table5["class_travel"][column], abs=2e-4)
+    assert published(policy, 0.99, "class_accuracy", TEN) == pytest.approx(
+        table5["class_accuracy"][column], abs=2e-4
+    )
+    assert published(policy, 0.99, "class_travel_moved", TEN) == pytest.approx(
+        table5["class_travel"][column], abs=2e-4
+    )
     assert published(policy, 0.99, "accuracy", TEN) == table5["instance_accuracy"][column]
 
 
@@ -179,7 +268,11 @@ def test_it_is_printed_with_a_sentence_where_nothing_differs_and_a_warning_where
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
     shown = " ".join(" ".join(lines).split())
-    of = load(tmp_path / "board").tables.summary.query("threshold == 0.97").set_index(["policy", "measure"])
+    of = (
+        load(tmp_path / "board")
+        .tables.summary.query("threshold == 0.97")
+        .set_index(["policy", "measure"])
+    )
     lem = of.loc["lem", "accuracy"]
     assert f"lem {lem.value:.3f} ({lem.low:.3f}-{lem.high:.3f})" in shown
     assert "< 0.001 *" in next(line for line in lines if "oracle-gain" in line)
@@ -191,7 +284,9 @@ def test_measured_error_rates_stand_beside_the_promised_ones(predictions, tmp_pa
     bounds = RiskBounds((0.7, 0.8), ((0.2, 0.1),) * 5, 0.1)
     replace(predictions, calibration=Calibration(1.0, 0.0, bounds)).save(tmp_path / "r.npz")
     policies, rates = ("random", "lem", "oracle-gain"), tmp_path / "rates"
-    found = benchmark(tmp_path / "r.npz", rates, policies=policies, risks=(0.1, 0.2), runs=4, samples=50)
+    found = benchmark(
+        tmp_path / "r.npz", rates, policies=policies, risks=(0.1, 0.2), runs=4, samples=50
+    )
     rows = pd.read_parquet(rates / "episodes.parquet")
     risks = found.tables.risks
     assert set(zip(risks.policy, risks.risk, risks.threshold, strict=True)) == {
@@ -200,7 +295,9 @@ def test_measured_error_rates_stand_beside_the_promised_ones(predictions, tmp_pa
     for row in risks.itertuples():
         cell = rows[(rows.policy == row.policy) & (rows.threshold == row.threshold)]
         stopped = cell[cell.confidence >= row.threshold]
-        assert row.error == pytest.approx((stopped.answer.astype(str) != stopped.label.astype(str)).mean())
+        assert row.error == pytest.approx(
+            (stopped.answer.astype(str) != stopped.label.astype(str)).mean()
+        )
         assert row.confident == pytest.approx(len(stopped) / len(cell))
         assert row.low <= row.error <= row.high
     assert any(promise.broken for promise in promised_risks(found.tables))  # the logits are noise

@@ -1,4 +1,6 @@
-"""Captured views: three layouts read against closed forms, the nearest view, the way there and back, damage."""
+"""Captured views: three layouts read against closed forms, the nearest view, the way there and
+back, damage.
+"""
 
 import json
 import re
@@ -62,7 +64,9 @@ def write_bop(folder):
 def write_tum(folder):
     write_png(folder / "depth/a.png", depth_image(10000))
     (folder / "depth.txt").write_text("# time name\n10.00 depth/a.png\n")
-    (folder / "groundtruth.txt").write_text("# t\n9.99 9 9 9 0 0 0 1\n10.004 0.25 -0.5 2 1 0 0 0\n10.1 8 8 8 0 0 0 1\n")
+    (folder / "groundtruth.txt").write_text(
+        "# t\n9.99 9 9 9 0 0 0 1\n10.004 0.25 -0.5 2 1 0 0 0\n10.1 8 8 8 0 0 0 1\n"
+    )
     np.savetxt(folder / "camera-intrinsics.txt", K)
     return folder
 
@@ -90,9 +94,12 @@ def test_pose_intrinsics_and_depth_are_those_of_the_layout(layout, tmp_path):
     frame = captured.read()
     assert frame.depth[0, 0] == frame.depth[0, 1] == 0
     np.testing.assert_allclose(frame.depth.ravel()[2:], 2, rtol=1e-6)
-    # The pixel at the principal point sees the floor right below the camera; 50 columns of 500 are 0.1 of the depth.
+    # The pixel at the principal point sees the floor right below the camera; 50 columns of 500 are
+    # 0.1 of the depth.
     expected = (np.array([3 - 7.5, 4 - 5.5]) / [500, 510] * 2) * [1, -1] + [0.25, -0.5]
-    np.testing.assert_allclose(frame.positions(np.array([4]), np.array([3]))[0], [*expected, 0], atol=1e-6)
+    np.testing.assert_allclose(
+        frame.positions(np.array([4]), np.array([3]))[0], [*expected, 0], atol=1e-6
+    )
 
 
 # There and back
@@ -113,14 +120,26 @@ def system():
 
 
 def test_captured_from_the_viewpoints_it_is_the_same_as_looking(captured, system):
-    """With the box known no pose is off, the same views are taken, and they are believed as those of the mesh."""
-    camera = CapturedCamera(read_capture(captured), up=(0, 0, 1), box=read_box(captured / "box.json"))
-    found, looked = system.recognise(camera, start=4), system.recognise(sample_mesh("chair"), start=4)
+    """With the box known no pose is off, the same views are taken, and they are believed as
+    those of the mesh.
+    """
+    camera = CapturedCamera(
+        read_capture(captured), up=(0, 0, 1), box=read_box(captured / "box.json")
+    )
+    found, looked = (
+        system.recognise(camera, start=4),
+        system.recognise(sample_mesh("chair"), start=4),
+    )
     assert max(view.degrees_off for view in found.views) < 1e-5
     assert [view.index for view in found.views] == [view.index for view in looked.views]
-    assert [camera.capture.frames.index(taken.frame) for taken in camera.taken] == [v.index for v in looked.views]
+    assert [camera.capture.frames.index(taken.frame) for taken in camera.taken] == [
+        v.index for v in looked.views
+    ]
     assert found.answer == looked.answer == "chair"
-    centre, height = camera.object.object_frame.centre, -RADIUS * sample_mesh("chair").vertices[:, 2].min()
+    centre, height = (
+        camera.object.object_frame.centre,
+        -RADIUS * sample_mesh("chair").vertices[:, 2].min(),
+    )
     np.testing.assert_allclose(centre, [0, 0, height], atol=1e-9)
     for view in found.views:
         np.testing.assert_allclose(view.observation.pose, TWELVE.poses[view.index], atol=1e-6)
@@ -166,13 +185,19 @@ def test_views_that_do_not_show_the_object_are_left_out(captured, tmp_path, syst
     camera = CapturedCamera(read_capture(tmp_path / "some"))
     result = system.recognise(camera, start=4)
     assert list(camera.left_out) == ["000004"]
-    assert camera.taken[0].degrees_off == pytest.approx(20.9, abs=2)  # the next one: 30 degrees round, at 45 up
+    # the next one: 30 degrees round, at 45 up
+    assert camera.taken[0].degrees_off == pytest.approx(20.9, abs=2)
     assert result.answer == "chair"
 
 
 def test_the_section_of_the_guide_runs(tmp_path, monkeypatch, capsys):
     root = Path(__file__).parent.parent
-    section = (root / "docs" / "your_camera.md").read_text().split("## Captured images\n")[1].split("\n## ")[0]
+    section = (
+        (root / "docs" / "your_camera.md")
+        .read_text()
+        .split("## Captured images\n")[1]
+        .split("\n## ")[0]
+    )
     shutil.copytree(root / "samples", tmp_path / "samples")
     monkeypatch.chdir(tmp_path)
     for line in re.search(r"```sh\n(.*?)```", section, re.S)[1].splitlines():
@@ -190,7 +215,8 @@ STEPS = {"bop": 0.001, "tum": 1 / 5000, "7scenes": 0.001}  # metres, of the dept
 
 
 def seen(count=9, moved=0.0, turned=0.0, evenly=False, thing=None):
-    """Depth images, metres, of a thing on a table, by default the sample chair, and poses around it.
+    """Depth images, metres, of a thing on a table, by default the sample chair, and poses around
+    it.
 
     The poses are off by some metres and degrees; they are random or evenly around at one height.
     """
@@ -212,25 +238,35 @@ def seen(count=9, moved=0.0, turned=0.0, evenly=False, thing=None):
     for pose in poses:
         turn = Rotation.from_rotvec(rng.normal(0, turned, 3), degrees=True).as_matrix()
         there = pose[:3, 3] + rng.normal(0, moved, 3)
-        depth, which = caster.cast(there, rays @ np.ascontiguousarray((pose[:3, :3] @ turn).T, np.float32))
+        depth, which = caster.cast(
+            there, rays @ np.ascontiguousarray((pose[:3, :3] @ turn).T, np.float32)
+        )
         depths.append(np.where(which < 0, 0, depth).reshape(120, 160))
     return depths, poses
 
 
 def reordered(rotations):
     """Rotations of quaternions w, x, y, z that are taken for x, y, z, w."""
-    return Rotation.from_quat(np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=1)).as_matrix()
+    return Rotation.from_quat(
+        np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=1)
+    ).as_matrix()
 
 
 def write_frames(folder, layout, depths, poses, step=1.0, unit=1.0, swapped=False):
-    """Frames in a layout; the depth images have steps other than the layout's, the translations another unit."""
+    """Frames in a layout; the depth images have steps other than the layout's, the translations
+    another unit.
+    """
     stored = np.linalg.inv(poses) if layout == "bop" else poses.copy()
     if swapped and layout != "tum":
         stored[:, :3, :3] = reordered(stored[:, :3, :3])
     stored[:, :3, 3] *= unit * (1000 if layout == "bop" else 1)
     k, cameras, times, lines = SMALL_K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), {}, [], []
     for i, (depth, pose) in enumerate(zip(depths, stored, strict=True)):
-        name = {"bop": f"depth/{i:06d}.png", "tum": f"depth/{i}.png", "7scenes": f"frame-{i:06d}.depth.png"}[layout]
+        name = {
+            "bop": f"depth/{i:06d}.png",
+            "tum": f"depth/{i}.png",
+            "7scenes": f"frame-{i:06d}.depth.png",
+        }[layout]
         write_png(folder / name, np.minimum(np.rint(depth / (step * STEPS[layout])), 65534))
         if layout == "bop":
             there = {"cam_R_w2c": pose[:3, :3].ravel().tolist(), "cam_t_w2c": pose[:3, 3].tolist()}
@@ -277,14 +313,18 @@ MISTAKES = {
 def test_a_mistake_in_all_poses_is_named(what, layout, nine, tmp_path):
     depths, poses = nine
     change, options, said = MISTAKES[what]
-    options = {name: value[layout] if isinstance(value, dict) else value for name, value in options.items()}
+    options = {
+        name: value[layout] if isinstance(value, dict) else value for name, value in options.items()
+    }
     write_frames(tmp_path, layout, depths, change(poses), **options)
     with pytest.raises(DatasetError, match=said):
         CapturedCamera(read_capture(tmp_path))
 
 
 @pytest.mark.parametrize("layout", WRITERS)
-@pytest.mark.parametrize(("count", "moved", "turned"), [(9, 0, 0), (9, 0.004, 0.5), (5, 0.004, 0.5), (2, 0, 0)])
+@pytest.mark.parametrize(
+    ("count", "moved", "turned"), [(9, 0, 0), (9, 0.004, 0.5), (5, 0.004, 0.5), (2, 0, 0)]
+)
 def test_right_frames_pass(layout, count, moved, turned, tmp_path):
     write_frames(tmp_path, layout, *seen(count, moved, turned))
     checked, left_out = check_capture(read_capture(tmp_path))
@@ -294,7 +334,9 @@ def test_right_frames_pass(layout, count, moved, turned, tmp_path):
 
 @pytest.fixture(scope="module")
 def around():
-    """The sample chair on a table, from 24 places around it at one height: a turn leaves the table as it is."""
+    """The sample chair on a table, from 24 places around it at one height: a turn leaves the
+    table as it is.
+    """
     return seen(24, evenly=True)
 
 
@@ -333,8 +375,14 @@ PARTS = {
     "one image lost": (late_from(12, 1), "from frame 000012 on the poses are one frame late"),
     "one image lost early": (late_from(4, 1), "from frame 000004 on the poses are one frame late"),
     "two images lost": (late_from(9, 2), "from frame 000009 on the poses are 2 frames late"),
-    "one pose lost": (late_from(12, -1), "from frame 00001. to 00002. the poses are one frame early"),
-    "an image lost twice": (two_lost, "from frame 000007 to .* one frame late.* and from frame 0000.* 2 frames late"),
+    "one pose lost": (
+        late_from(12, -1),
+        "from frame 00001. to 00002. the poses are one frame early",
+    ),
+    "an image lost twice": (
+        two_lost,
+        "from frame 000007 to .* one frame late.* and from frame 0000.* 2 frames late",
+    ),
     "bumped": (bumped, "the frames from 000012 on contradict those before"),
 }
 
@@ -362,8 +410,18 @@ CAMERAS_WRONG = {
     "offset": (lambda d: d, moved(0.08, 0.05, 0.04), 1.0, "hand-eye"),
     "mirrored": (np.fliplr, lambda p: p, 1.0, "flipped left to right"),
     "flipped": (np.flipud, lambda p: p, 1.0, "flipped top to bottom"),
-    "long focal length": (lambda d: d, lambda p: p, 1.15, "the focal length is some 1[3-7] % too long"),
-    "short focal length": (lambda d: d, lambda p: p, 0.85, "the focal length is some 1[3-7] % too short"),
+    "long focal length": (
+        lambda d: d,
+        lambda p: p,
+        1.15,
+        "the focal length is some 1[3-7] % too long",
+    ),
+    "short focal length": (
+        lambda d: d,
+        lambda p: p,
+        0.85,
+        "the focal length is some 1[3-7] % too short",
+    ),
 }
 
 
@@ -418,7 +476,10 @@ ONE_BAD = {
     "a lost pose": (lose_pose, "NaN"),
     "a wrong pose": (turn_pose, "contradicts the other frames"),
     "a cut image": (cut_image, "damaged"),
-    "an empty image": (lambda f: write_png(f / "frame-000004.depth.png", np.zeros((120, 160))), "no pixel has a depth"),
+    "an empty image": (
+        lambda f: write_png(f / "frame-000004.depth.png", np.zeros((120, 160))),
+        "no pixel has a depth",
+    ),
 }
 
 
@@ -475,7 +536,12 @@ CAMERAS, TRAJECTORY = "scene_camera.json", "groundtruth.txt"
 POSE, DEPTH = "frame-000003.pose.txt", "frame-000003.depth.png"
 DAMAGE = {
     "a missing image": ("bop", "depth/000007.png", Path.unlink, "no such file"),
-    "a truncated image": ("7scenes", DEPTH, lambda p: p.write_bytes(p.read_bytes()[:-40]), "damaged"),
+    "a truncated image": (
+        "7scenes",
+        DEPTH,
+        lambda p: p.write_bytes(p.read_bytes()[:-40]),
+        "damaged",
+    ),
     "a link to an image elsewhere": ("7scenes", DEPTH, link_out, "link out of this folder"),
     "a link to a list elsewhere": ("tum", TRAJECTORY, link_out, "link out of this folder"),
     "a link to a folder elsewhere": ("bop", "depth", link_out, "link out of this folder"),
@@ -483,7 +549,12 @@ DAMAGE = {
     "no JSON": ("bop", CAMERAS, put("{"), "not the cameras"),
     "no scale": ("bop", CAMERAS, edited(lambda v: v.update(depth_scale=0)), "depth_scale"),
     "no translation": ("bop", CAMERAS, edited(lambda v: v.pop("cam_t_w2c")), "cam_t"),
-    "no rotation": ("bop", CAMERAS, edited(lambda v: v.update(cam_R_w2c=[2, 0, 0, 0, 2, 0, 0, 0, 2])), "scaled by 2"),
+    "no rotation": (
+        "bop",
+        CAMERAS,
+        edited(lambda v: v.update(cam_R_w2c=[2, 0, 0, 0, 2, 0, 0, 0, 2])),
+        "scaled by 2",
+    ),
     "a lost camera": ("7scenes", POSE, put(4 * "nan nan nan nan\n"), "NaN"),
     "an empty trajectory": ("tum", TRAJECTORY, put("# t\n"), "lists nothing"),
     "no quaternion": ("tum", TRAJECTORY, put("10 0 0 0 0 0 0 0\n"), "quaternion"),
@@ -500,6 +571,7 @@ def test_what_is_damaged_is_named(what, tmp_path, capsys):
     folder.mkdir()
     WRITERS[layout](folder)
     damage(folder / name)
-    sentence = refused(capsys, "recognise", folder).replace(" ", "")  # it may be broken in two lines anywhere
+    # it may be broken in two lines anywhere
+    sentence = refused(capsys, "recognise", folder).replace(" ", "")
     assert said.replace(" ", "") in sentence
     assert (folder.name if what == "no intrinsics" else name) in sentence

@@ -46,13 +46,15 @@ def test_every_command_explains_itself(name, capsys):
     shown = capsys.readouterr().out
     assert shown.startswith(f"usage: nextview {name} ")
     assert "(required)" in shown or name == "demo" or name == "explore"
-    assert not [line for line in shown.splitlines() if re.search(r"--[\w-]+ \S+\s+\(default", line)], "no help"
+    assert not [
+        line for line in shown.splitlines() if re.search(r"--[\w-]+ \S+\s+\(default", line)
+    ], "no help"
 
 
 def test_all_commands_are_listed_without_importing_one():
     code = (
-        "import sys; from nextview.cli.main import main; main(['--help'])\n"
-        "slow = {'torch', 'pandas', 'matplotlib', 'zarr', 'tyro', 'rich'} & set(sys.modules); assert not slow, slow"
+        "import sys; from nextview.cli.main import main; main(['--help'])\nslow = {'torch',"
+        " 'pandas', 'matplotlib', 'zarr', 'tyro', 'rich'} & set(sys.modules); assert not slow, slow"
     )
     listed = run_python(code)
     assert listed.returncode == 0, listed.stderr
@@ -98,13 +100,23 @@ def test_an_option_takes_the_same_in_every_command():
     taken = {}
     for name in COMMANDS:
         for option, kind in options(name).items():
-            assert not kind or taken.setdefault(option, kind) & kind, (option, name, kind, taken[option])
+            assert not kind or taken.setdefault(option, kind) & kind, (
+                option,
+                name,
+                kind,
+                taken[option],
+            )
     assert {"held_out", "validation", "views", "seed"} <= taken.keys()
 
 
-@pytest.mark.parametrize(("words", "meant"), [("recognize", "recognise"), ("train recognizer", "train recogniser")])
+@pytest.mark.parametrize(
+    ("words", "meant"), [("recognize", "recognise"), ("train recognizer", "train recogniser")]
+)
 def test_a_misspelt_command_is_guessed(words, meant, capsys):
-    assert ended(capsys, *words.split()) == (2, f"nextview: there is no command {words!r}; did you mean {meant!r}?\n")
+    assert ended(capsys, *words.split()) == (
+        2,
+        f"nextview: there is no command {words!r}; did you mean {meant!r}?\n",
+    )
 
 
 @pytest.mark.parametrize("preset", [None, "thesis"])
@@ -118,21 +130,37 @@ def test_a_preset_sets_defaults_that_options_change(preset, monkeypatch):
         return []
 
     monkeypatch.setattr(stage, "train_recogniser", train)
-    main(["train", "recogniser", "s", "none", *(["--preset", preset] if preset else []), "--epochs", "1"])
+    main(
+        [
+            "train",
+            "recogniser",
+            "s",
+            "none",
+            *(["--preset", preset] if preset else []),
+            "--epochs",
+            "1",
+        ]
+    )
     assert called == [replace(recipe, epochs=1)]
 
 
 def interrupted(command, ready):
     """Ctrl-C for a command, once it is ready."""
     running = subprocess.Popen(
-        command, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        command,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )  # fmt: skip
+    )
     while not ready() and running.poll() is None:
         time.sleep(0.01)
     running.send_signal(signal.SIGINT)
     _, said = running.communicate(timeout=60)
-    return running.returncode, [line for line in said.splitlines() if line.startswith("nextview: ")][-1]
+    return (
+        running.returncode,
+        [line for line in said.splitlines() if line.startswith("nextview: ")][-1],
+    )
 
 
 def test_ctrl_c_ends_rendering_in_one_line_and_it_resumes(tmp_path, furniture):
@@ -164,10 +192,16 @@ def test_a_bug_keeps_its_traceback(monkeypatch):
 
 @pytest.mark.parametrize(
     ("package", "arguments", "extra"),
-    [("torch", ["train", "recogniser", "s", "run"], "train"), ("pandas", ["benchmark", "p.npz"], "benchmark")],
+    [
+        ("torch", ["train", "recogniser", "s", "run"], "train"),
+        ("pandas", ["benchmark", "p.npz"], "benchmark"),
+    ],
 )
 def test_a_missing_extra_is_named_with_what_brings_it(package, arguments, extra):
-    code = f"import sys; sys.modules[{package!r}] = None; from nextview.cli.main import main; main({arguments!r})"
+    code = (
+        f"import sys; sys.modules[{package!r}] = None; from nextview.cli.main import main;"
+        f" main({arguments!r})"
+    )
     done = run_python(code)
     assert done.returncode == 2
     assert f"pip install 'nextview[{extra}]'" in done.stderr
@@ -196,12 +230,20 @@ PathFinder.find_spec = staticmethod(find)
         ("from nextview.learning.recogniser_training import train_recogniser", "train"),
         ("from nextview.learning.export import export_map", "train"),
         ("from nextview.learning.gain_training import train_gain", "train"),
-        ("from nextview.data.pool import each; list(each(print, [1], None, 'tcp://localhost:1'))", "cluster"),
+        (
+            (
+                "from nextview.data.pool import each; list(each(print, [1], None,"
+                " 'tcp://localhost:1'))"
+            ),
+            "cluster",
+        ),
     ],
 )
 def test_python_without_an_extra_names_it_too(code, extra):
     caught = "    print(error)\nelse:\n    raise SystemExit('nothing was raised')"
-    body = f"import nextview\ntry:\n    {code}\nexcept nextview.MissingExtraError as error:\n{caught}"
+    body = (
+        f"import nextview\ntry:\n    {code}\nexcept nextview.MissingExtraError as error:\n{caught}"
+    )
     done = run_python(HIDDEN + body)
     assert done.returncode == 0, done.stderr
     assert f"pip install 'nextview[{extra}]'" in done.stdout
@@ -214,14 +256,23 @@ def test_a_module_that_is_no_extra_is_no_missing_extra():
     assert not isinstance(raised.value, MissingExtraError)
 
 
-@pytest.mark.parametrize("name", ["train recogniser", "train gain", "export map", "evaluate", "benchmark", "report"])
+@pytest.mark.parametrize(
+    "name", ["train recogniser", "train gain", "export map", "evaluate", "benchmark", "report"]
+)
 def test_help_needs_no_extra(name):
     """The packages are hidden from the search of installed ones."""
-    done = run_python(HIDDEN + f"from nextview.cli.main import main; main({[*name.split(), '--help']!r})")
+    done = run_python(
+        HIDDEN + f"from nextview.cli.main import main; main({[*name.split(), '--help']!r})"
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(f"usage: nextview {name} ")
     assert "pip install 'nextview[" in done.stderr
-    assert done.stdout == run_python(f"from nextview.cli.main import main; main({[*name.split(), '--help']!r})").stdout
+    assert (
+        done.stdout
+        == run_python(
+            f"from nextview.cli.main import main; main({[*name.split(), '--help']!r})"
+        ).stdout
+    )
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
@@ -238,15 +289,20 @@ def test_a_shell_completes_the_whole_command(shell, capsys):
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
 @pytest.mark.parametrize(
     ("words", "offered"),
-    [("re", {"recognise", "render", "report"}), ("fit s", {"size"}), ("train recogniser --lay", {"--layers"})],
+    [
+        ("re", {"recognise", "render", "report"}),
+        ("fit s", {"size"}),
+        ("train recogniser --lay", {"--layers"}),
+    ],
 )
 def test_bash_completes_commands_and_options(words, offered, tmp_path):
     pytest.importorskip("torch")
     script = run_python("from nextview.cli.main import main; main(['completion', 'bash'])").stdout
     (tmp_path / "nextview.sh").write_text(script)
     ask = (
-        f"source {tmp_path}/nextview.sh; f=$(complete -p nextview | sed 's/.*-F \\([^ ]*\\).*/\\1/'); "
-        f"COMP_WORDS=(nextview {words}); COMP_CWORD=$((${{#COMP_WORDS[@]}}-1)); $f; echo ${{COMPREPLY[@]}}"
+        f"source {tmp_path}/nextview.sh; f=$(complete -p nextview | sed 's/.*-F \\([^"
+        f" ]*\\).*/\\1/'); COMP_WORDS=(nextview {words}); COMP_CWORD=$((${{#COMP_WORDS[@]}}-1));"
+        " $f; echo ${COMPREPLY[@]}"
     )
     done = subprocess.run(["bash", "-c", ask], capture_output=True, text=True, check=True)
     assert set(done.stdout.split()) == offered
@@ -257,7 +313,10 @@ def test_a_stage_that_resumes_says_what_it_did(views, tmp_path, capsys, monkeypa
     shutil.copytree(views, store)
     (tmp_path / "ones.py").write_text("def one(view):\n    return 1.0\n")
     monkeypatch.chdir(tmp_path)
-    for said in ("18 of 18 objects measured now", "nothing was left to do; all 18 objects were measured before"):
+    for said in (
+        "18 of 18 objects measured now",
+        "nothing was left to do; all 18 objects were measured before",
+    ):
         main(["measure", str(store), "--measures", "ones:one", "--workers", "0"])
         assert said in " ".join(capsys.readouterr().err.split())
 
@@ -274,10 +333,20 @@ def test_where_there_is_no_terminal_a_line_tells_how_far_it_is(monkeypatch):
 
 def test_render_says_at_once_what_sizes_the_networks_take(furniture, tmp_path, capsys):
     for size, said in (("48", True), ("112", False)):
-        command = ["render", str(furniture), str(tmp_path / f"{size}.zarr"), "--size", size, "--viewpoints", "12"]
+        command = [
+            "render",
+            str(furniture),
+            str(tmp_path / f"{size}.zarr"),
+            "--size",
+            size,
+            "--viewpoints",
+            "12",
+        ]
         main([*command, "--split", "test", "--workers", "0"])
         words = " ".join(capsys.readouterr().err.split())
-        assert ("networks take images whose side is a multiple of 112 pixels, such as 224" in words) == said
+        assert (
+            "networks take images whose side is a multiple of 112 pixels, such as 224" in words
+        ) == said
 
 
 def test_predictions_are_summed_up():
@@ -285,6 +354,9 @@ def test_predictions_are_summed_up():
     n, v, c = p.logits.shape
     truth = np.eye(c, dtype=np.float32)[p.labels]
     logits = np.repeat(truth[:, None], v, 1)
-    logits[:, : v // 4] = 1.5 * np.roll(truth, 1, axis=1)[:, None]  # a quarter of the views names another class
-    p = replace(p, logits=logits, splits=np.array(["test"] * n), models={"recogniser": ("tiny", "0" * 64)})
+    # a quarter of the views names another class
+    logits[:, : v // 4] = 1.5 * np.roll(truth, 1, axis=1)[:, None]
+    p = replace(
+        p, logits=logits, splits=np.array(["test"] * n), models={"recogniser": ("tiny", "0" * 64)}
+    )
     assert summed_up(p) == [f"{n} test objects: right from one view 0.750, from all {v} 1.000"]

@@ -1,4 +1,6 @@
-"""Points of a view, against the depth image they come from, and what the map networks are given of them."""
+"""Points of a view, against the depth image they come from, and what the map networks are given
+of them.
+"""
 
 import numpy as np
 import pytest
@@ -45,7 +47,9 @@ def test_every_point_is_under_a_visible_pixel(share, view):
     assert (points.shape, points.dtype) == ((1024, 3), np.float32)
     row, column = pixels_of(points, POSES[view], intrinsics).T
     assert (depth[row, column] > 0).all()
-    np.testing.assert_allclose(points, unprojected(depth, POSES[view], intrinsics)[row, column], atol=1e-6)
+    np.testing.assert_allclose(
+        points, unprojected(depth, POSES[view], intrinsics)[row, column], atol=1e-6
+    )
 
 
 @settings(deadline=None, max_examples=30)
@@ -67,9 +71,12 @@ def test_every_visible_pixel_has_the_same_chance():
     depth, intrinsics = np.full((48, 48), 3.0, np.float32), pinhole(48, 3.0)
     drawn = np.zeros((4, 4))
     for seed in range(60):
-        row, column = pixels_of(visible_points(depth, POSES[0], intrinsics, seed), POSES[0], intrinsics).T
+        row, column = pixels_of(
+            visible_points(depth, POSES[0], intrinsics, seed), POSES[0], intrinsics
+        ).T
         np.add.at(drawn, (row // 12, column // 12), 1)
-    # Without replacement the counts vary less than in chisquare's model: a p-value near 0 would still tell of a bias.
+    # Without replacement the counts vary less than in chisquare's model: a p-value near 0 would
+    # still tell of a bias.
     assert chisquare(drawn.ravel()).pvalue > 1e-3
 
 
@@ -98,7 +105,8 @@ def test_turning_object_and_camera_together_changes_nothing(azimuth, elevation):
 
 
 def test_the_camera_stands_at_azimuth_zero():
-    # A marker towards the camera has the largest x, one on the camera's right the largest y, one above the largest z.
+    # A marker towards the camera has the largest x, one on the camera's right the largest y, one
+    # above the largest z.
     for azimuth in np.linspace(0, 6, 7):
         pose = look_at_origin(0.0, azimuth)
         towards, right, up = -pose[:3, 2], pose[:3, 0], -pose[:3, 1]

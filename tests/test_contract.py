@@ -1,6 +1,8 @@
-"""What must not break: public names, episodes of the bundled models to the digit, and the benchmark's table.
+"""What must not break: public names, episodes of the bundled models to the digit, and the
+benchmark's table.
 
-``python tests/test_contract.py`` writes the golden data beside this file anew, after a wanted change of answers.
+``python tests/test_contract.py`` writes the golden data beside this file anew, after a wanted
+change of answers.
 """
 
 import hashlib
@@ -24,11 +26,37 @@ ROOT = HERE.parent
 GOLDEN = HERE / "contract.json"
 SAMPLES = ROOT / "samples"
 NAMES = {
-    "Camera", "DatasetError", "Directions", "EpisodeState", "Evidence", "Mesh", "MeshError", "ModelError", "Models",
-    "NextviewError", "NoViewLeftError", "Observation", "ObservationError", "Policy", "PolicyError", "PredictionsError",
-    "Recognition", "ResultsError", "Session", "SessionError", "SimulatedCamera", "Stopping", "System", "UsageError",
-    "View", "ViewSphere", "load", "load_mesh", "make_policy", "recognise",
-}  # fmt: skip
+    "Camera",
+    "DatasetError",
+    "Directions",
+    "EpisodeState",
+    "Evidence",
+    "Mesh",
+    "MeshError",
+    "ModelError",
+    "Models",
+    "NextviewError",
+    "NoViewLeftError",
+    "Observation",
+    "ObservationError",
+    "Policy",
+    "PolicyError",
+    "PredictionsError",
+    "Recognition",
+    "ResultsError",
+    "Session",
+    "SessionError",
+    "SimulatedCamera",
+    "Stopping",
+    "System",
+    "UsageError",
+    "View",
+    "ViewSphere",
+    "load",
+    "load_mesh",
+    "make_policy",
+    "recognise",
+}
 ATTRIBUTES = {
     nextview.Session: "done failed pose poses reachable result run target travel_cost update view",
     nextview.Recognition: "answer confidence most_like novelty plot seen travel unknown",
@@ -40,27 +68,50 @@ ATTRIBUTES = {
 }
 FIELDS = {
     nextview.Recognition: "classes confident sphere stopping stranded views",
-    nextview.View: "alone arc azimuth_bins belief degrees_off direction index maps next_view travel warnings",
+    nextview.View: (
+        "alone arc azimuth_bins belief degrees_off direction index maps next_view travel warnings"
+    ),
     Frame: "depth image intrinsics mask",
-    nextview.EpisodeState: "azimuth_bins belief current evidence observations reachable step travel visibility visited",
+    nextview.EpisodeState: (
+        "azimuth_bins belief current evidence observations reachable step travel visibility visited"
+    ),
     nextview.Observation: "depth intrinsics pose",
 }
 POLICIES = (
-    "gain", "spread", "random", "random-all", "furthest", "unidirectional", "lem", "lcm", "lcm-peak", "fixed-sequence",
-    "class-table", "visible-gain",
-)  # fmt: skip
+    "gain",
+    "spread",
+    "random",
+    "random-all",
+    "furthest",
+    "unidirectional",
+    "lem",
+    "lcm",
+    "lcm-peak",
+    "fixed-sequence",
+    "class-table",
+    "visible-gain",
+)
 
 
 def policy_episodes():
     """The policies on the 40 views, each on two samples."""
     for k, policy in enumerate(POLICIES):
-        for sample, start in (("chair", (7 * k + 1) % 40), (("table", "monitor")[k % 2], (5 * k + 30) % 40)):
+        for sample, start in (
+            ("chair", (7 * k + 1) % 40),
+            (("table", "monitor")[k % 2], (5 * k + 30) % 40),
+        ):
             options = {"policy": policy, "threshold": 1.0, "max_views": 4}
-            yield f"{sample}, {policy}, from {start}", _recognise, (sample, options, {"start": start, "seed": k})
+            yield (
+                f"{sample}, {policy}, from {start}",
+                _recognise,
+                (sample, options, {"start": start, "seed": k}),
+            )
 
 
 def other_episodes():
-    """The defaults, other viewpoints, sensors, frames on a table, cost and reach, and a cluttered scene."""
+    """The defaults, other viewpoints, sensors, frames on a table, cost and reach, and a
+    cluttered scene.
+    """
     for sample in ("chair", "monitor", "table"):
         yield f"{sample}, defaults", _recognise, (sample, {}, {"start": 3})
     for viewpoints in ("12", "rings:0,30,60x12", "fibonacci:30"):
@@ -84,7 +135,9 @@ def _arm(sample):
         example = importlib.import_module("arm_over_table")
     finally:
         sys.path.remove(str(ROOT / "examples"))
-    return example.recognise(example.Arm(nextview.load_mesh(SAMPLES / f"{sample}.off"), np.random.default_rng(1)))
+    return example.recognise(
+        example.Arm(nextview.load_mesh(SAMPLES / f"{sample}.off"), np.random.default_rng(1))
+    )
 
 
 def _constrained():
@@ -109,11 +162,16 @@ def _cluttered():
     from nextview.simulation.scene import build_scene
     from nextview.simulation.scene_layout import Block, Placement, SceneLayout
 
-    sha = {name: hashlib.sha256((SAMPLES / name).read_bytes()).hexdigest() for name in ("chair.off", "table.off")}
+    sha = {
+        name: hashlib.sha256((SAMPLES / name).read_bytes()).hexdigest()
+        for name in ("chair.off", "table.off")
+    }
     chair = Placement("chair.off", sha["chair.off"])
     table = Placement("table.off", sha["table.off"], -0.6, 2.0, 0.7, 1.1)
     blocks = (Block(1.6, 0.0, 0.3, 0.3, 1.6, 1.8), Block(-3.0, 0.0, 0.0, 0.1, 4.0, 3.0, True))
-    scene = build_scene(SceneLayout("chair@medium-0", "medium", 0, chair, (table,), blocks), SAMPLES)
+    scene = build_scene(
+        SceneLayout("chair@medium-0", "medium", 0, chair, (table,), blocks), SAMPLES
+    )
     camera = RobotCamera(scene, "wrist", named="box")
     system = nextview.load(policy="visible-gain", threads=1, threshold=0.999, max_views=4)
     session = system.session_with(camera, start=0)
@@ -143,13 +201,23 @@ def synthetic_predictions():
     """60 objects of three classes, whose views resemble each other within an object."""
     rng = np.random.default_rng(7)
     labels, n = np.arange(60) % 3, 60
-    logits = rng.normal(size=(n, 40, 3)) + rng.normal(size=(n, 1, 3)) + 1.5 * np.eye(3)[labels][:, None]
+    logits = (
+        rng.normal(size=(n, 40, 3)) + rng.normal(size=(n, 1, 3)) + 1.5 * np.eye(3)[labels][:, None]
+    )
     maps = {"lem": rng.random((n, 40, 5, 3)).astype(np.float32)}
     return Predictions(
-        logits.astype(np.float32), maps, rng.random((n, 40)).astype(np.float32), tuple(f"object_{i}" for i in range(n)),
-        labels, ("bed", "desk", "sofa"), np.array(["test"] * n), np.zeros(n, bool), nextview.ViewSphere.named("40"),
-        {}, {"lem": ("desk",)},
-    )  # fmt: skip
+        logits.astype(np.float32),
+        maps,
+        rng.random((n, 40)).astype(np.float32),
+        tuple(f"object_{i}" for i in range(n)),
+        labels,
+        ("bed", "desk", "sofa"),
+        np.array(["test"] * n),
+        np.zeros(n, bool),
+        nextview.ViewSphere.named("40"),
+        {},
+        {"lem": ("desk",)},
+    )
 
 
 TABLE_OF = ("random", "random-all", "furthest", "spread", "lem", "lem-peak", "oracle-gain")
@@ -160,11 +228,25 @@ def table(folder):
     """The benchmark's numbers by policy, threshold and measure: value, low, high."""
     pd = pytest.importorskip("pandas")
     synthetic_predictions().save(folder / "p.npz")
-    how = ["--thresholds", "0.8", "0.97", "--runs", "3", "--max-views", "4", "--samples", "200", "--seed", "1"]
+    how = [
+        "--thresholds",
+        "0.8",
+        "0.97",
+        "--runs",
+        "3",
+        "--max-views",
+        "4",
+        "--samples",
+        "200",
+        "--seed",
+        "1",
+    ]
     main(["benchmark", str(folder / "p.npz"), str(folder / "out"), "--policies", *TABLE_OF, *how])
     rows = pd.read_csv(folder / "out" / "summary.csv")
     rows = rows[rows.measure.isin(MEASURES) & rows.threshold.isin([0.8, 0.97])]
-    return {f"{r.policy} {r.threshold} {r.measure}": [r.value, r.low, r.high] for r in rows.itertuples()}
+    return {
+        f"{r.policy} {r.threshold} {r.measure}": [r.value, r.low, r.high] for r in rows.itertuples()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -180,7 +262,9 @@ def test_public_names():
 @pytest.mark.parametrize("kind", ATTRIBUTES | FIELDS, ids=lambda kind: kind.__name__)
 def test_attributes_and_fields(kind):
     assert not [name for name in ATTRIBUTES.get(kind, "").split() if not hasattr(kind, name)]
-    found = set(getattr(kind, "__dataclass_fields__", ())) | set(getattr(kind, "__struct_fields__", ()))
+    found = set(getattr(kind, "__dataclass_fields__", ())) | set(
+        getattr(kind, "__struct_fields__", ())
+    )
     assert not set(FIELDS.get(kind, "").split()) - found
 
 
@@ -190,9 +274,15 @@ PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md")), *sorted(ROOT.glob(
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_what_pages_import_is_there(page):
     """Lines "from nextview... import names", each name of which has to be there."""
-    lines = re.findall(r"^(?:>>> )?from (nextview(?:\.[\w.]+)?) import ([\w, ]+)", page.read_text(), re.M)
-    for module, name in ((module, name.strip()) for module, names in lines for name in names.split(", ")):
-        there = hasattr(importlib.import_module(module), name) or importlib.util.find_spec(f"{module}.{name}")
+    lines = re.findall(
+        r"^(?:>>> )?from (nextview(?:\.[\w.]+)?) import ([\w, ]+)", page.read_text(), re.M
+    )
+    for module, name in (
+        (module, name.strip()) for module, names in lines for name in names.split(", ")
+    ):
+        there = hasattr(importlib.import_module(module), name) or importlib.util.find_spec(
+            f"{module}.{name}"
+        )
         assert there, f"{page.name}: {name} of {module}"
 
 
@@ -200,9 +290,13 @@ def test_what_pages_import_is_there(page):
 def test_episodes(name, golden):
     found, wanted = measured(name), golden["episodes"][name]
     assert (found["path"], found["answer"], found["confident"]) == (
-        wanted["path"], wanted["answer"], wanted["confident"],
-    )  # fmt: skip
-    assert [found["travel"], found["arc"]] == pytest.approx([wanted["travel"], wanted["arc"]], abs=1e-9)
+        wanted["path"],
+        wanted["answer"],
+        wanted["confident"],
+    )
+    assert [found["travel"], found["arc"]] == pytest.approx(
+        [wanted["travel"], wanted["arc"]], abs=1e-9
+    )
     np.testing.assert_allclose(found["belief"], wanted["belief"], rtol=0, atol=1e-5)
     assert found["novelty"] == pytest.approx(wanted["novelty"], abs=1e-4)
 
@@ -222,4 +316,6 @@ if __name__ == "__main__":
     found = {"episodes": {name: measured(name) for name in EPISODES}, "table": numbers}
     lines = [f"{json.dumps(name)}: {json.dumps(e)}" for name, e in found["episodes"].items()]
     rows = [f"{json.dumps(name)}: {json.dumps(row)}" for name, row in found["table"].items()]
-    GOLDEN.write_text('{"episodes": {\n' + ",\n".join(lines) + '\n},\n"table": {\n' + ",\n".join(rows) + "\n}}\n")
+    GOLDEN.write_text(
+        '{"episodes": {\n' + ",\n".join(lines) + '\n},\n"table": {\n' + ",\n".join(rows) + "\n}}\n"
+    )

@@ -1,4 +1,6 @@
-"""Downloads from a real server on this machine: one that cuts, lies, or serves what it should not."""
+"""Downloads from a real server on this machine: one that cuts, lies, or serves what it should
+not.
+"""
 
 import gc
 import hashlib
@@ -26,7 +28,12 @@ def zipped(members: dict[str, bytes]) -> bytes:
 
 
 GOOD = zipped(
-    {"Shapes/chair/train/a.off": MESH, "Shapes/chair/test/noise.bin": NOISE, "__MACOSX/x": b"no", "../r.txt": b""}
+    {
+        "Shapes/chair/train/a.off": MESH,
+        "Shapes/chair/test/noise.bin": NOISE,
+        "__MACOSX/x": b"no",
+        "../r.txt": b"",
+    }
 )
 
 
@@ -73,7 +80,8 @@ def test_download_unpacks_only_its_folder_once_and_leaves_nothing_else(tmp_path)
     assert (tmp_path / "data/Shapes/chair/train/a.off").read_bytes() == MESH
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # requests leaves its socket open
+# requests leaves its socket open
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize(
     ("options", "published", "sentence"),
     [
@@ -85,18 +93,24 @@ def test_download_unpacks_only_its_folder_once_and_leaves_nothing_else(tmp_path)
     ],
 )
 def test_what_is_not_the_published_file_leaves_nothing(tmp_path, options, published, sentence):
-    with Server(**{"data": GOOD} | options) as server, pytest.raises(DatasetError, match=sentence) as refusal:
+    with (
+        Server(**{"data": GOOD} | options) as server,
+        pytest.raises(DatasetError, match=sentence) as refusal,
+    ):
         download(server.archive(published), tmp_path)
     assert "\n" not in str(refusal.value)
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.filterwarnings("ignore:unclosed <socket:ResourceWarning")  # of a refused answer, closed when collected
+# of a refused answer, closed when collected
+@pytest.mark.filterwarnings("ignore:unclosed <socket:ResourceWarning")
 @pytest.mark.parametrize("there", [(), ("mine",)])
 def test_a_download_that_fails_leaves_no_folder_of_its_own(tmp_path, there):
     for name in there:
         (tmp_path / name).mkdir()
     with Server(GOOD, status=500) as server, pytest.raises(DatasetError, match="500"):
         download(Archive(server.url, "0" * 64, "Shapes"), tmp_path / "mine" / "data", timeout=5)
-    assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")) == list(there)
+    assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")) == list(
+        there
+    )
     gc.collect()

@@ -1,4 +1,6 @@
-"""The environments: what Gymnasium promises for them, and that they are the replay's own episodes."""
+"""The environments: what Gymnasium promises for them, and that they are the replay's own
+episodes.
+"""
 
 import doctest
 from dataclasses import replace
@@ -28,7 +30,9 @@ INPUTS = ("belief", "view", "place", "lem", "azimuth_bin")
 def learnable(n: int = 12) -> Predictions:
     azimuth_bins = np.random.default_rng(9).normal(size=(n, 40, 3, 8)).astype(np.float32)
     calibration, splits = Calibration(1.5, 0.3, bin_correlation=0.2), np.array(["train"] * n)
-    return replace(some_predictions(n), splits=splits, azimuth_bins=azimuth_bins, calibration=calibration)
+    return replace(
+        some_predictions(n), splits=splits, azimuth_bins=azimuth_bins, calibration=calibration
+    )
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +48,13 @@ def file(tmp_path_factory):
     [
         {},
         {"inputs": INPUTS, "frame": "object", "objective": "log-belief"},
-        {"threshold": 0.6, "view_price": 0.1, "travel_price": 0.01, "balanced": True, "inputs": ("lem", "azimuth_bin")},
+        {
+            "threshold": 0.6,
+            "view_price": 0.1,
+            "travel_price": 0.01,
+            "balanced": True,
+            "inputs": ("lem", "azimuth_bin"),
+        },
     ],
 )
 def test_gymnasium_finds_nothing_wrong(file, options):
@@ -66,7 +76,9 @@ def played(env, seed: int, n: int = 60):
     return found
 
 
-@pytest.mark.parametrize("options", [{}, {"threshold": 0.7, "travel_price": 0.02, "frame": "object", "inputs": INPUTS}])
+@pytest.mark.parametrize(
+    "options", [{}, {"threshold": 0.7, "travel_price": 0.02, "frame": "object", "inputs": INPUTS}]
+)
 def test_the_vectorised_environment_is_many_single_ones(options):
     p, n, rng = learnable(), 7, np.random.default_rng(1)
     many = gymnasium.make_vec(RECOGNISE, num_envs=n, predictions=p, **options)
@@ -77,7 +89,9 @@ def test_the_vectorised_environment_is_many_single_ones(options):
 
     def begin(row):
         """The single environment on the same object, from the same first view."""
-        return singles[row].reset(options={"object": info["object"][row], "start": info["view"][row]})[0]
+        return singles[row].reset(
+            options={"object": info["object"][row], "start": info["view"][row]}
+        )[0]
 
     for row in range(n):
         np.testing.assert_array_equal(begin(row), observation[row])
@@ -88,7 +102,9 @@ def test_the_vectorised_environment_is_many_single_ones(options):
         for row in range(n):
             seen, reward, over, _, alone = singles[row].step(actions[row])
             last = info["final_info"] if over else info
-            np.testing.assert_array_equal(seen, info["final_obs"][row] if over else observation[row])
+            np.testing.assert_array_equal(
+                seen, info["final_obs"][row] if over else observation[row]
+            )
             assert (reward, over) == (rewards[row], ended[row])
             assert all(np.array_equal(alone[name], last[name][row]) for name in alone)
             if over:
@@ -98,7 +114,9 @@ def test_the_vectorised_environment_is_many_single_ones(options):
 
 
 def test_an_episode_is_the_loop_of_a_robot():
-    """Beliefs, travel and the end are those of ``run_episodes`` with a policy that goes where the actions went."""
+    """Beliefs, travel and the end are those of ``run_episodes`` with a policy that goes where
+    the actions went.
+    """
     p = learnable()
     policy, stopping = Spread(p.sphere), Stopping(0.75, 5, p.calibration.correlation)
     for k in range(6):
@@ -107,9 +125,13 @@ def test_an_episode_is_the_loop_of_a_robot():
             return p.evidence(np.array([row]), views)
 
         rng = np.random.default_rng(k)
-        expected = run_episodes(observe, p.sphere, policy, np.array([3 * k]), stopping, rng, p.calibration)
+        expected = run_episodes(
+            observe, p.sphere, policy, np.array([3 * k]), stopping, rng, p.calibration
+        )
         views = expected.outcome.views[0]
-        env = gymnasium.make(RECOGNISE, predictions=p, threshold=0.75, objective="belief", inputs=("belief",))
+        env = gymnasium.make(
+            RECOGNISE, predictions=p, threshold=0.75, objective="belief", inputs=("belief",)
+        )
         observation, info = env.reset(options={"object": k, "start": int(views[0])})
         total, ended = observation[p.labels[k]], False
         for step, (here, there) in zip(expected.steps[1:], pairwise(views), strict=False):
@@ -144,7 +166,9 @@ def test_meshes_are_rendered_as_the_agent_goes(tmp_path):
     system = load(policy="spread", max_views=2)
     camera = simulated(sample_mesh(next(iter(SAMPLES))))
     session: Session = system.session(start=3)
-    np.testing.assert_allclose(observation[:10], session.update(camera.observe(session.pose)).belief, atol=1e-5)
+    np.testing.assert_allclose(
+        observation[:10], session.update(camera.observe(session.pose)).belief, atol=1e-5
+    )
     with pytest.raises(DatasetError, match="no such folder"):
         gymnasium.make("nextview/RecogniseMesh-v0", meshes=str(tmp_path / "none"))
     (tmp_path / "spoon/train").mkdir(parents=True)
@@ -156,6 +180,8 @@ def test_meshes_are_rendered_as_the_agent_goes(tmp_path):
 def test_the_page_does_what_it_says(tmp_path, monkeypatch):
     learnable().save(tmp_path / "validation.npz")
     monkeypatch.chdir(tmp_path)
-    failed, tried = doctest.testfile(str(Path(__file__).parents[1] / "docs/environments.md"), module_relative=False)
+    failed, tried = doctest.testfile(
+        str(Path(__file__).parents[1] / "docs/environments.md"), module_relative=False
+    )
     assert tried > 12
     assert failed == 0

@@ -39,23 +39,34 @@ class Table:
         return Evidence(self.logits[episodes, views], {"lem": self.lem[episodes, views]})
 
 
-def walk(table: Table, policy, episode: int, start: int, stopping: Stopping, calibration, sphere=SPHERE):
+def walk(
+    table: Table, policy, episode: int, start: int, stopping: Stopping, calibration, sphere=SPHERE
+):
     """One episode as one would write it for one object: views, beliefs."""
     views, beliefs = [start], []
     while True:
-        beliefs.append(softmax(table.logits[episode, views].sum(0) / calibration.temperature_after(len(views))))
-        if beliefs[-1].max() >= stopping.threshold or len(views) in (stopping.max_views, len(sphere)):
+        beliefs.append(
+            softmax(table.logits[episode, views].sum(0) / calibration.temperature_after(len(views)))
+        )
+        if beliefs[-1].max() >= stopping.threshold or len(views) in (
+            stopping.max_views,
+            len(sphere),
+        ):
             return views, beliefs
         visited = np.zeros((1, len(sphere)), bool)
         visited[0, views] = True
         here = np.array([views[-1]])
         evidence = table.observe(np.array([episode]), here)
-        state = EpisodeState(here, visited, beliefs[-1][None], evidence, len(views), np.array([episode]))
+        state = EpisodeState(
+            here, visited, beliefs[-1][None], evidence, len(views), np.array([episode])
+        )
         views.append(int(policy.next_views(state, np.random.default_rng(0))[0]))
 
 
 def run(table, policy, starts, stopping, sphere=SPHERE, seed=0, calibration=PLAIN_SUM) -> Episodes:
-    return run_episodes(table.observe, sphere, policy, starts, stopping, np.random.default_rng(seed), calibration)
+    return run_episodes(
+        table.observe, sphere, policy, starts, stopping, np.random.default_rng(seed), calibration
+    )
 
 
 @settings(deadline=None, max_examples=25)
@@ -63,10 +74,18 @@ def run(table, policy, starts, stopping, sphere=SPHERE, seed=0, calibration=PLAI
     st.integers(0, 1000),
     st.sampled_from([0.0, 0.5, 0.8, 0.97, 1.0]),
     st.integers(1, 7),
-    st.sampled_from([Unidirectional(SPHERE), MapPeak(SPHERE, "lem"), MapPeak(SPHERE, "lem", valley_classes=(0, 2))]),
+    st.sampled_from(
+        [
+            Unidirectional(SPHERE),
+            MapPeak(SPHERE, "lem"),
+            MapPeak(SPHERE, "lem", valley_classes=(0, 2)),
+        ]
+    ),
     st.sampled_from([PLAIN_SUM, Calibration(0.7, 0.4)]),
 )
-def test_many_episodes_at_once_are_each_episode_alone(seed, threshold, max_views, policy, calibration):
+def test_many_episodes_at_once_are_each_episode_alone(
+    seed, threshold, max_views, policy, calibration
+):
     table, stopping = Table.random(20, seed=seed), Stopping(threshold, max_views)
     starts = np.random.default_rng(seed).integers(0, 40, 20)
     episodes = run(table, policy, starts, stopping, calibration=calibration)
@@ -98,7 +117,9 @@ class Turning:
 
 
 def test_the_belief_in_the_side_is_that_of_an_object_that_stands_still():
-    """Each view says something of the side seen from it; together they speak of where the object's own zero points."""
+    """Each view says something of the side seen from it; together they speak of where the
+    object's own zero points.
+    """
     table, policy, calibration = Table.random(20), Turning(), Calibration(0.7, 0.4)
     log_evidence = np.random.default_rng(1).normal(size=(20, len(SPHERE), CLASSES, 8))
 
@@ -113,10 +134,13 @@ def test_the_belief_in_the_side_is_that_of_an_object_that_stands_still():
         for e, now, found in zip(episodes, current, azimuth_bins, strict=True):
             at = done.outcome.views[e, :n_views]
             assert at[-1] == now
-            zero = np.zeros((CLASSES, 8))  # summed by the azimuth that the object's zero has, a steps from the view's
+            # summed by the azimuth that the object's zero has, a steps from the view's
+            zero = np.zeros((CLASSES, 8))
             for view in at:
                 for side in range(8):
-                    zero[:, (SPHERE.azimuth_index[view] - side) % 8] += log_evidence[e, view, :, side]
+                    zero[:, (SPHERE.azimuth_index[view] - side) % 8] += log_evidence[
+                        e, view, :, side
+                    ]
             expected = softmax(zero / (1 + 0.4 * (n_views - 1)), axis=1)
             seen = expected[:, (SPHERE.azimuth_index[now] - np.arange(8)) % 8]
             np.testing.assert_allclose(found, seen, atol=1e-9)
@@ -190,8 +214,12 @@ def test_an_episode_of_fixed_length_goes_on_however_sure_it_is():
     sphere = ViewSphere.named("40")
     done = run_episodes(
         lambda episodes, _: sure.select(np.isin(np.arange(4), episodes)),
-        sphere, ViewList(views), views[:, 0], FixedLength(max_views=3), np.random.default_rng(0),
-    )  # fmt: skip
+        sphere,
+        ViewList(views),
+        views[:, 0],
+        FixedLength(max_views=3),
+        np.random.default_rng(0),
+    )
     np.testing.assert_array_equal(done.outcome.views, views)
     assert done.steps[0].belief.max() == 1
     assert not done.outcome.confident.any()

@@ -1,4 +1,6 @@
-"""Evaluation of recognisers and maps from made-up predictions, against counts by hand, brute force and SciPy."""
+"""Evaluation of recognisers and maps from made-up predictions, against counts by hand, brute
+force and SciPy.
+"""
 
 from dataclasses import replace
 from itertools import combinations
@@ -31,9 +33,14 @@ RING = ViewSphere((45.0,), 3)
 
 
 def by_hand():
-    """Four objects of two classes, three views. Right views: 3, 1 and 2 of class a, none of class b."""
+    """Four objects of two classes, three views.
+
+    Right views: 3, 1 and 2 of class a, none of class b.
+    """
     sure, unsure = np.log([9, 1]), np.log([2, 3])  # beliefs 0.9 for a, 0.6 for b
-    logits = np.array([[sure] * 3, [sure, unsure, unsure], [sure, sure, unsure], [sure] * 3], np.float32)
+    logits = np.array(
+        [[sure] * 3, [sure, unsure, unsure], [sure, sure, unsure], [sure] * 3], np.float32
+    )
     maps = np.zeros((4, 3, 1, 3), np.float32)
     maps[..., 2] = 1
     return replace(
@@ -58,7 +65,10 @@ def score(table, **where):
 
 def test_accuracy_by_hand():
     table = evaluate(by_hand(), 200, np.random.default_rng(0)).accuracy
-    of = {(row.n_views, row.label, row.measure): (row.value, row.objects) for row in table.itertuples()}
+    of = {
+        (row.n_views, row.label, row.measure): (row.value, row.objects)
+        for row in table.itertuples()
+    }
     assert of[1, "", "accuracy"] == pytest.approx((6 / 12, 4))
     assert of[1, "a", "accuracy"] == pytest.approx((6 / 9, 3))
     assert of[1, "b", "accuracy"] == (0, 1)
@@ -86,14 +96,24 @@ def test_what_is_right_without_knowing_the_size_stands_beside():
 
 def test_confusion_and_calibration_by_hand():
     found = evaluate(by_hand(), 10, np.random.default_rng(0))
-    answers = {(row.n_views, row.label, row.answer): row.answers for row in found.confusion.itertuples()}
+    answers = {
+        (row.n_views, row.label, row.answer): row.answers for row in found.confusion.itertuples()
+    }
     assert answers == {
-        (1, "a", "a"): 6, (1, "a", "b"): 3, (1, "b", "a"): 3, (1, "b", "b"): 0,
-        (3, "a", "a"): 3, (3, "a", "b"): 0, (3, "b", "a"): 1, (3, "b", "b"): 0,
-    }  # fmt: skip
+        (1, "a", "a"): 6,
+        (1, "a", "b"): 3,
+        (1, "b", "a"): 3,
+        (1, "b", "b"): 0,
+        (3, "a", "a"): 3,
+        (3, "a", "b"): 0,
+        (3, "b", "a"): 1,
+        (3, "b", "b"): 0,
+    }
     # one view: 9 answers at 0.9, of which 6 are right; 3 at 0.6, none of them right
     rows = found.reliability[found.reliability["n_views"] == 1]
-    np.testing.assert_allclose(rows[["confidence", "accuracy", "answers"]], [[0.6, 0, 3], [0.9, 6 / 9, 9]], rtol=1e-6)
+    np.testing.assert_allclose(
+        rows[["confidence", "accuracy", "answers"]], [[0.6, 0, 3], [0.9, 6 / 9, 9]], rtol=1e-6
+    )
     error = (9 * abs(0.9 - 6 / 9) + 3 * 0.6) / 12
     assert score(found.fusion, n_views=1).calibration_error == pytest.approx(error)
 
@@ -120,7 +140,9 @@ def test_intervals_are_scipys():
         (score(found.accuracy, n_views=1, label="box", measure="accuracy"), single[p.labels == 1]),
         (score(found.maps, by="network", label="", measure="mse"), error),
     ):
-        theirs = bootstrap((values,), np.mean, n_resamples=4000, method="percentile", rng=1).confidence_interval
+        theirs = bootstrap(
+            (values,), np.mean, n_resamples=4000, method="percentile", rng=1
+        ).confidence_interval
         assert row.value == pytest.approx(values.mean())
         assert (row.low, row.high) == pytest.approx(theirs, abs=0.1 * (theirs.high - theirs.low))
 
@@ -137,14 +159,23 @@ def true_windows(p):
 
 def test_map_scores_by_hand():
     found = evaluate(by_hand(), 50, np.random.default_rng(0))
-    # The true map is 0, 1/3, 1 round the ring; its windows are (1, 0, 1/3), (0, 1/3, 1) and (1/3, 1, 0).
-    # The network says (0, 0, 1) everywhere: its peak is 2, 0 and 1 cells off.
+    # The true map is 0, 1/3, 1 round the ring; its windows are (1, 0, 1/3), (0, 1/3, 1) and (1/3,
+    # 1, 0). The network says (0, 0, 1) everywhere: its peak is 2, 0 and 1 cells off.
     errors = [1 + 4 / 9, 1 / 9, 1 / 9 + 1 + 1]
-    lem = {m: score(found.maps, map="lem", by="network", label="", measure=m).value for m in ("mse", "d0", "regret")}
-    assert lem == pytest.approx({"mse": sum(errors) / 9, "d0": 1 / 3, "regret": (2 / 3 + 0 + 1) / 3})
-    near = {m: score(found.maps, map="lem", by="network", label="b", measure=m).value for m in ("d_le_1", "d_lt_2")}
+    lem = {
+        m: score(found.maps, map="lem", by="network", label="", measure=m).value
+        for m in ("mse", "d0", "regret")
+    }
+    assert lem == pytest.approx(
+        {"mse": sum(errors) / 9, "d0": 1 / 3, "regret": (2 / 3 + 0 + 1) / 3}
+    )
+    near = {
+        m: score(found.maps, map="lem", by="network", label="b", measure=m).value
+        for m in ("d_le_1", "d_lt_2")
+    }
     assert near == pytest.approx({"d_le_1": 2 / 3, "d_lt_2": 2 / 3})
-    # All objects have the same true map, so the class's mean at the view is the truth; the mean map is 4/9 everywhere.
+    # All objects have the same true map, so the class's mean at the view is the truth; the mean map
+    # is 4/9 everywhere.
     of_class = score(found.maps, map="lem", by="mean map of the class", label="", measure="mse")
     assert of_class.value == pytest.approx(0, abs=1e-12)
     mean = score(found.maps, map="lem", by="mean map", label="", measure="mse")
@@ -156,6 +187,7 @@ def test_lcm_leaves_out_what_is_never_recognised():
     assert found.left_out == {"lcm": "without the objects that are recognised from no view: 1 of 4"}
     lcm = found.maps[found.maps["map"] == "lcm"]
     assert set(lcm["label"]) == {"", "a"}
-    # confidences 0.9 where right: (.9, .9, .9), (.9, 0, 0), (.9, .9, 0); each cell stands in every column once
+    # confidences 0.9 where right: (.9, .9, .9), (.9, 0, 0), (.9, .9, 0); each cell stands in every
+    # column once
     off = [1.63] * 3 + [0.81 + 1] * 2 + [0.01] + [1.62 + 1, 0.81 + 0.01, 0.81 + 0.01]
     assert score(lcm, by="network", label="", measure="mse").value == pytest.approx(sum(off) / 27)

@@ -48,11 +48,24 @@ def test_the_folder_holds_tables_settings_and_a_page(made):
 
 def test_the_page_shows_the_numbers_of_the_tables(made):
     text = (made / "out" / "evaluate.html").read_text()
-    of = {(int(row["n_views"]), row["label"], row["measure"]): float(row["value"]) for row in table(made, "accuracy")}
-    cells = re.findall(r"<td>([\d.]+)", re.search(r'<tr><th scope="row">pillar</th>.*?</tr>', text)[0])
-    shown = [(n_views, "pillar", measure) for n_views in (1, 40) for measure in ("accuracy", "clean_accuracy")]
+    of = {
+        (int(row["n_views"]), row["label"], row["measure"]): float(row["value"])
+        for row in table(made, "accuracy")
+    }
+    cells = re.findall(
+        r"<td>([\d.]+)", re.search(r'<tr><th scope="row">pillar</th>.*?</tr>', text)[0]
+    )
+    shown = [
+        (n_views, "pillar", measure)
+        for n_views in (1, 40)
+        for measure in ("accuracy", "clean_accuracy")
+    ]
     assert cells == ["10", *(f"{of[key]:.3f}" for key in shown)]
-    mse = next(float(row["value"]) for row in table(made, "maps") if (row["map"], row["label"]) == ("lem", "box"))
+    mse = next(
+        float(row["value"])
+        for row in table(made, "maps")
+        if (row["map"], row["label"]) == ("lem", "box")
+    )
     section = text[text.index('id="lem"') : text.index('id="lcm"')]
     assert f"<td>{mse:.4f}" in re.search(r'<tr><th scope="row">box</th>.*?</tr>', section)[0]
 
@@ -66,7 +79,9 @@ def test_predictions_that_name_no_model_are_judged_alike(made, tmp_path, capsys)
     assert table(tmp_path, "accuracy") == table(made, "accuracy")
 
 
-def test_a_card_that_changed_while_it_was_judged_keeps_the_change(predictions, models, tmp_path, monkeypatch):
+def test_a_card_that_changed_while_it_was_judged_keeps_the_change(
+    predictions, models, tmp_path, monkeypatch
+):
     for path in models.iterdir():
         shutil.copy(path, tmp_path)
     card = tmp_path / "tiny.json"
@@ -89,24 +104,58 @@ def test_scores_are_noted_on_the_cards_of_the_models_that_made_the_predictions(t
         (tmp_path / f"{name}.onnx").write_bytes(name.encode())
         weights = tmp_path / f"{name}.onnx"
         classes = ("a", "b", "c") if kind == "recogniser" else ()
-        card = ModelCard(name, kind, InputSpec("geometry", 16), sha256_of(weights), weights, classes=classes)
-        write_card(tmp_path / f"{name}.json", msgspec.structs.replace(card, scores={"validation": 1}))
+        card = ModelCard(
+            name, kind, InputSpec("geometry", 16), sha256_of(weights), weights, classes=classes
+        )
+        write_card(
+            tmp_path / f"{name}.json", msgspec.structs.replace(card, scores={"validation": 1})
+        )
     models = {"recogniser": "net", "lem": "map"}
     models = {kind: (name, sha256_of(tmp_path / f"{name}.onnx")) for kind, name in models.items()}
     replace(p, models=models, splits=np.full(30, "test")).save(tmp_path / "p.npz")
     cards = [str(tmp_path / "net.json"), str(tmp_path / "map.json")]
-    main(["evaluate", str(tmp_path / "p.npz"), str(tmp_path / "o"), "--samples", "50", "--cards", *cards])
+    main(
+        [
+            "evaluate",
+            str(tmp_path / "p.npz"),
+            str(tmp_path / "o"),
+            "--samples",
+            "50",
+            "--cards",
+            *cards,
+        ]
+    )
     net, lem = (json.loads(Path(card).read_text())["scores"] for card in cards)
     right = p.logits.argmax(2) == p.labels[:, None]
-    assert net["test (30 objects)"]["single_view"]["instance"] == pytest.approx(right.mean(), abs=1e-4)
+    assert net["test (30 objects)"]["single_view"]["instance"] == pytest.approx(
+        right.mean(), abs=1e-4
+    )
     assert net["validation"] == 1
     assert lem["test (30 objects)"].keys() >= {"mse", "regret"}
-    sized = replace(p, models=models, splits=np.full(30, "test"), of_size=np.zeros((30, 3), np.float32))
+    sized = replace(
+        p, models=models, splits=np.full(30, "test"), of_size=np.zeros((30, 3), np.float32)
+    )
     sized.save(tmp_path / "sized.npz")
-    main(["evaluate", str(tmp_path / "sized.npz"), str(tmp_path / "s"), "--samples", "50", "--cards", cards[0]])
+    main(
+        [
+            "evaluate",
+            str(tmp_path / "sized.npz"),
+            str(tmp_path / "s"),
+            "--samples",
+            "50",
+            "--cards",
+            cards[0],
+        ]
+    )
     scores = json.loads(Path(cards[0]).read_text())["scores"]
-    assert scores["test (30 objects, of known size)"] == scores["test (30 objects)"] == net["test (30 objects)"]
+    assert (
+        scores["test (30 objects, of known size)"]
+        == scores["test (30 objects)"]
+        == net["test (30 objects)"]
+    )
     assert capsys.readouterr().out.count("size not known") == 1
     assert "size of the objects not known" in (tmp_path / "s" / "evaluate.html").read_text()
-    said = refused(capsys, "evaluate", tmp_path / "p.npz", tmp_path / "x", "--cards", tmp_path / "other.json")
+    said = refused(
+        capsys, "evaluate", tmp_path / "p.npz", tmp_path / "x", "--cards", tmp_path / "other.json"
+    )
     assert "not made by model other" in said

@@ -279,7 +279,9 @@ def test_a_policy_without_known_geometry_says_so():
 
 def test_what_is_known_of_a_scene_comes_from_the_views_and_the_verifier():
     meshes = [box_mesh(BODY), box_mesh(BODY, HANDLE)]
-    verifier = Verifier([Surface.from_mesh(m, str(k)) for k, m in enumerate(meshes)], [0, 1], [np.eye(3)] * 2)
+    verifier = Verifier(
+        [Surface.from_mesh(m, str(k)) for k, m in enumerate(meshes)], [0, 1], [np.eye(3)] * 2
+    )
     sensor = replace(SENSORS["none"], radius=meshes[1].metres, distance=AWAY)
     block = trimesh.creation.box((0.2, 1.0, 1.5))
     block.apply_translation((1.8, 0.0, 0.0))  # object radii
@@ -341,7 +343,10 @@ def test_poses_of_a_robot_are_ranked():
         (np.eye(4), r"\(V, 4, 4\), not \(4, 4\)"),
         ("here", r"camera-to-world matrices"),
         (np.zeros((2, 4, 4)), "pose 0 of those to rank: the last row"),
-        (np.stack([np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0])]), "pose 1 of those to rank: .*mirrored"),
+        (
+            np.stack([np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0])]),
+            "pose 1 of those to rank: .*mirrored",
+        ),
         (np.full((1, 4, 4), np.nan), "pose 0 of those to rank"),
         (np.zeros((0, 4, 4)), "camera-to-world matrices"),
     ],

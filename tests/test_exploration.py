@@ -45,12 +45,16 @@ def test_a_view_by_hand_counts_from_where_it_was_taken(chair):
     view = walk.look(chair.pose_towards(np.array([2.0, -1.0, 1.5])))
     assert walk.visited[0] == 5
     np.testing.assert_allclose(view.direction, np.array([2.0, -1.0, 1.5]) / np.sqrt(7.25))
-    assert view.travel == pytest.approx(float(walk.sphere.travel_between(walk.sphere.directions[5], view.direction)))
+    assert view.travel == pytest.approx(
+        float(walk.sphere.travel_between(walk.sphere.directions[5], view.direction))
+    )
     assert len(chair.walks[1].views) == 0  # the other one is where it was
 
 
 @pytest.mark.parametrize("place", [(0.3, 0.2, 4), (-5, 1, -2), (0, 0, 0), (0, 0, 1)])
-def test_a_camera_that_is_dragged_looks_at_the_object_level_and_from_the_usual_distance(chair, place):
+def test_a_camera_that_is_dragged_looks_at_the_object_level_and_from_the_usual_distance(
+    chair, place
+):
     pose = chair.pose_towards(np.array(place, float))
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(pose[:3, 3] + 3 * pose[:3, 2], 0, atol=1e-12)
@@ -113,7 +117,9 @@ def test_the_objects_of_a_store_are_seen_as_they_were_rendered(tmp_path):
     expected = SimulatedCamera(sample_mesh("chair"), 112).observe(SPHERE.poses[3])
     np.testing.assert_allclose(view.observation.depth, expected.depth, atol=1e-3)
     np.testing.assert_array_equal(view.observation.pose, expected.pose)
-    nearby = exploration.walks[0].look(exploration.pose_towards(SPHERE.directions[12] + (0, 0, 0.02)))
+    nearby = exploration.walks[0].look(
+        exploration.pose_towards(SPHERE.directions[12] + (0, 0, 0.02))
+    )
     np.testing.assert_array_equal(nearby.observation.pose, SPHERE.poses[12])  # its own pose counts
     with pytest.raises(UsageError, match="seat has only stored views"):
         exploration.use_sensor("kinect")

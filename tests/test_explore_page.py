@@ -42,7 +42,10 @@ def test_what_is_chosen_is_done_and_shown(page):
     page._look(0, 5)
     until(lambda: "view 5" in page._cards[0].content, "the card shows the view")
     page._second.value = "furthest"
-    until(lambda: exploration.policies == ["gain", "furthest"] and len(page._cards) == 2, "two policies")
+    until(
+        lambda: exploration.policies == ["gain", "furthest"] and len(page._cards) == 2,
+        "two policies",
+    )
     assert [walk.visited for walk in exploration.walks] == [[5], [5]]
     page._object.value = "monitor"
     until(lambda: exploration.shown.name == "monitor", "another object")
@@ -72,9 +75,16 @@ def test_a_name_means_nothing_in_the_page_and_a_sensor_may_be_any():
 
 
 def sockets(page, **headers):
-    """A connection that sends what the page's own scripts send, with headers of the caller's choice."""
+    """A connection that sends what the page's own scripts send, with headers of the caller's
+    choice.
+    """
     address = f"ws://127.0.0.1:{page.server.get_port()}"
-    return connect(address, additional_headers=headers, subprotocols=[f"viser-v{viser.__version__}"], max_size=None)
+    return connect(
+        address,
+        additional_headers=headers,
+        subprotocols=[f"viser-v{viser.__version__}"],
+        max_size=None,
+    )
 
 
 @pytest.mark.parametrize(
@@ -86,7 +96,8 @@ def sockets(page, **headers):
         ("{address}", "http://evil.example", False),
         ("{address}", "http://127.0.0.1:1", False),  # another server of the same machine
         ("{address}", "null", False),
-        ("evil.example:{port}", "http://evil.example:{port}", False),  # a name that points here (DNS rebinding)
+        # a name that points here (DNS rebinding)
+        ("evil.example:{port}", "http://evil.example:{port}", False),
         ("", None, False),
         ("[::bad", None, False),  # no address at all
         ("[zz]:{port}", None, False),
@@ -96,9 +107,14 @@ def sockets(page, **headers):
 def test_only_pages_of_its_own_may_drive_it(page, host, origin, allowed):
     port = page.server.get_port()
     names = {"address": f"127.0.0.1:{port}", "port": port}
-    headers = {"Host": host.format(**names)} | ({} if origin is None else {"Origin": origin.format(**names)})
+    headers = {"Host": host.format(**names)} | (
+        {} if origin is None else {"Origin": origin.format(**names)}
+    )
     upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
-    upgrade |= {"Sec-WebSocket-Key": 22 * "A" + "==", "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}"}
+    upgrade |= {
+        "Sec-WebSocket-Key": 22 * "A" + "==",
+        "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}",
+    }
     for more, answered in (({}, 200), (upgrade, 101)):
         with closing(http.client.HTTPConnection("127.0.0.1", port)) as connection:
             connection.request("GET", "/", headers=headers | more)
@@ -106,20 +122,40 @@ def test_only_pages_of_its_own_may_drive_it(page, host, origin, allowed):
                 assert response.status == (answered if allowed else 403)
 
 
-CAMERA = {"type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "fov": 1.0, "near": 0.1, "far": 100.0}
-CAMERA |= {"image_height": 9, "image_width": 9, "look_at": [0, 0, 0], "up_direction": [0, 0, 1], "position": [3, 0, 0]}
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": [1, 0, 0, 0],
+    "fov": 1.0,
+    "near": 0.1,
+    "far": 100.0,
+}
+CAMERA |= {
+    "image_height": 9,
+    "image_width": 9,
+    "look_at": [0, 0, 0],
+    "up_direction": [0, 0, 1],
+    "position": [3, 0, 0],
+}
 
 
 def test_a_policy_that_is_not_listed_is_not_imported(page, tmp_path, monkeypatch):
-    (tmp_path / "evilmod.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'w')\ndef go(sphere): pass\n")
+    (tmp_path / "evilmod.py").write_text(
+        f"open({str(tmp_path / 'imported')!r}, 'w')\ndef go(sphere): pass\n"
+    )
     monkeypatch.chdir(tmp_path)
     said = []
-    monkeypatch.setattr(viser.ClientHandle, "add_notification", lambda *about, **more: said.append(about[-1]))
+    monkeypatch.setattr(
+        viser.ClientHandle, "add_notification", lambda *about, **more: said.append(about[-1])
+    )
     with sockets(page) as socket:
         socket.send(msgspec.msgpack.encode(CAMERA))  # the first message of a page
         until(lambda: page.server.get_clients(), "viser knows the page")
         for sent in ("evilmod:go", NOTHING, 3, None):
-            message = {"type": "GuiUpdateMessage", "uuid": page._policy._impl.uuid, "updates": {"value": sent}}
+            message = {
+                "type": "GuiUpdateMessage",
+                "uuid": page._policy._impl.uuid,
+                "updates": {"value": sent},
+            }
             socket.send(msgspec.msgpack.encode(message))
             until(lambda: said, "the page says so")
             assert f"{sent}" in said.pop()

@@ -34,7 +34,9 @@ def names(requirements) -> set[str]:
 
 
 def imported(tree: ast.AST, in_extras: bool = False):
-    """The packages that code imports, not for types alone, and whether that stands in ``with extras()``."""
+    """The packages that code imports, not for types alone, and whether that stands in ``with
+    extras()``.
+    """
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.Import):
             yield from ((alias.name.partition(".")[0], in_extras) for alias in node.names)
@@ -43,14 +45,19 @@ def imported(tree: ast.AST, in_extras: bool = False):
         elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             yield from imported(ast.Module(node.orelse, []), in_extras)
         else:
-            here = isinstance(node, ast.With) and any(ast.unparse(i.context_expr) == "extras()" for i in node.items)
+            here = isinstance(node, ast.With) and any(
+                ast.unparse(i.context_expr) == "extras()" for i in node.items
+            )
             yield from imported(node, in_extras or here)
 
 
 @cache
 def brought_by() -> dict[str, set[str]]:
     """The distributions that bring each package which is installed here."""
-    return {package: set(map(canonicalize_name, names)) for package, names in packages_distributions().items()}
+    return {
+        package: set(map(canonicalize_name, names))
+        for package, names in packages_distributions().items()
+    }
 
 
 def faults(code: str) -> list[str]:
@@ -85,7 +92,10 @@ def test_what_is_imported_is_asked_for(path):
         ("def f():\n    with extras():\n        import torch", []),
         ("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torch", []),
         ("import torch", ["torch: imported outside of extras()"]),
-        ("class A:\n    def f(self):\n        from faiss import Index", ["faiss: imported outside of extras()"]),
+        (
+            "class A:\n    def f(self):\n        from faiss import Index",
+            ["faiss: imported outside of extras()"],
+        ),
         ("try:\n    import hypothesis\nexcept ImportError:\n    pass", ["hypothesis: neither"]),
         ("with extras():\n    import pytest", ["pytest: neither"]),
         ("import not_a_package_of_anybody", ["not_a_package_of_anybody: neither"]),
@@ -107,7 +117,9 @@ def test_an_extra_brings_what_its_error_speaks_of(folder):
             if needed.name == "nextview":
                 texts += [text for own in needed.extras for text in of_nextview[own]]
         try:
-            brought = {canonicalize_name(name) for name, _ in asked_for([(text, "") for text in texts])}
+            brought = {
+                canonicalize_name(name) for name, _ in asked_for([(text, "") for text in texts])
+            }
         except PackageNotFoundError:
             continue  # the extra is not installed here
         for package in packages:
@@ -121,7 +133,9 @@ def base(tmp_path_factory) -> Path:
 
 
 def in_base(base: Path, code: str, *arguments: str) -> str:
-    done = subprocess.run([str(base), "-c", code, *arguments], cwd=ROOT, env={}, capture_output=True, text=True)
+    done = subprocess.run(
+        [str(base), "-c", code, *arguments], cwd=ROOT, env={}, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
 
@@ -156,7 +170,8 @@ import os, runpy, sys, tempfile
 
 # Once, before each is run in a process of its own.
 import matplotlib.figure, rich.progress, scipy.optimize, scipy.stats, trimesh, tyro
-import nextview.data.rendering, nextview.data.store, nextview.session.system, nextview.things.recogniser
+import nextview.data.rendering, nextview.data.store
+import nextview.session.system, nextview.things.recogniser
 
 options, scripts = sys.argv[1], sys.argv[2:]
 sys.path.insert(0, os.getcwd())

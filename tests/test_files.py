@@ -18,14 +18,21 @@ class Record(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def everything(folder):
-    return {path.relative_to(folder).as_posix(): path.read_text() for path in folder.rglob("*") if path.is_file()}
+    return {
+        path.relative_to(folder).as_posix(): path.read_text()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 def test_a_file_appears_whole_and_replaces_nothing_unless_told(tmp_path):
     path = tmp_path / "new" / "a.txt"
     with files.new_file(path) as part:
         part.write_text("old")
-    with pytest.raises(ResultsError, match="exists; give another name, or --overwrite"), files.new_file(path):
+    with (
+        pytest.raises(ResultsError, match="exists; give another name, or --overwrite"),
+        files.new_file(path),
+    ):
         pass
     with pytest.raises(RuntimeError), files.new_file(path, overwrite=True) as part:
         part.write_text("half")
@@ -67,21 +74,31 @@ def test_links_and_places_of_another_kind_are_refused(tmp_path):
 def test_a_full_disk_is_one_sentence_and_leaves_the_old_file(tmp_path):
     (tmp_path / "a").write_text("old")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    program = "import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\nfrom pathlib import Path\n"
-    program += "from nextview.files import new_file\nfrom nextview.errors import ResultsError\ntry:\n"
+    program = (
+        "import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\nfrom pathlib import Path\n"
+    )
+    program += (
+        "from nextview.files import new_file\nfrom nextview.errors import ResultsError\ntry:\n"
+    )
     program += " with new_file(Path('a'), True) as part: part.write_bytes(bytes(10**6))\n"
     program += "except ResultsError as error: print(error)"
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True,
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1])),
-    )  # fmt: skip
+    )
     assert "cannot be written (File too large)" in done.stdout
     assert everything(tmp_path) == {"a": "old"}
 
 
 def test_one_writer_at_a_time_and_no_lock_file_stays(tmp_path):
     with files.only_one(tmp_path / "store"):
-        with pytest.raises(DatasetError, match="another run is writing it"), files.only_one(tmp_path / "store"):
+        with (
+            pytest.raises(DatasetError, match="another run is writing it"),
+            files.only_one(tmp_path / "store"),
+        ):
             pass
     with files.only_one(tmp_path / "store"):
         pass
@@ -104,7 +121,8 @@ def test_records_come_back_and_what_is_none_is_one_sentence(tmp_path):
 
 def test_bytes_are_those_of_the_hash(tmp_path):
     (tmp_path / "weights").write_bytes(b"abc")
-    known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # FIPS 180-2, appendix B.1
+    # FIPS 180-2, appendix B.1
+    known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
     assert files.sha256_of(tmp_path / "weights") == known
     assert files.checked_bytes(tmp_path / "weights", known) == b"abc"
     with pytest.raises(ModelError, match="SHA-256 differs"):

@@ -18,7 +18,14 @@ from nextview.data.splits import divide
 from nextview.errors import DatasetError, ModelError, PredictionsError, ResultsError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning import card_fits as calibration
-from nextview.learning.card_fits import error_bound, fit_calibration, fit_risk, fit_temperature, loss, valley_gains
+from nextview.learning.card_fits import (
+    error_bound,
+    fit_calibration,
+    fit_risk,
+    fit_temperature,
+    loss,
+    valley_gains,
+)
 from nextview.learning.fitting_set import blind_walks, card_to_fit
 from nextview.learning.teaching import embeddings
 from nextview.learning.unknown import fit_novelty, fit_unknown
@@ -36,13 +43,21 @@ SMALL = ViewSphere((0.0, 30.0, 60.0), 4)
 
 
 def correlated(n: int, correlation: float, temperature: float, seed: int = 0) -> Predictions:
-    """Two classes at -1 and +1, seen through Gaussian noise that is shared in part by all views of an object."""
+    """Two classes at -1 and +1, seen through Gaussian noise that is shared in part by all views
+    of an object.
+    """
     rng, spread = np.random.default_rng(seed), 1.5
     labels = (rng.random(n) < 0.8).astype(np.int64)  # a mix that the even weights have to undo
     shared, own = rng.normal(size=(n, 1)), rng.normal(size=(n, len(SMALL)))
-    seen = 2.0 * labels[:, None] - 1 + spread * (np.sqrt(correlation) * shared + np.sqrt(1 - correlation) * own)
+    seen = (
+        2.0 * labels[:, None]
+        - 1
+        + spread * (np.sqrt(correlation) * shared + np.sqrt(1 - correlation) * own)
+    )
     logits = np.stack([-((seen - m) ** 2) / (2 * spread**2) for m in (-1, 1)], -1)
-    return train_predictions((temperature * logits).astype(np.float32), labels, SMALL, ("minus", "plus"))
+    return train_predictions(
+        (temperature * logits).astype(np.float32), labels, SMALL, ("minus", "plus")
+    )
 
 
 @pytest.mark.parametrize(("correlation", "temperature"), [(0.0, 1.0), (0.4, 0.5), (0.8, 2.0)])
@@ -51,7 +66,10 @@ def test_the_correlation_and_temperature_of_generated_looks_are_found(correlatio
     found = fit_temperature(data, np.random.default_rng(1), walks=1)
     assert found.temperature == pytest.approx(temperature, rel=0.08)
     assert found.correlation == pytest.approx(correlation, abs=0.06)
-    losses = [loss(data, c, np.random.default_rng(2), walks=1) for c in (found, Calibration(temperature, correlation))]
+    losses = [
+        loss(data, c, np.random.default_rng(2), walks=1)
+        for c in (found, Calibration(temperature, correlation))
+    ]
     assert losses[0] == pytest.approx(losses[1], rel=0.01)
     if correlation:
         assert losses[0] < loss(data, PLAIN_SUM, np.random.default_rng(2), walks=1)
@@ -59,14 +77,20 @@ def test_the_correlation_and_temperature_of_generated_looks_are_found(correlatio
 
 @pytest.mark.parametrize("right", [0.8, 0.5])
 def test_sides_count_as_far_as_looks_are_right_about_them(right):
-    """Both classes look alike; seen as the true one, a view claims to be right about the side 8 times in 10."""
+    """Both classes look alike; seen as the true one, a view claims to be right about the side 8
+    times in 10.
+    """
     rng, n, v, s = np.random.default_rng(0), 2000, len(SMALL), SMALL.azimuths
     labels, zero = rng.integers(0, 2, n), rng.integers(0, s, n)
     claimed = rng.integers(0, s, (n, v, 2))  # seen as the other class: anything
     true = (SMALL.azimuth_index - zero[:, None]) % s
     wrong = (true + rng.integers(1, s, (n, v))) % s
-    claimed[np.arange(n)[:, None], np.arange(v), labels[:, None]] = np.where(rng.random((n, v)) < right, true, wrong)
-    azimuth_bins = np.log(np.where(np.arange(s) == claimed[..., None], 0.8, 0.2 / (s - 1))).astype(np.float32)
+    claimed[np.arange(n)[:, None], np.arange(v), labels[:, None]] = np.where(
+        rng.random((n, v)) < right, true, wrong
+    )
+    azimuth_bins = np.log(np.where(np.arange(s) == claimed[..., None], 0.8, 0.2 / (s - 1))).astype(
+        np.float32
+    )
     logits = rng.normal(size=(n, v, 2)).astype(np.float32) / 100
     data = train_predictions(logits, labels, SMALL, ("a", "b"), azimuth_bins)
     found = fit_temperature(data, np.random.default_rng(1), walks=1)
@@ -112,7 +136,8 @@ def test_promises_are_kept_as_often_as_promised():
         some = np.random.default_rng([5, seed]).choice(len(whole), 300, replace=False)
         part = whole.of_objects(some)
         bounds = fit_risk(part, calibration, np.random.default_rng(seed), delta, n_views, walks=1)
-        if min(bounds.bounds[n_views - 1]) <= risk:  # else it promises nothing, and nothing is broken
+        # else it promises nothing, and nothing is broken
+        if min(bounds.bounds[n_views - 1]) <= risk:
             promises += 1
             broken += error_at(bounds.threshold(risk, n_views)) > risk
     assert promises > 30
@@ -126,14 +151,24 @@ def test_a_shape_that_was_copied_counts_once():
     p = replace(some_predictions(60), splits=np.array(["train"] * 60))
     # The first object nine times more, under other names and a little otherwise recognised.
     rows = np.array([*range(60), *[0] * 9])
-    arrays = {name: getattr(p, name)[rows] for name in ("labels", "splits", "conflicting", "depth_entropy")}
+    arrays = {
+        name: getattr(p, name)[rows]
+        for name in ("labels", "splits", "conflicting", "depth_entropy")
+    }
     names, maps = (*p.names, *(f"copy{i}" for i in range(9))), {"lem": p.maps["lem"][rows]}
-    many = replace(p, **arrays, logits=p.logits[rows] + (np.arange(69) >= 60)[:, None, None], maps=maps, names=names)
+    many = replace(
+        p,
+        **arrays,
+        logits=p.logits[rows] + (np.arange(69) >= 60)[:, None, None],
+        maps=maps,
+        names=names,
+    )
     once = many.deduplicate()
     assert once.names == p.names
     np.testing.assert_array_equal(once.logits, p.logits)
     relabelled = replace(many, labels=np.r_[many.labels[:-1], (many.labels[-1] + 1) % 3])
-    assert relabelled.deduplicate().names == (*p.names, "copy8")  # which of two labels is right is not for us
+    # which of two labels is right is not for us
+    assert relabelled.deduplicate().names == (*p.names, "copy8")
     np.testing.assert_array_equal(fitting_set(many, 1.0, 0).logits, p.logits)
     drawn = [fitting_set(many, 0.1, seed) for seed in range(40)]
     assert any(p.logits[0] in data.logits for data in drawn)
@@ -153,8 +188,12 @@ def test_it_is_fitted_to_the_objects_that_validate():
 # Tables
 
 
-def telling(sphere: ViewSphere, rings_of_class: list[list[int]], n: int = 40, seed: int = 0) -> Predictions:
-    """Every view says little of the class, but those on some rings, which depend on the class, say it loudly."""
+def telling(
+    sphere: ViewSphere, rings_of_class: list[list[int]], n: int = 40, seed: int = 0
+) -> Predictions:
+    """Every view says little of the class, but those on some rings, which depend on the class,
+    say it loudly.
+    """
     rng = np.random.default_rng(seed)
     c = len(rings_of_class)
     labels = np.arange(n) % c
@@ -171,10 +210,14 @@ def test_what_tells_most_is_found(scope):
     data = telling(SMALL, [[2], [2]])
     assert fit_ring(data, scope, 4, PLAIN_SUM)[0] == 2
     assert (SMALL.ring[fit_sequence(data, scope, 3, PLAIN_SUM)] == 2).all()
-    by_class = fit_class_table(telling(SMALL, [[0], [2]]), 4, 0.0, PLAIN_SUM, np.random.default_rng(0))
+    by_class = fit_class_table(
+        telling(SMALL, [[0], [2]]), 4, 0.0, PLAIN_SUM, np.random.default_rng(0)
+    )
     assert (SMALL.ring[by_class[0].argmax(1)] == 0).all()
     assert (SMALL.ring[by_class[1].argmax(1)] == 2).all()
-    shared = fit_class_table(telling(SMALL, [[0], [2]]), 4, 1e9, PLAIN_SUM, np.random.default_rng(0))
+    shared = fit_class_table(
+        telling(SMALL, [[0], [2]]), 4, 1e9, PLAIN_SUM, np.random.default_rng(0)
+    )
     np.testing.assert_allclose(shared[0], shared[1], atol=1e-6)
 
 
@@ -182,7 +225,9 @@ def test_what_tells_most_is_found(scope):
 def test_each_move_of_a_sequence_is_the_best_there_is(scope):
     rng, calibration = np.random.default_rng(0), Calibration(0.8, 0.5)
     labels = np.array([0, 0, 0, 1, 2])
-    data = train_predictions(rng.normal(size=(5, len(SMALL), 3)).astype(np.float32), labels, SMALL, ("a", "b", "c"))
+    data = train_predictions(
+        rng.normal(size=(5, len(SMALL), 3)).astype(np.float32), labels, SMALL, ("a", "b", "c")
+    )
     travel_weight = 0.05
     moves = fit_sequence(data, scope, 2, calibration, travel_weight)
 
@@ -195,7 +240,9 @@ def test_each_move_of_a_sequence_is_the_best_there_is(scope):
         for i, label in enumerate(labels):
             for steps in range(4):
                 total = data.logits[i, [turned(v, steps) for v in path]].astype(float).sum(0)
-                by_class[label].append(log_softmax(total / calibration.temperature_after(len(path)))[label])
+                by_class[label].append(
+                    log_softmax(total / calibration.temperature_after(len(path)))[label]
+                )
         return np.mean([np.mean(values) for values in by_class.values()])
 
     for ring in range(3):
@@ -203,7 +250,9 @@ def test_each_move_of_a_sequence_is_the_best_there_is(scope):
         for move in moves[ring]:
             reachable = range(12) if scope == "global" else SMALL.windows[path[-1]].ravel()
             left = [v for v in reachable if v not in path]
-            values = {v: value([*path, v]) - travel_weight * SMALL.travel[path[-1], v] for v in left}
+            values = {
+                v: value([*path, v]) - travel_weight * SMALL.travel[path[-1], v] for v in left
+            }
             path.append(int(cells_from(SMALL)[path[-1], move]))
             assert values[path[-1]] == pytest.approx(max(values.values()), abs=1e-9)
 
@@ -221,7 +270,9 @@ def training_predictions(tmp_path):
     change_card(card, held_out=list(p.names[:45]))
     models = {**p.models, "recogniser": ("tiny", read_card(card).sha256)}
     path = tmp_path / "training.npz"
-    replace(p, logits=logits.astype(np.float32), splits=np.array(["train"] * 90), models=models).save(path)
+    replace(
+        p, logits=logits.astype(np.float32), splits=np.array(["train"] * 90), models=models
+    ).save(path)
     return card, path
 
 
@@ -236,7 +287,8 @@ def test_a_calibration_goes_into_the_card_and_is_used(training_predictions, monk
     assert NetworkRecogniser(card).calibration == fitted.calibration
     assert fitted.after < fitted.before
     assert "45 objects" in after["fitted_to"]["calibration"]
-    assert [p.name for p in card.parent.iterdir() if p.name.startswith(".")] == []  # no lock, no part is left
+    # no lock, no part is left
+    assert [p.name for p in card.parent.iterdir() if p.name.startswith(".")] == []
 
 
 def test_logits_of_ones_own_are_fitted_to_where_they_name_no_model(training_predictions):
@@ -267,7 +319,9 @@ def test_a_calibration_by_a_bad_sensor_trusts_views_less(training_predictions, t
         fit_calibration(path, card, sensed=(tmp_path / "few.npz",))
 
 
-def test_a_card_that_was_changed_meanwhile_or_does_not_fit_is_left_alone(training_predictions, monkeypatch):
+def test_a_card_that_was_changed_meanwhile_or_does_not_fit_is_left_alone(
+    training_predictions, monkeypatch
+):
     card, path = training_predictions
     whole, p = json.loads(card.read_text()), Predictions.load(path)
 
@@ -294,9 +348,15 @@ def test_learned_policies_can_be_run_from_their_cards(training_predictions, tmp_
     _, path = training_predictions
     made = fit_policies(path, tmp_path / "learned", length=3)
     assert sorted(c.stem for c in made.cards) == [
-        "class-table", "class-table-local", "class-table-near", "fixed-ring", "fixed-ring-local",
-        "fixed-sequence", "fixed-sequence-local", "fixed-sequence-near",
-    ]  # fmt: skip
+        "class-table",
+        "class-table-local",
+        "class-table-near",
+        "fixed-ring",
+        "fixed-ring-local",
+        "fixed-sequence",
+        "fixed-sequence-local",
+        "fixed-sequence-near",
+    ]
     data = fitting_set(Predictions.load(path), 0.1, 0)
     fitted = fit_temperature(data, np.random.default_rng([0, 0]), walks=1 + 8000 // 9)
     values = fit_class_table(data, 5, 20.0, fitted, np.random.default_rng(0))
@@ -322,8 +382,10 @@ def test_learned_policies_can_be_run_from_their_cards(training_predictions, tmp_
 def test_valley_classes_are_those_that_gain_by_the_valley():
     logits = np.zeros((2, 40, 2))
     high = SPHERE.ring == 4
-    logits[0, ~high, 0], logits[1, high, 1] = 3, 3  # class 0 is clear from below, class 1 from above
-    maps = np.broadcast_to((SPHERE.ring / 4)[SPHERE.windows], (2, 40, 5, 3))  # the map rises with the ring
+    # class 0 is clear from below, class 1 from above
+    logits[0, ~high, 0], logits[1, high, 1] = 3, 3
+    # the map rises with the ring
+    maps = np.broadcast_to((SPHERE.ring / 4)[SPHERE.windows], (2, 40, 5, 3))
     gains = valley_gains(SPHERE, logits, maps, np.array([0, 1]))
     assert gains[0] > 0.1
     assert gains[1] < -0.1
@@ -384,7 +446,9 @@ def test_a_recogniser_learns_to_notice_unknown_objects(furniture, models, tmp_pa
     assert "calibrated on 6 others" in about
     views = [SimulatedCamera(sample_mesh("chair")).observe(pose) for pose in SPHERE.poses[:3]]
     evidence = taught(views)
-    np.testing.assert_allclose(values_of(evidence.novelty), taught.novelty.scores(embeddings(views), True), atol=1e-5)
+    np.testing.assert_allclose(
+        values_of(evidence.novelty), taught.novelty.scores(embeddings(views), True), atol=1e-5
+    )
     sensed = taught([replace(view, exact=False) for view in views])
     np.testing.assert_array_equal(sensed.logits, evidence.logits)
     assert set(values_of(sensed.novelty)).isdisjoint(values_of(evidence.novelty))

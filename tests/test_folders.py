@@ -25,13 +25,23 @@ def meshes(root: Path, *places: str) -> Path:
             [("a", "cup", "train"), ("b", "cup", "test"), ("c", "cup", "val")],
         ),
         (["train/cup/a.off", "val/cup/b.off"], [("a", "cup", "train"), ("b", "cup", "val")]),
-        (["bed/77/models/model.off", "bed/78/models/model.off"], [("77", "bed", ""), ("78", "bed", "")]),
-        (["bed/train/77/m.off", "bed/test/78/m.off"], [("77", "bed", "train"), ("78", "bed", "test")]),
+        (
+            ["bed/77/models/model.off", "bed/78/models/model.off"],
+            [("77", "bed", ""), ("78", "bed", "")],
+        ),
+        (
+            ["bed/train/77/m.off", "bed/test/78/m.off"],
+            [("77", "bed", "train"), ("78", "bed", "test")],
+        ),
         (["bed/old/a.off", "bed/b.off"], [("a", "bed", ""), ("b", "bed", "")]),
         (["train/a.off", "plane/b.off"], [("b", "plane", ""), ("a", "train", "")]),
         (
             ["cup/train/1.off", "cup/test/1.off", "jar/train/1.off"],
-            [("cup_train_1", "cup", "train"), ("cup_test_1", "cup", "test"), ("jar_train_1", "jar", "train")],
+            [
+                ("cup_train_1", "cup", "train"),
+                ("cup_test_1", "cup", "test"),
+                ("jar_train_1", "jar", "train"),
+            ],
         ),
     ],
 )
@@ -47,12 +57,24 @@ def test_links_are_followed_but_not_in_circles(tmp_path):
     (root / "cup/again").symlink_to(root)
     (root / "pot").symlink_to(tmp_path / "elsewhere")
     listing = scan_dataset(root)
-    assert [(e.name, e.label) for e in listing.entries] == [("a", "cup"), ("d", "cup"), ("b", "jar"), ("c", "jar")]
+    assert [(e.name, e.label) for e in listing.entries] == [
+        ("a", "cup"),
+        ("d", "cup"),
+        ("b", "jar"),
+        ("c", "jar"),
+    ]
     assert {f"{path}" for path, _ in listing.left_out} == {"cup/again", "pot"}
 
 
 def test_what_is_understood_and_what_is_left_out_is_said(tmp_path):
-    root = meshes(tmp_path, "loose.off", ".trash/bed/a.off", "bed/train/a.off", "bed/val/b.off", "bed/9/m/c.off")
+    root = meshes(
+        tmp_path,
+        "loose.off",
+        ".trash/bed/a.off",
+        "bed/train/a.off",
+        "bed/val/b.off",
+        "bed/9/m/c.off",
+    )
     (root / "bed/gone.off").symlink_to(root / "nowhere.off")
     assert scan_dataset(root).summary() == (
         "3 objects: 1 in CLASS/train/MESH, 1 in CLASS/val/MESH, 1 in CLASS/.../MESH; left out: "
@@ -60,7 +82,9 @@ def test_what_is_understood_and_what_is_left_out_is_said(tmp_path):
     )
 
 
-CASES = {  # what lies in a folder; what is taken, (name, label, split); and what is left out, by a part of the reason
+# what lies in a folder; what is taken, (name, label, split); and what is left out, by a part of the
+# reason
+CASES = {
     "formats": (
         ["tin.stl", "tin.ply", "tin.OBJ", "box.stl", "cup/a.stl", "cup/a.off", "textures/wood.png"],
         [("a", "cup", ""), ("box", "box", ""), ("tin", "tin", "")],
@@ -72,7 +96,10 @@ CASES = {  # what lies in a folder; what is taken, (name, label, split); and wha
     ),
     "ycb": (
         [
-            *("011_banana/google_16k/" + name for name in ("nontextured.stl", "textured.obj", "nontextured.ply")),
+            *(
+                "011_banana/google_16k/" + name
+                for name in ("nontextured.stl", "textured.obj", "nontextured.ply")
+            ),
             "011_banana/google_64k/nontextured.ply",
             "011_banana/clouds/merged_cloud.ply",
             "065-a_cups/tsdf/textured.obj",
@@ -126,7 +153,17 @@ CASES = {  # what lies in a folder; what is taken, (name, label, split); and wha
         {},
     ),
     "what is no mesh": (
-        ["a.ply", "b.step", "c.3MF", "d/e.gltf", "d/f.usdz", "notes.txt", "__MACOSX/._a.ply", "._a.ply", "x/y/z.txt"],
+        [
+            "a.ply",
+            "b.step",
+            "c.3MF",
+            "d/e.gltf",
+            "d/f.usdz",
+            "notes.txt",
+            "__MACOSX/._a.ply",
+            "._a.ply",
+            "x/y/z.txt",
+        ],
         [("a", "a", "")],
         {
             "b.step, c.3MF, d/e.gltf and 1 more": "of a format that is not read; export it as .off",
@@ -151,7 +188,9 @@ def test_all_that_is_in_a_folder_is_taken_or_left_out_with_a_reason(tmp_path, ca
     assert [(entry.name, entry.label, entry.split) for entry in listing.entries] == in_order
     phrases = left_out_phrases(listing.left_out)
     for path, reason in left_out.items():
-        assert any(path in phrase.partition(": ")[0] and reason in phrase for phrase in phrases), phrases
+        assert any(path in phrase.partition(": ")[0] and reason in phrase for phrase in phrases), (
+            phrases
+        )
     assert len(phrases) >= len(left_out)
     assert bool(phrases) == bool(left_out)
     taken = {entry.path for entry in listing.entries}
@@ -163,13 +202,20 @@ def test_all_that_is_in_a_folder_is_taken_or_left_out_with_a_reason(tmp_path, ca
 
 def test_links_that_lead_nowhere_and_folders_of_results_are_left_out(tmp_path):
     root = meshes(
-        tmp_path / "scans", "a.ply", "old/memory.json", "views.zarr/zarr.json", "views.zarr/c/0.off", "new/b.ply"
+        tmp_path / "scans",
+        "a.ply",
+        "old/memory.json",
+        "views.zarr/zarr.json",
+        "views.zarr/c/0.off",
+        "new/b.ply",
     )
     (root / "empty").mkdir()
     (root / "gone").symlink_to("nowhere")
     (root / "gone.ply").symlink_to("nowhere.ply")
     (root / "circle.ply").symlink_to("circle.ply")
-    listing = read_folder(root, loose=True, skip={root / "new": "a result", root / "not there": "nothing"})
+    listing = read_folder(
+        root, loose=True, skip={root / "new": "a result", root / "not there": "nothing"}
+    )
     assert [entry.name for entry in listing.entries] == ["a"]
     assert dict(listing.left_out) == {
         Path("circle.ply"): "a link that leads nowhere",
@@ -184,24 +230,40 @@ def test_links_that_lead_nowhere_and_folders_of_results_are_left_out(tmp_path):
 
 def test_a_folder_called_as_a_split_is_a_class_only_with_a_word(tmp_path):
     summary = scan_dataset(meshes(tmp_path, "Train/a.ply", "plane/b.ply")).summary()
-    assert summary == "2 objects: 2 in CLASS/MESH; the folder Train is taken for a class, not for a split"
+    assert (
+        summary
+        == "2 objects: 2 in CLASS/MESH; the folder Train is taken for a class, not for a split"
+    )
 
 
 def test_a_folder_around_the_classes_is_told(tmp_path):
     root = meshes(tmp_path, "data/cup/a.ply", "data/cup/b.ply", "data/jar/train/c.ply")
     (note,) = scan_dataset(root).notes
-    assert note == f"all are of the class data; if the folders in it are the classes, give {root / 'data'}"
+    assert (
+        note
+        == f"all are of the class data; if the folders in it are the classes, give {root / 'data'}"
+    )
     assert not scan_dataset(root / "data").notes
-    assert not scan_dataset(meshes(tmp_path / "one", "bed/77/models/m.ply", "bed/78/models/m.ply")).notes
+    assert not scan_dataset(
+        meshes(tmp_path / "one", "bed/77/models/m.ply", "bed/78/models/m.ply")
+    ).notes
 
 
 def test_a_dataset_without_meshes_is_refused_and_says_what_it_holds(tmp_path, caplog):
     with pytest.raises(DatasetError, match="no such folder"):
         list_dataset(tmp_path / "nowhere")
-    with pytest.raises(DatasetError, match=r"no meshes in CLASS/NAME.*; left out: cup/a\.dae: of a format"):
+    with pytest.raises(
+        DatasetError, match=r"no meshes in CLASS/NAME.*; left out: cup/a\.dae: of a format"
+    ):
         list_dataset(meshes(tmp_path / "empty", "cup/a.dae"))
-    with pytest.raises(DatasetError, match=r"a/b_c\.off and .*a_b/c\.off would both be called a_b_c; rename one"):
-        list_dataset(meshes(tmp_path / "twice", "a/b_c.off", "a_b/c.off", "d/c.off", "d/e/c.off", "f/b_c.off"))
+    with pytest.raises(
+        DatasetError, match=r"a/b_c\.off and .*a_b/c\.off would both be called a_b_c; rename one"
+    ):
+        list_dataset(
+            meshes(
+                tmp_path / "twice", "a/b_c.off", "a_b/c.off", "d/c.off", "d/e/c.off", "f/b_c.off"
+            )
+        )
     list_dataset(meshes(tmp_path / "loose", "loose.off", "cup/a.off"))
     assert "loose: left out: loose.off: not in a class folder" in caplog.text
     flat = list_dataset(meshes(tmp_path / "flat", "a.off", "b.off"))  # each is a class of its own

@@ -38,7 +38,9 @@ def plane_depth(pose: np.ndarray, point: np.ndarray, normal: np.ndarray) -> np.n
 
 
 def expected_channels(depth, pose, normal):
-    """Closed forms where the surface and its unit normals, towards the camera, are known in the world frame."""
+    """Closed forms where the surface and its unit normals, towards the camera, are known in the
+    world frame.
+    """
     directions = RAYS @ pose[:3, :3].T
     positions = pose[:3, 3] + depth[..., None] * directions
     towards = -directions / np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -61,11 +63,19 @@ def test_the_ball():
             inner = DISTANCE**2 - (RAYS**2).sum(-1) * (DISTANCE**2 - 1) > 0.2
             # Positions are exact; a normal is taken over one pixel's width, on a curved surface.
             limit = STEP if name in ("height", "nearness") else 0.03
-            np.testing.assert_allclose(found[name][inner], expected[inner], atol=limit, err_msg=name)
+            np.testing.assert_allclose(
+                found[name][inner], expected[inner], atol=limit, err_msg=name
+            )
 
 
 @settings(deadline=None, max_examples=40)
-@given(st.floats(-1.2, 1.2), st.floats(-np.pi, np.pi), st.floats(-1, 1), st.floats(-1, 1), st.floats(-0.5, 0.5))
+@given(
+    st.floats(-1.2, 1.2),
+    st.floats(-np.pi, np.pi),
+    st.floats(-1, 1),
+    st.floats(-1, 1),
+    st.floats(-0.5, 0.5),
+)
 def test_a_plane_at_any_slant(elevation, azimuth, tilt, turn, offset):
     pose = look_at_origin(elevation, azimuth)
     normal = np.array([np.sin(tilt), np.sin(turn) * np.cos(tilt), -np.cos(turn) * np.cos(tilt)])
@@ -77,13 +87,18 @@ def test_a_plane_at_any_slant(elevation, azimuth, tilt, turn, offset):
     for name in CHANNELS:
         inside = seen & (np.abs(expected[name]) <= 1)
         if name in ("facing", "up"):
-            inside &= expected["facing"] > 0.3  # perspective bends depth between neighbours on steep planes
+            # perspective bends depth between neighbours on steep planes
+            inside &= expected["facing"] > 0.3
         limit = 0.5 * STEP + (1e-4 if name in ("height", "nearness") else 0.02)
-        np.testing.assert_allclose(found[name][inside], expected[name][inside], atol=limit, err_msg=name)
+        np.testing.assert_allclose(
+            found[name][inside], expected[name][inside], atol=limit, err_msg=name
+        )
 
 
 def as_the_bundled_models_were_trained(depth, poses, focal, centre):
-    """The formula of the bundled models' training, for square pixels: what they are given must not change by a bit."""
+    """The formula of the bundled models' training, for square pixels: what they are given must
+    not change by a bit.
+    """
     rotation, origin = poses[:, :3, :3].astype(np.float32), poses[:, :3, 3].astype(np.float32)
 
     def slope(axis):
@@ -104,7 +119,9 @@ def as_the_bundled_models_were_trained(depth, poses, focal, centre):
     height = a * (x * depth) + b * (y * depth) + c * depth + origin[:, 2, None, None]
     nearness = np.linalg.norm(origin, axis=1)[:, None, None] - depth
     channels = np.stack([2 * facing - 1, up, height, nearness], 1)
-    return np.where(depth[:, None] > 0, 1 + 127 * (np.clip(channels, -1, 1) + 1) + 0.5, 0).astype(np.uint8)
+    return np.where(depth[:, None] > 0, 1 + 127 * (np.clip(channels, -1, 1) + 1) + 0.5, 0).astype(
+        np.uint8
+    )
 
 
 @pytest.mark.parametrize("name", ["chair", "monitor"])
@@ -115,4 +132,6 @@ def test_a_render_is_coded_as_the_bundled_models_know_it(name):
     depth[:, [0, -1]] = depth[:, :, [0, -1]] = 0  # the formula above wraps around the border
     found = geometry_input(depth, poses, INTRINSICS, SIZE)
     assert (found > 0).mean() > 0.05
-    np.testing.assert_array_equal(found, as_the_bundled_models_were_trained(depth, poses, INTRINSICS[0, 0], SIZE / 2))
+    np.testing.assert_array_equal(
+        found, as_the_bundled_models_were_trained(depth, poses, INTRINSICS[0, 0], SIZE / 2)
+    )

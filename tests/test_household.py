@@ -1,4 +1,6 @@
-"""Household things of simple shapes, taught and shown through the wrist sensor: what is known, and what is not."""
+"""Household things of simple shapes, taught and shown through the wrist sensor: what is known,
+and what is not.
+"""
 
 import numpy as np
 import pytest
@@ -83,7 +85,9 @@ def test_a_taught_soap_is_known_wherever_it_lies(system, tmp_path):
     assert answers == ["soap"] * 6
 
 
-@pytest.mark.xfail(strict=True, reason="a taught thing is known by its radius and features, not by its proportions")
+@pytest.mark.xfail(
+    strict=True, reason="a taught thing is known by its radius and features, not by its proportions"
+)
 def test_a_plate_of_other_proportions_is_not_the_taught_one(system, tmp_path):
     results = shown(system, dish(0.21, 0.19), tmp_path, 7)
     assert not any(result.answer == "plate" and result.confident for result in results)

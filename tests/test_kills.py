@@ -1,7 +1,8 @@
-"""Runs that are killed before any step on the disk: what is read then is the old output or the new one, never neither.
+"""Runs that are killed before any step on the disk: what is read then is the old output or the new
+one, never neither.
 
-An audit hook ends the process at the n-th time that something is about to be opened for writing, made, renamed or
-removed in the folder: as ``kill -9`` does, without clearing up.
+An audit hook ends the process at the n-th time that something is about to be opened for writing,
+made, renamed or removed in the folder: as ``kill -9`` does, without clearing up.
 """
 
 import json
@@ -20,7 +21,9 @@ CHANGES = {"os.rename", "os.remove", "os.rmdir", "os.mkdir", "os.link", "os.syml
 def changes(event, arguments):
     if event == "open":
         mode, flags = arguments[1:]
-        return bool(flags & (os.O_WRONLY | os.O_RDWR)) if isinstance(flags, int) else "r" not in str(mode)
+        if isinstance(flags, int):
+            return bool(flags & (os.O_WRONLY | os.O_RDWR))
+        return "r" not in str(mode)
     return event in CHANGES
 
 
@@ -39,7 +42,8 @@ def steps(work, place, ready, after, kinds=CHANGES | {"open"}):
 
             def hook(event, arguments):
                 nonlocal count
-                inside = changes(event, arguments) and os.fsdecode(arguments[0]).startswith(str(place))
+                changed = changes(event, arguments)
+                inside = changed and os.fsdecode(arguments[0]).startswith(str(place))
                 if event in kinds and inside:
                     count += 1
                     if count > len(said):
@@ -157,7 +161,8 @@ sphere = ViewSphere((30.0,), 3)
 
 
 def contents(folder):
-    return {file.relative_to(folder): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+    files = [file for file in folder.rglob("*") if file.is_file()]
+    return {file.relative_to(folder): file.read_bytes() for file in files}
 
 
 def ready():
@@ -196,7 +201,9 @@ def died(program, *arguments):
 
 
 COMMANDS = [("add", "now"), ("remove", "now"), ("overwrite", "now"), ("add", "earlier")]
-"""Commands, and the layout of the memory that they find: the file of earlier versions had no hash in its name."""
+"""Commands, and the layout of the memory that they find: the file of earlier versions had no
+hash in its name.
+"""
 
 
 @pytest.mark.parametrize(("case", "layout"), COMMANDS)
@@ -210,11 +217,16 @@ def test_learn_killed_before_any_step_leaves_the_old_memory_or_the_new_one(tmp_p
     assert found == sorted(found, reverse=True)  # from some step on it is the new one
     for *_, (_, left) in said:
         assert len(left) == 4
-        assert [name for name in left if not name.startswith("memory-")] == ["learned.png", "memory.json", "mine"]
+        assert [name for name in left if not name.startswith("memory-")] == [
+            "learned.png",
+            "memory.json",
+            "mine",
+        ]
 
 
 def test_capture_killed_between_any_two_steps_never_mixes_the_views_of_two_objects(tmp_path):
     said = died(CAPTURE, tmp_path)
     found = [which for *_, which in said]
     assert found == sorted(found, key=["old", "none", "new"].index)
-    assert found.count("none") == 9  # three depth images, three masks, box.json, scene_gt.json and scene_camera.json
+    # three depth images, three masks, box.json, scene_gt.json and scene_camera.json
+    assert found.count("none") == 9

@@ -1,4 +1,6 @@
-"""Teaching things: what a folder holds, what is remembered, added and forgotten, and what recognises them then."""
+"""Teaching things: what a folder holds, what is remembered, added and forgotten, and what
+recognises them then.
+"""
 
 import shutil
 from dataclasses import replace
@@ -50,7 +52,9 @@ def test_taught_things_are_recognised_through_a_sensor(taught, scans):
 
 
 def test_the_explorer_shows_the_leading_things_as_they_were_taught(taught, scans):
-    exploration = Exploration(shown_objects(scans / "chair.off"), models=taught, start=11, threads=1)
+    exploration = Exploration(
+        shown_objects(scans / "chair.off"), models=taught, start=11, threads=1
+    )
     walk = exploration.walks[0]
     assert walk.rivals is None
     walk.step()
@@ -67,11 +71,16 @@ def test_the_explorer_shows_the_leading_things_as_they_were_taught(taught, scans
     assert f"as view {walk.next_view} would show them" in shown
     assert f"differ by {1 - rivals.alike[walk.next_view]:.2f}" in shown
     assert f"The two likeliest, as view {view} would show them" in preview_card(seen, walk)
-    bundled = nextview.load(models="ycb", threads=1).models.recogniser  # its meshes are not here, but their surfaces
+    # its meshes are not here, but their surfaces
+    bundled = nextview.load(models="ycb", threads=1).models.recogniser
     thing = bundled.memory.thing[100]
     surface = bundled.memory.surfaces.surface(thing, bundled.card.memory.things[thing].name)
-    standing = rotated(make_mesh(surface.vertices, surface.faces), bundled.memory.rotations[100].astype(float))
-    drawn = SimulatedCamera(standing, 64).observe(look_at_origin(np.radians(RINGS[1]), 2 * np.pi * 3 / AZIMUTHS))
+    standing = rotated(
+        make_mesh(surface.vertices, surface.faces), bundled.memory.rotations[100].astype(float)
+    )
+    drawn = SimulatedCamera(standing, 64).observe(
+        look_at_origin(np.radians(RINGS[1]), 2 * np.pi * 3 / AZIMUTHS)
+    )
     np.testing.assert_array_equal(remembered_picture(bundled, 100, 1, 3), drawn.picture)
 
 
@@ -85,7 +94,9 @@ def test_predictions_of_taught_things_replay_with_their_policy(tmp_path, taught,
         assert (ends.answer == specs.labels).mean() > 0.9
 
 
-def test_adding_leaves_what_is_known_as_it_was_and_removing_takes_it_away(tmp_path, taught, scans, capsys):
+def test_adding_leaves_what_is_known_as_it_was_and_removing_takes_it_away(
+    tmp_path, taught, scans, capsys
+):
     more, models = tmp_path / "more", tmp_path / "models"
     more.mkdir()
     shutil.copytree(taught, models)
@@ -121,9 +132,17 @@ def test_a_run_that_was_stopped_goes_on_and_gives_the_same(tmp_path, taught, sca
         learn(scans, tmp_path / "mine", upright=True, workers=0, track=stopping)
     assert not (tmp_path / "mine").exists()
     counts = []
-    learn(scans, tmp_path / "mine", upright=True, workers=0, track=lambda done, total, what: counts.extend(done))
+    learn(
+        scans,
+        tmp_path / "mine",
+        upright=True,
+        workers=0,
+        track=lambda done, total, what: counts.extend(done),
+    )
     assert counts[0] == 2  # what was finished is not looked at again
-    assert read_card(tmp_path / "mine/memory.json").sha256 == read_card(taught / "memory.json").sha256
+    assert (
+        read_card(tmp_path / "mine/memory.json").sha256 == read_card(taught / "memory.json").sha256
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]
 
 
@@ -141,7 +160,10 @@ def test_what_is_wrong_with_a_folder_is_one_sentence_and_nothing_is_lost(tmp_pat
     small = load_mesh(scans / "chair.off")
     write_off(mixed / "small.off", replace(small, vertices=small.vertices / 1000))
     how = {"unit": "cm", "upright": True, "workers": 0}
-    with pytest.raises(DatasetError, match=r"small\.off: is .* times smaller than most others; is it in another unit"):
+    with pytest.raises(
+        DatasetError,
+        match=r"small\.off: is .* times smaller than most others; is it in another unit",
+    ):
         learn(mixed, tmp_path / "out", **how)
     found = learn(mixed, tmp_path / "out", any_size=True, **how)
     assert found.things == 3
@@ -156,7 +178,10 @@ def test_classes_of_several_things_and_one_alone(tmp_path, scans):
         for name in THINGS[:2]:
             (folder / name).mkdir(parents=True, exist_ok=True)
             mesh = sample_mesh(name)
-            write_off(folder / name / f"{name}_{k}.off", make_mesh(mesh.vertices * (1, stretch, 1), mesh.faces))
+            write_off(
+                folder / name / f"{name}_{k}.off",
+                make_mesh(mesh.vertices * (1, stretch, 1), mesh.faces),
+            )
     found = learn(folder, tmp_path / "two", upright=True, workers=0)
     assert (found.things, found.classes) == (4, 2)
     assert found.accuracy[2] > 0.9  # by the other things of the class
@@ -174,7 +199,9 @@ def test_belief_in_classes_is_the_sum_over_their_things_and_azimuths():
     by_hand = logits.mean(0) + [logsumexp(pointing[k]) for k in ([0, 1], [2], [3, 4, 5])]
     np.testing.assert_allclose(np.log(belief), by_hand - logsumexp(by_hand), atol=1e-9)
     marginal = joint.sum(1)
-    np.testing.assert_allclose([marginal[:2].sum(), marginal[2], marginal[3:].sum()], belief, atol=1e-12)
+    np.testing.assert_allclose(
+        [marginal[:2].sum(), marginal[2], marginal[3:].sum()], belief, atol=1e-12
+    )
     with pytest.raises(NextviewError, match="not of every class"):
         Calibration(hypotheses=(0, 2))
 
@@ -197,14 +224,17 @@ def test_the_nearest_of_many_views_are_those_of_an_exact_search():
     found = NearestViews(np.stack([views, views]))
     found, exact = found.similarities(seen, np.full((20, 2), 0.5, np.float32)), seen @ views.T
     best = np.argsort(-exact, 1)[:, :20]
-    close = np.isclose(np.take_along_axis(found, best, 1), np.take_along_axis(exact, best, 1), atol=1e-5)
+    close = np.isclose(
+        np.take_along_axis(found, best, 1), np.take_along_axis(exact, best, 1), atol=1e-5
+    )
     assert close.mean() > 0.95
     np.testing.assert_array_less(found.max(1), exact.max(1) + 1e-5)
 
 
 @pytest.mark.parametrize("place", [3, 21, 38])
 def test_the_policy_goes_where_two_things_differ(place):
-    # Two things that look alike from everywhere but from one view; the object's azimuth is known, and not zero.
+    # Two things that look alike from everywhere but from one view; the object's azimuth is known,
+    # and not zero.
     views = np.zeros((2, len(RINGS), AZIMUTHS, 2), np.float32)
     views[..., 0] = 1
     ring, azimuth = divmod(place, 8)
@@ -215,7 +245,9 @@ def test_the_policy_goes_where_two_things_differ(place):
     joint[0, :, (2 * (current % 8) + 5) % AZIMUTHS] = 0.5
     visited = np.arange(40)[None] == current
     evidence = Evidence(np.zeros((1, 2)))
-    state = EpisodeState(np.array([current]), visited, np.full((1, 2), 0.5), evidence, 1, joint=joint)
+    state = EpisodeState(
+        np.array([current]), visited, np.full((1, 2), 0.5), evidence, 1, joint=joint
+    )
     assert policy.next_views(state, np.random.default_rng(0)).tolist() == [place]
     rivals = policy.rivals(joint[0], FORTY.azimuth[current])
     np.testing.assert_array_equal(rivals.classes, [0, 1])

@@ -1,4 +1,6 @@
-"""What a folder teaches, wherever the result goes; sizes that give a wrong unit away; the picture of all things."""
+"""What a folder teaches, wherever the result goes; sizes that give a wrong unit away; the
+picture of all things.
+"""
 
 import os
 import re
@@ -52,7 +54,15 @@ def scans_in(folder: Path, *names: str) -> Path:
 
 
 def test_frames_meshes_and_classes_are_found_together(tmp_path):
-    scans_in(tmp_path, "box.ply", "cups/a.ply", "cups/a.stl", "frames/frame-0.depth.png", "mine/learned.png", "b.dae")
+    scans_in(
+        tmp_path,
+        "box.ply",
+        "cups/a.ply",
+        "cups/a.stl",
+        "frames/frame-0.depth.png",
+        "mine/learned.png",
+        "b.dae",
+    )
     found = find_things(tmp_path, tmp_path / "mine")
     assert [(thing.name, thing.label) for thing in found.things] == [
         ("box", "box"),
@@ -72,7 +82,9 @@ def test_what_is_for_tests_is_not_taught(tmp_path):
     found = find_things(tmp_path)
     assert [thing.name for thing in found.things] == ["box", "a"]
     assert found.left_out == ["cup/test/b.ply: of the split test"]
-    with pytest.raises(DatasetError, match=r"holds no mesh .*; left out: a\.step: of a format that is not read"):
+    with pytest.raises(
+        DatasetError, match=r"holds no mesh .*; left out: a\.step: of a format that is not read"
+    ):
         find_things(scans_in(tmp_path / "drawings", "a.step"))
 
 
@@ -88,7 +100,8 @@ def test_what_is_for_tests_is_not_taught(tmp_path):
 def test_a_folder_around_all_things_is_asked_about(tmp_path, quickly, places, inside):
     root = scans_in(tmp_path / "things", *places)
     with pytest.raises(
-        DatasetError, match=rf"all . things are of the one class .*; give {root / inside} if .*--one-class"
+        DatasetError,
+        match=rf"all . things are of the one class .*; give {root / inside} if .*--one-class",
     ):
         find_things(root)
     assert len({thing.label for thing in find_things(root / inside).things}) > 1
@@ -98,9 +111,13 @@ def test_a_folder_around_all_things_is_asked_about(tmp_path, quickly, places, in
 
 def test_a_class_beside_those_that_are_known_is_not_asked_about(tmp_path, quickly):
     learn(scans_in(tmp_path / "first", "box.ply", "tin.ply"), tmp_path / "mine", workers=0)
-    learned = learn(scans_in(tmp_path / "new", "cup/a.ply", "cup/b.ply"), tmp_path / "mine", add=True, workers=0)
+    learned = learn(
+        scans_in(tmp_path / "new", "cup/a.ply", "cup/b.ply"), tmp_path / "mine", add=True, workers=0
+    )
     assert (learned.things, learned.classes) == (4, 3)
-    assert [thing.label for thing in find_things(scans_in(tmp_path / "one", "cup/a.ply")).things] == ["cup"]
+    assert [
+        thing.label for thing in find_things(scans_in(tmp_path / "one", "cup/a.ply")).things
+    ] == ["cup"]
 
 
 @pytest.mark.parametrize(
@@ -118,7 +135,9 @@ def test_a_class_beside_those_that_are_known_is_not_asked_about(tmp_path, quickl
         ("workers", "two"),
     ],
 )
-def test_a_value_that_makes_no_sense_is_refused_before_anything_is_taught(tmp_path, monkeypatch, option, value):
+def test_a_value_that_makes_no_sense_is_refused_before_anything_is_taught(
+    tmp_path, monkeypatch, option, value
+):
     def teach(*arguments):
         raise AssertionError("a thing was taught")
 
@@ -129,7 +148,9 @@ def test_a_value_that_makes_no_sense_is_refused_before_anything_is_taught(tmp_pa
     assert not (tmp_path / "mine").exists()
 
 
-@pytest.mark.parametrize(("folder", "out"), [(".", "mine"), ("../things", "."), ("../things", "../things/mine")])
+@pytest.mark.parametrize(
+    ("folder", "out"), [(".", "mine"), ("../things", "."), ("../things", "../things/mine")]
+)
 def test_the_result_may_lie_beside_the_things_or_in_the_working_folder(
     tmp_path, monkeypatch, capsys, quickly, folder, out
 ):
@@ -160,7 +181,11 @@ def test_a_file_that_cannot_be_taught_does_not_keep_the_others_from_it(tmp_path,
 @pytest.mark.parametrize(
     ("radii", "unit_given", "said"),
     [
-        ([71.0, 80, 65], "m", r"b\.ply: has a radius of 71 m if --unit m is right.* --unit mm \(7\.1 cm\)"),
+        (
+            [71.0, 80, 65],
+            "m",
+            r"b\.ply: has a radius of 71 m if --unit m is right.* --unit mm \(7\.1 cm\)",
+        ),
         ([71.0], "m", "--unit mm"),
         ([0.0001, 0.00012], "mm", r"--unit m \("),
         ([0.1, 0.12, 100.0], "m", r"c\.ply: is 833 times larger than most others"),
@@ -180,11 +205,15 @@ def test_sizes_that_give_a_wrong_unit_away_are_asked_about(radii, unit_given, sa
 
 
 @pytest.mark.parametrize(("count", "shown"), [(1, 1), (7, 7), (14, 14), (90, 90), (400, 120)])
-def test_the_picture_shows_all_things_that_fit_each_in_a_place_of_its_own(tmp_path, monkeypatch, count, shown):
+def test_the_picture_shows_all_things_that_fit_each_in_a_place_of_its_own(
+    tmp_path, monkeypatch, count, shown
+):
     pages = []
     monkeypatch.setattr(Figure, "savefig", lambda self, path: pages.append(self))
     pictures = {f"thing_{k}": np.full((64, 64), 99, np.uint8) for k in range(count)}
-    draw_learned(tmp_path / "p.png", pictures, SimpleNamespace(accuracy=(0.5, 0.6, 0.7, 0.8), confused=()))
+    draw_learned(
+        tmp_path / "p.png", pictures, SimpleNamespace(accuracy=(0.5, 0.6, 0.7, 0.8), confused=())
+    )
     (figure,) = pages
     page = figure.axes[0]
     places = np.array([image.get_extent() for image in page.images])
@@ -195,4 +224,6 @@ def test_the_picture_shows_all_things_that_fit_each_in_a_place_of_its_own(tmp_pa
     assert (places[:, 2:] <= height).all()
     apart = np.abs(places[:, None, [0, 3]] - places[None, :, [0, 3]]).max(-1) + 9 * np.eye(shown)
     assert apart.min() > 1.05  # inches: none lies on another
-    assert (f"{shown} of them" in "".join(text.get_text() for text in page.texts)) == (shown < count)
+    assert (f"{shown} of them" in "".join(text.get_text() for text in page.texts)) == (
+        shown < count
+    )

@@ -1,4 +1,6 @@
-"""Where a memory is written: links, folders of others, two runs at once, other features, parts of a stopped run."""
+"""Where a memory is written: links, folders of others, two runs at once, other features, parts
+of a stopped run.
+"""
 
 import json
 import os
@@ -39,7 +41,9 @@ def looked_at(monkeypatch):
         }
 
     monkeypatch.setattr(module, "teach", teach)
-    monkeypatch.setattr(module, "draw_learned", lambda path, pictures, fit: path.write_text(" ".join(pictures)))
+    monkeypatch.setattr(
+        module, "draw_learned", lambda path, pictures, fit: path.write_text(" ".join(pictures))
+    )
     return names
 
 
@@ -88,7 +92,9 @@ def link_away(path, place):
 
 @pytest.mark.parametrize("run", RUNS)
 @pytest.mark.parametrize("linked", ["memory.json", "learned.png", "."])
-def test_a_link_where_a_file_is_to_be_replaced_is_refused_before_anything_is_done(place, looked_at, run, linked):
+def test_a_link_where_a_file_is_to_be_replaced_is_refused_before_anything_is_done(
+    place, looked_at, run, linked
+):
     link_away(place / "mine" / linked if linked != "." else place / "mine", place)
     before = contents(place)
     with pytest.raises(ResultsError, match="is a link; give what it points to"):
@@ -140,7 +146,9 @@ def test_what_is_not_ours_beside_the_output_stays(place, run):
     RUNS[run](place)
     assert known(place / "mine") == AFTER[run]
     now = contents(place)
-    assert {name: now.get(name) for name in foreign} == {name: text.encode() for name, text in foreign.items()}
+    assert {name: now.get(name) for name in foreign} == {
+        name: text.encode() for name, text in foreign.items()
+    }
 
 
 def test_predict_leaves_a_folder_of_others_alone(tmp_path, views, models):
@@ -170,7 +178,8 @@ def test_of_two_runs_at_once_one_is_refused_and_none_loses_what_the_other_wrote(
     find = module.find_things
     waiting = [place / "third"]
 
-    def find_things(folder, out, one_class):  # while this run looks for its things, another one begins and ends
+    # while this run looks for its things, another one begins and ends
+    def find_things(folder, out, one_class):
         if waiting:
             learn(waiting.pop(), place / "mine", add=True, workers=0)
         return find(folder, out, one_class)
@@ -202,11 +211,17 @@ def test_a_memory_of_nothing_is_not_written(place):
 
 CHANGES = {
     "nothing": (lambda folder: None, False),
-    "the size of a file": (lambda folder: (folder / "depth/0.png").write_bytes(b"longer than it was"), True),
+    "the size of a file": (
+        lambda folder: (folder / "depth/0.png").write_bytes(b"longer than it was"),
+        True,
+    ),
     "the time of a file": (lambda folder: os.utime(folder / "depth/0.png", (1, 1)), True),
     "one file more": (lambda folder: (folder / "depth/1.png").write_bytes(b"0"), True),
     "one file less": (lambda folder: (folder / "scene_gt.json").unlink(), True),
-    "the name of a file": (lambda folder: (folder / "depth/0.png").rename(folder / "depth/2.png"), True),
+    "the name of a file": (
+        lambda folder: (folder / "depth/0.png").rename(folder / "depth/2.png"),
+        True,
+    ),
     "a file behind a link": (lambda folder: os.utime(folder / "rgb/0.png", (1, 1)), True),
 }
 
@@ -233,7 +248,9 @@ def test_frames_that_were_changed_in_place_are_looked_at_again(tmp_path, looked_
     assert sorted(looked_at) == ["box", "thing"]
     looked_at.clear()
     change, again = CHANGES[what]
-    times = {path: path.stat().st_mtime_ns for path in (folder, folder / "depth", tmp_path / "disk")}
+    times = {
+        path: path.stat().st_mtime_ns for path in (folder, folder / "depth", tmp_path / "disk")
+    }
     change(folder)
     for path, time in times.items():  # as cp over what is there leaves it
         os.utime(path, ns=(time, time))
@@ -251,7 +268,10 @@ def test_no_file_of_a_folder_is_replaced_before_all_can_be(tmp_path):
     (out / "linked").symlink_to(tmp_path / "away")
     before = contents(out)
     for taken in ("b", "linked/x.txt"):
-        with pytest.raises(ResultsError, match=r"is a (folder|link)"), new_folder(out, overwrite=True) as part:
+        with (
+            pytest.raises(ResultsError, match=r"is a (folder|link)"),
+            new_folder(out, overwrite=True) as part,
+        ):
             for name in ("a.txt", "c.txt", taken):
                 (part / name).parent.mkdir(exist_ok=True)
                 (part / name).write_text("new")
@@ -259,11 +279,15 @@ def test_no_file_of_a_folder_is_replaced_before_all_can_be(tmp_path):
     assert not any((tmp_path / "away").iterdir())
 
 
-@pytest.mark.parametrize("image", ["rgb/000001.jpg", "gray/000000.png", "mask_visib/000002_000000.png"])
+@pytest.mark.parametrize(
+    "image", ["rgb/000001.jpg", "gray/000000.png", "mask_visib/000002_000000.png"]
+)
 def test_capture_writes_no_views_beside_images_that_would_be_taken_for_theirs(tmp_path, image):
     sphere = ViewSphere((30.0,), 3)
     (tmp_path / image).parent.mkdir()
     (tmp_path / image).write_bytes(b"mine")
     with pytest.raises(ResultsError, match="would be taken for one of the new views"):
-        list(write_capture(sample_mesh("chair"), tmp_path, sphere, 0.4, masks=False, overwrite=True))
+        list(
+            write_capture(sample_mesh("chair"), tmp_path, sphere, 0.4, masks=False, overwrite=True)
+        )
     assert contents(tmp_path) == {image: b"mine"}

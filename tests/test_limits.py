@@ -1,4 +1,6 @@
-"""Candidate views to which no camera is sent: too low, too high, too near to what the frames show, behind it."""
+"""Candidate views to which no camera is sent: too low, too high, too near to what the frames
+show, behind it.
+"""
 
 import pickle
 
@@ -75,7 +77,11 @@ def test_the_least_height_can_be_given(tiny, least):
 
 def test_no_target_is_as_high_as_no_robot_reaches(tiny):
     first = pose_at(5, -90, 3.0, (0, 0, 0.95))
-    for most, limits in ((2.0, Limits()), (1.3, Limits(max_height=1.3)), (np.inf, Limits(max_height=np.inf))):
+    for most, limits in (
+        (2.0, Limits()),
+        (1.3, Limits(max_height=1.3)),
+        (np.inf, Limits(max_height=np.inf)),
+    ):
         session = begin(tiny, limits, distance=2.5)
         session.update(look(first, WARDROBE, FLOOR))
         high = [why == TOO_HIGH for why in session.left_out]
@@ -112,9 +118,12 @@ def test_no_target_is_in_or_beside_another_thing(tiny, name):
     assert (away < clearance).any()
 
     left_out = np.array(session.left_out) != ""
-    facing = away < 0.6 * clearance  # the back of a thing is not seen: nearer to it than to its front
+    # the back of a thing is not seen: nearer to it than to its front
+    facing = away < 0.6 * clearance
     assert left_out[facing].all()
-    clear = (away > 2.5 * clearance) & (places(session)[:, 1] < 0.1) & (places(session)[:, 2] > 0.08)
+    clear = (
+        (away > 2.5 * clearance) & (places(session)[:, 1] < 0.1) & (places(session)[:, 2] > 0.08)
+    )
     assert clear.any()
     assert not left_out[clear].any()
 
@@ -266,7 +275,11 @@ def test_the_values_of_a_view_rank_the_candidates():
     session = nextview.load(policy="gain", threshold=1.0, threads=1).session(distance=0.5)
     view = session.update(look(FROM, BRICK, TABLE))
     taken = {earlier.index for earlier in session.views}
-    left = [k for k in range(40) if not session.left_out[k] and k not in taken and np.isfinite(view.values[k])]
+    left = [
+        k
+        for k in range(40)
+        if not session.left_out[k] and k not in taken and np.isfinite(view.values[k])
+    ]
     assert session.view == max(left, key=lambda k: view.values[k])
 
 

@@ -1,4 +1,6 @@
-"""Depth-entropy against closed forms and scikit-image; measures in a store: kept, resumed, of a user's own."""
+"""Depth-entropy against closed forms and scikit-image; measures in a store: kept, resumed, of a
+user's own.
+"""
 
 import shutil
 from pathlib import Path
@@ -10,7 +12,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from skimage.measure import shannon_entropy
 
-from nextview.data.measures import QUANTUM, confidence_maps, depth_entropy, measure, normalise_per_object
+from nextview.data.measures import (
+    QUANTUM,
+    confidence_maps,
+    depth_entropy,
+    measure,
+    normalise_per_object,
+)
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, MeasureError
 
@@ -71,9 +79,12 @@ def test_normalising_keeps_order_and_ends_at_zero_and_one(values):
 
 def test_confidence_where_right_and_zero_where_wrong():
     half, three_quarters = np.log([1, 1]), np.log([1, 3])
-    logits = np.array([[three_quarters, half], [three_quarters, -three_quarters], [half, three_quarters]])
+    logits = np.array(
+        [[three_quarters, half], [three_quarters, -three_quarters], [half, three_quarters]]
+    )
     maps = confidence_maps(logits, np.array([1, 0, 0]))
-    # a tie counts for the lower index, so the second view of the first object is wrong and the first of the last right
+    # a tie counts for the lower index, so the second view of the first object is wrong and the
+    # first of the last right
     np.testing.assert_allclose(maps, [[0.75, 0], [0, 0.75], [0.5, 0]], rtol=1e-6)
     assert maps.dtype == np.float32
 

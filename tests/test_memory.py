@@ -1,4 +1,6 @@
-"""A memory of taught things whose hash is right, but whose values do not fit: each is refused in one sentence."""
+"""A memory of taught things whose hash is right, but whose values do not fit: each is refused in
+one sentence.
+"""
 
 import json
 import re
@@ -49,7 +51,9 @@ def features():
 
 
 def rewrite(models, change):
-    """Change the arrays of a memory; the card has the new hash, and the file's name of earlier versions."""
+    """Change the arrays of a memory; the card has the new hash, and the file's name of earlier
+    versions.
+    """
     card = models / "memory.json"
     weights = read_card(card).path
     arrays = load_file(weights)
@@ -78,7 +82,9 @@ OF_EACH = {
     "empty": lambda values: values[:0],
     "complex": lambda values: values.astype(np.complex64),
     "truth values": lambda values: values.astype(bool),
-    "16-bit integers": lambda values: values.astype(np.uint16) if values.dtype.kind == "f" else values / 1,
+    "16-bit integers": lambda values: (
+        values.astype(np.uint16) if values.dtype.kind == "f" else values / 1
+    ),
 }
 OF_FLOATS = {
     "NaN": lambda values: with_value(values, np.nan),
@@ -97,7 +103,9 @@ OF_ONE = {
     ("radii", "zero"): lambda values: np.zeros_like(values),
     ("radii", "finite, but absurd"): lambda values: values * 0 + 1e30,
     ("head", "finite, but absurd"): lambda values: with_value(values, -1e30),
-    ("head", "too large in all of a column"): lambda values: values * 0 + 701 / np.sqrt(len(values)),
+    ("head", "too large in all of a column"): lambda values: (
+        values * 0 + 701 / np.sqrt(len(values))
+    ),
     ("head_bias", "finite, but absurd"): lambda values: with_value(values, 1e30),
     ("thing", "negative"): lambda values: values - 1,
     ("thing", "beyond the last"): lambda values: values + 1,
@@ -117,9 +125,17 @@ OF_ONE = {
 
 
 AXES = {
-    "views": 4, "held_out": 3, "held_out_views": 3, "rotations": 3, "pictures": 3, "head": 2,
-    "places": 2, "faces": 2, "counts": 2, "boxes": 3,
-}  # fmt: skip
+    "views": 4,
+    "held_out": 3,
+    "held_out_views": 3,
+    "rotations": 3,
+    "pictures": 3,
+    "head": 2,
+    "places": 2,
+    "faces": 2,
+    "counts": 2,
+    "boxes": 3,
+}
 
 
 def array_mutations():
@@ -127,8 +143,16 @@ def array_mutations():
         for how, change in OF_EACH.items():
             yield name, how, change
         for axis in range(AXES.get(name, 1)):
-            yield name, f"one less along axis {axis}", lambda values, axis=axis: np.delete(values, -1, axis)
-            yield name, f"one more along axis {axis}", lambda values, axis=axis: lengthened(values, axis)
+            yield (
+                name,
+                f"one less along axis {axis}",
+                lambda values, axis=axis: np.delete(values, -1, axis),
+            )
+            yield (
+                name,
+                f"one more along axis {axis}",
+                lambda values, axis=axis: lengthened(values, axis),
+            )
     for name in FLOATS:
         for how, change in OF_FLOATS.items():
             if (name, how) != ("radii", "NaN"):  # a size that is not known
@@ -137,23 +161,33 @@ def array_mutations():
         yield name, how, change
 
 
-@pytest.mark.parametrize(("name", "how", "change"), [pytest.param(*m, id="-".join(m[:2])) for m in array_mutations()])
+@pytest.mark.parametrize(
+    ("name", "how", "change"), [pytest.param(*m, id="-".join(m[:2])) for m in array_mutations()]
+)
 def test_every_array_is_checked(models, name, how, change):
     rewrite(models, lambda arrays: arrays.update({name: change(arrays[name])}))
-    with pytest.raises(ModelError, match=r"^\S+/mine/memory\.safetensors: (not a memory \()?its .+"):
+    with pytest.raises(
+        ModelError, match=r"^\S+/mine/memory\.safetensors: (not a memory \()?its .+"
+    ):
         open_memory(models / "memory.json")
 
 
 @pytest.mark.parametrize("name", ARRAYS)
 def test_every_array_has_to_be_there(models, name):
     rewrite(models, lambda arrays: arrays.pop(name))
-    with pytest.raises(ModelError, match=rf"memory\.safetensors: not a memory \(it holds no {name}\)"):
+    with pytest.raises(
+        ModelError, match=rf"memory\.safetensors: not a memory \(it holds no {name}\)"
+    ):
         open_memory(models / "memory.json")
 
 
 def test_a_memory_of_an_earlier_version_is_refused_in_a_sentence_that_says_what_to_do(models):
-    rewrite(models, lambda arrays: [arrays.pop(name) for name in ("places", "faces", "counts", "boxes")])
-    with pytest.raises(ModelError, match=r"memory\.safetensors: is of an earlier version; teach it again"):
+    rewrite(
+        models, lambda arrays: [arrays.pop(name) for name in ("places", "faces", "counts", "boxes")]
+    )
+    with pytest.raises(
+        ModelError, match=r"memory\.safetensors: is of an earlier version; teach it again"
+    ):
         open_memory(models / "memory.json")
 
 
@@ -211,7 +245,9 @@ def changed_card(models, change):
 
 
 def set_at(path, value):
-    """A change that sets a field of a card; "novelty/0/3" is the fourth value of a list in a list."""
+    """A change that sets a field of a card; "novelty/0/3" is the fourth value of a list in a
+    list.
+    """
 
     def change(about):
         *above, last = [int(key) if key.isdigit() else key for key in path.split("/")]
@@ -222,7 +258,12 @@ def set_at(path, value):
     return change
 
 
-VERIFIED = {"weights": {"geometry": 20.0}, "things": 3, "usual": [0.1, 0.1, 0.2], "excess": [[-0.1, 0.2]]}
+VERIFIED = {
+    "weights": {"geometry": 20.0},
+    "things": 3,
+    "usual": [0.1, 0.1, 0.2],
+    "excess": [[-0.1, 0.2]],
+}
 REFUSED = {
     "one class more": set_at("classes", lambda names: [*names, "mug"]),
     "one class less": set_at("classes", lambda names: names[:-1]),
@@ -267,10 +308,18 @@ REFUSED = {
     "an empty row of usual": set_at("memory/usual", [[]]),
     "ragged usual": set_at("memory/usual/0", lambda row: row[:-1]),
     "usual of one class more": set_at("memory/usual", lambda rows: [[*row, 0.0] for row in rows]),
-    "a symmetry of order one": set_at("memory/things/0/symmetries", [{"axis": [0, 0, 1], "order": 1}]),
-    "a symmetry of negative order": set_at("memory/things/0/symmetries", [{"axis": [0, 0, 1], "order": -2}]),
-    "a symmetry about no axis": set_at("memory/things/0/symmetries", [{"axis": [0, 0, 0], "order": 2}]),
-    "a symmetry about half an axis": set_at("memory/things/0/symmetries", [{"axis": [0, 1], "order": 2}]),
+    "a symmetry of order one": set_at(
+        "memory/things/0/symmetries", [{"axis": [0, 0, 1], "order": 1}]
+    ),
+    "a symmetry of negative order": set_at(
+        "memory/things/0/symmetries", [{"axis": [0, 0, 1], "order": -2}]
+    ),
+    "a symmetry about no axis": set_at(
+        "memory/things/0/symmetries", [{"axis": [0, 0, 0], "order": 2}]
+    ),
+    "a symmetry about half an axis": set_at(
+        "memory/things/0/symmetries", [{"axis": [0, 1], "order": 2}]
+    ),
     "negative weights": set_at("memory/verification", {"weights": {"geometry": -1}, "things": 3}),
     "descending residuals": set_at("memory/verification", VERIFIED | {"excess": [[0.2, 0.1]]}),
     "no residuals": set_at("memory/verification", VERIFIED | {"excess": [[]]}),
@@ -283,7 +332,9 @@ REFUSED = {
 @pytest.mark.parametrize("how", REFUSED)
 def test_a_card_that_does_not_fit_is_refused_by_its_name(models, how):
     change = REFUSED[how]
-    card = changed_card(models, lambda about: change(Missing(about) if how == "an unknown field" else about))
+    card = changed_card(
+        models, lambda about: change(Missing(about) if how == "an unknown field" else about)
+    )
     with pytest.raises(ModelError, match=r"^\S+/mine/memory\.(json|safetensors): .+"):
         open_recogniser(card)
 

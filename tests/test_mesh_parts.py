@@ -1,4 +1,6 @@
-"""Scans with a table, a turntable's plate or loose pieces, and scans that were saved far from their origin."""
+"""Scans with a table, a turntable's plate or loose pieces, and scans that were saved far from
+their origin.
+"""
 
 import itertools
 import re
@@ -24,7 +26,11 @@ NOISE = np.random.default_rng(0)
 def thing(size: float = 0.05) -> trimesh.Trimesh:
     """An egg with a dent, as of a scanner: many small triangles, rough; it stands on the ground."""
     egg = trimesh.creation.icosphere(4)
-    egg.vertices *= 1 + 0.15 * np.sin(3 * egg.vertices[:, :1]) + 0.004 * NOISE.standard_normal((len(egg.vertices), 1))
+    egg.vertices *= (
+        1
+        + 0.15 * np.sin(3 * egg.vertices[:, :1])
+        + 0.004 * NOISE.standard_normal((len(egg.vertices), 1))
+    )
     egg.vertices *= (size, 0.8 * size, 1.3 * size)
     egg.vertices[:, 2] -= egg.vertices[:, 2].min()
     return egg
@@ -40,7 +46,9 @@ def ground(side: float, steps: int = 60) -> trimesh.Trimesh:
     x, y = np.meshgrid(*2 * [np.linspace(-side / 2, side / 2, steps)])
     points = np.stack([x, y, 0.001 * NOISE.standard_normal(x.shape)], -1).reshape(-1, 3)
     corner = (np.arange(steps - 1)[:, None] * steps + np.arange(steps - 1)).ravel()
-    faces = np.concatenate([[corner, corner + 1, corner + steps], [corner + 1, corner + steps + 1, corner + steps]], 1)
+    faces = np.concatenate(
+        [[corner, corner + 1, corner + steps], [corner + 1, corner + steps + 1, corner + steps]], 1
+    )
     return trimesh.Trimesh(points, faces.T, process=False)
 
 
@@ -49,7 +57,9 @@ def joined(*parts: trimesh.Trimesh, connected: bool = False) -> trimesh.Trimesh:
     whole = trimesh.util.concatenate(parts)
     if connected:
         starts = np.cumsum([0, *(len(part.vertices) for part in parts)])[:-1]
-        whole.faces = np.vstack([whole.faces, [(a, b, b + 1) for a, b in itertools.pairwise(starts)]])
+        whole.faces = np.vstack(
+            [whole.faces, [(a, b, b + 1) for a, b in itertools.pairwise(starts)]]
+        )
     return whole
 
 
@@ -60,12 +70,20 @@ def saved(path, shape: trimesh.Trimesh):
 
 SCANS = {
     "a loose piece": ((thing(), thing(0.004).apply_translation((0.5, 0, 0.1))), False, "2 parts"),
-    "crumbs around": ((thing(), *(thing(0.001).apply_translation((x, 0.4, 0)) for x in (-0.4, 0.4))), False, "3 parts"),
+    "crumbs around": (
+        (thing(), *(thing(0.001).apply_translation((x, 0.4, 0)) for x in (-0.4, 0.4))),
+        False,
+        "3 parts",
+    ),
     "a plate": ((thing(), disc(0.2)), False, "2 parts"),
-    "a large plate": ((thing(), disc(0.4, 0.02), thing(0.001).apply_translation((0.3, 0, 0))), False, "3 parts"),
+    "a large plate": (
+        (thing(), disc(0.4, 0.02), thing(0.001).apply_translation((0.3, 0, 0))),
+        False,
+        "3 parts",
+    ),
     "a table that it touches": ((thing(), ground(0.6)), True, "a plane in it is"),
     "a turntable that it touches": ((thing(), disc(0.15)), True, "a plane in it is"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("turn", [False, True])
@@ -85,7 +103,9 @@ def test_what_does_not_belong_to_an_object_is_asked_about(tmp_path, name, kind, 
         alone = make_mesh(*(np.asarray(each) for each in (shape.vertices, parts[0].faces)))
         assert len(mesh.faces) == len(parts[0].faces)
         assert mesh.radius == pytest.approx(alone.radius, rel=1e-5)
-        assert re.fullmatch(r"the largest of its \d parts was taken, \d+% of the surface", *mesh_warnings(mesh))
+        assert re.fullmatch(
+            r"the largest of its \d parts was taken, \d+% of the surface", *mesh_warnings(mesh)
+        )
 
 
 @pytest.mark.parametrize(
@@ -95,25 +115,41 @@ def test_what_does_not_belong_to_an_object_is_asked_about(tmp_path, name, kind, 
         disc(0.2),
         trimesh.creation.box((1, 1, 0.001)),
         ground(1.0),
-        joined(trimesh.creation.box((1.2, 0.6, 0.03)), *(
-            trimesh.creation.box((0.05, 0.05, 0.7)).apply_translation((x, y, -0.37))
-            for x in (-0.55, 0.55) for y in (-0.25, 0.25)
-        )),
+        joined(
+            trimesh.creation.box((1.2, 0.6, 0.03)),
+            *(
+                trimesh.creation.box((0.05, 0.05, 0.7)).apply_translation((x, y, -0.37))
+                for x in (-0.55, 0.55)
+                for y in (-0.25, 0.25)
+            ),
+        ),
         joined(thing(), disc(0.06)),
         trimesh.creation.annulus(0.2, 0.25, 0.02),
     ],
-    ids=["an egg", "a plate", "a board", "a sheet", "a table of five parts", "a cup on a saucer", "a ring"],
-)  # fmt: skip
+    ids=[
+        "an egg",
+        "a plate",
+        "a board",
+        "a sheet",
+        "a table of five parts",
+        "a cup on a saucer",
+        "a ring",
+    ],
+)
 def test_nothing_is_asked_about_an_object(shape):
     assert mesh_doubts(np.asarray(shape.vertices), np.asarray(shape.faces)) == ()
 
 
 def test_a_plate_alone_is_its_own_largest_part(tmp_path):
-    path = saved(tmp_path / "plate.ply", joined(disc(0.2), thing(0.002).apply_translation((0.5, 0, 0))))
+    path = saved(
+        tmp_path / "plate.ply", joined(disc(0.2), thing(0.002).apply_translation((0.5, 0, 0)))
+    )
     assert len(load_mesh(path, largest_part=True).faces) == len(disc(0.2).faces)
 
 
-@pytest.mark.parametrize("content", ["v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n"])
+@pytest.mark.parametrize(
+    "content", ["v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n"]
+)
 def test_a_broken_file_is_refused_with_the_option_too(tmp_path, content):
     (tmp_path / "broken.obj").write_text(content)
     with pytest.raises(MeshError, match=r"broken\.obj: .*vert"):
@@ -139,18 +175,23 @@ def test_an_odd_size_is_asked_about(unit, radius):
 
 
 @pytest.mark.parametrize("kind", ["ply", "stl", "obj"])
-@pytest.mark.parametrize(("offset", "lost"), [(1e3, False), (1e4, False), (1e6, True), (-4e6, True)])
+@pytest.mark.parametrize(
+    ("offset", "lost"), [(1e3, False), (1e4, False), (1e6, True), (-4e6, True)]
+)
 def test_a_scan_far_from_its_origin_in_single_precision(tmp_path, kind, offset, lost):
     egg = thing()
     egg.vertices = (egg.vertices + np.array((offset, 10, -20))).astype(np.float32)
     path = saved(tmp_path / f"far.{kind}", egg)
     if lost:
         with pytest.raises(
-            MeshError, match=r"far\.\w+: .*(single precision has steps of .* has lost its shape|no extent)"
+            MeshError,
+            match=r"far\.\w+: .*(single precision has steps of .* has lost its shape|no extent)",
         ):
             load_mesh(path)
     else:
-        assert load_mesh(path).radius == pytest.approx(make_mesh(thing().vertices, thing().faces).radius, rel=0.05)
+        assert load_mesh(path).radius == pytest.approx(
+            make_mesh(thing().vertices, thing().faces).radius, rel=0.05
+        )
 
 
 @pytest.mark.parametrize("exact", [True, False], ids=["whole metres", "double precision"])
@@ -173,14 +214,40 @@ def test_a_store_keeps_what_its_meshes_were_cut_to(tmp_path):
     radii = []
     for largest in (False, True):
         options = RenderOptions(largest_part=largest)
-        done = dict(render(scans.parent, tmp_path / f"{largest}.zarr", ViewSphere.named("12"), 32, options, workers=0))
+        done = dict(
+            render(
+                scans.parent,
+                tmp_path / f"{largest}.zarr",
+                ViewSphere.named("12"),
+                32,
+                options,
+                workers=0,
+            )
+        )
         assert list(done.values()) == [None]
         radii.append(float(ViewStore.open(tmp_path / f"{largest}.zarr").array("radius")[0]))
     assert radii[0] / radii[1] == pytest.approx(0.4 / 0.065, rel=0.2)
     with pytest.raises(DatasetError, match="begun with other largest_part"):
-        list(render(scans.parent, tmp_path / "False.zarr", ViewSphere.named("12"), 32, options, workers=0))
+        list(
+            render(
+                scans.parent,
+                tmp_path / "False.zarr",
+                ViewSphere.named("12"),
+                32,
+                options,
+                workers=0,
+            )
+        )
     with pytest.raises(UsageError, match="scenes are rendered as they are"):
-        list(render(scans.parent, tmp_path / "x.zarr", ViewSphere.named("12"), 32, replace(options, meshes=scans)))
+        list(
+            render(
+                scans.parent,
+                tmp_path / "x.zarr",
+                ViewSphere.named("12"),
+                32,
+                replace(options, meshes=scans),
+            )
+        )
 
 
 def test_render_says_which_meshes_look_odd(tmp_path, caplog, monkeypatch):
@@ -193,7 +260,10 @@ def test_render_says_which_meshes_look_odd(tmp_path, caplog, monkeypatch):
     done = dict(render(scans.parent, tmp_path / "x.zarr", ViewSphere.named("12"), 32, workers=0))
     assert set(done.values()) == {None}
     said = [record.getMessage() for record in caplog.records]
-    assert [line.partition(":")[0] for line in said[:2]] == [str(scans / "a.ply"), str(scans / "b.ply")]
+    assert [line.partition(":")[0] for line in said[:2]] == [
+        str(scans / "a.ply"),
+        str(scans / "b.ply"),
+    ]
     assert all("times as large" in line for line in said[:2])
     assert said[2].startswith("and 1 more meshes look odd")
     assert len(said) == 3
@@ -207,7 +277,9 @@ def test_recognise_warns_and_takes_the_largest_part(tmp_path):
         part = nextview.recognise(path, start=9, largest_part=True)
     alone = nextview.recognise(saved(tmp_path / "egg.ply", thing()), start=9)
     first = [result.views[0].observation.depth for result in (part, alone, whole)]
-    assert ((first[0] > 0) != (first[1] > 0)).mean() < 0.01 < ((first[0] > 0) != (first[2] > 0)).mean()
+    assert (
+        ((first[0] > 0) != (first[1] > 0)).mean() < 0.01 < ((first[0] > 0) != (first[2] > 0)).mean()
+    )
 
 
 def test_what_is_taught_of_a_scan_says_what_is_odd_about_it(tmp_path, monkeypatch):
@@ -217,8 +289,13 @@ def test_what_is_taught_of_a_scan_says_what_is_odd_about_it(tmp_path, monkeypatc
     monkeypatch.setattr(teaching, "embeddings", no_embeddings)
     path = saved(tmp_path / "scan.ply", joined(thing(), disc(0.4)))
     radii = []
-    for largest, sentence in ((False, "it has 2 parts"), (True, "the largest of its 2 parts was taken")):
-        taught = teaching.teach(path, "egg", teaching.How(unit="m", upright=True, largest_part=largest))
+    for largest, sentence in (
+        (False, "it has 2 parts"),
+        (True, "the largest of its 2 parts was taken"),
+    ):
+        taught = teaching.teach(
+            path, "egg", teaching.How(unit="m", upright=True, largest_part=largest)
+        )
         assert taught["doubts"].tobytes().decode().startswith(sentence)
         radii.append(float(taught["radii"][0]))
     assert radii[0] > 5 * radii[1]

@@ -1,4 +1,6 @@
-"""Models of a card and an ONNX file: what is written is read again, what does not fit is refused in one sentence."""
+"""Models of a card and an ONNX file: what is written is read again, what does not fit is refused
+in one sentence.
+"""
 
 import numpy as np
 import onnx
@@ -22,17 +24,23 @@ def test_cards_are_read_as_they_were_written(tmp_path):
     (tmp_path / "card.safetensors").touch()
     for card in bundled_cards().values():
         write_card(tmp_path / "card.json", card)
-        assert read_card(tmp_path / "card.json") == replace(card, path=tmp_path / f"card{card.path.suffix}")
+        assert read_card(tmp_path / "card.json") == replace(
+            card, path=tmp_path / f"card{card.path.suffix}"
+        )
 
 
 def test_a_model_that_is_not_there():
-    with pytest.raises(ModelError, match="no bundled model is called 'resnet'; there are features, lcm-"):
+    with pytest.raises(
+        ModelError, match="no bundled model is called 'resnet'; there are features, lcm-"
+    ):
         find_card("resnet")
     with pytest.raises(ModelError, match=r"gone\.json: no such file"):
         find_card("gone.json")
 
 
-def test_a_card_of_other_classes_or_inputs_than_its_network_is_refused_when_that_is_opened(tmp_path):
+def test_a_card_of_other_classes_or_inputs_than_its_network_is_refused_when_that_is_opened(
+    tmp_path,
+):
     card = make_recogniser(tmp_path, CLASSES, azimuth_bins=8)
     for values, sentence in (
         ({"classes": CLASSES[:9]}, r"has logits \(batch, 10\) .*, not \(batch, 9\)"),
@@ -55,7 +63,9 @@ def test_a_card_of_other_classes_or_inputs_than_its_network_is_refused_when_that
         MapNetwork(lem)
 
 
-SEEN = Observation(np.pad(np.full((16, 16), 2.5, np.float32), 8), ViewSphere.named("40").poses[3], pinhole(32, 3.5))
+SEEN = Observation(
+    np.pad(np.full((16, 16), 2.5, np.float32), 8), ViewSphere.named("40").poses[3], pinhole(32, 3.5)
+)
 
 
 def constant(model: onnx.ModelProto, name: str) -> onnx.TensorProto:
@@ -79,7 +89,9 @@ def another_input(model: onnx.ModelProto) -> None:
 
 
 def two_inputs(model: onnx.ModelProto) -> None:
-    model.graph.input.append(helper.make_tensor_value_info("more", TensorProto.UINT8, ["batch", 4, 16, 16]))
+    model.graph.input.append(
+        helper.make_tensor_value_info("more", TensorProto.UINT8, ["batch", 4, 16, 16])
+    )
 
 
 def one_answer(model: onnx.ModelProto) -> None:
@@ -90,7 +102,9 @@ def one_answer(model: onnx.ModelProto) -> None:
 
 
 def no_numbers(model: onnx.ModelProto) -> None:
-    constant(model, "weights").CopyFrom(numpy_helper.from_array(np.full((4, 3), np.nan, np.float32), "weights"))
+    constant(model, "weights").CopyFrom(
+        numpy_helper.from_array(np.full((4, 3), np.nan, np.float32), "weights")
+    )
 
 
 @pytest.mark.parametrize(

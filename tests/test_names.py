@@ -1,4 +1,6 @@
-"""Names of files, classes and objects may hold anything: they are shown as they are, and never mean anything."""
+"""Names of files, classes and objects may hold anything: they are shown as they are, and never
+mean anything.
+"""
 
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -24,7 +26,10 @@ COMMENT = "<!--<script>"
 
 
 def texts(svg: str) -> list[str]:
-    return ["".join(element.itertext()) for element in ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")]
+    return [
+        "".join(element.itertext())
+        for element in ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")
+    ]
 
 
 @pytest.mark.parametrize("name", [MATH, r"a\$b", "<b>&"])
@@ -39,8 +44,12 @@ def test_a_picture_of_an_episode(tmp_path):
     mesh.parent.mkdir(parents=True)
     trimesh.creation.box([1, 2, 3]).export(mesh)
     with matplotlib.rc_context({"svg.fonttype": "none"}):
-        main(["recognise", str(mesh), "--max-views", "1", "--figure", str(tmp_path / "episode.svg")])
-    assert any(text.startswith(f"{MATH}.off: ") for text in texts((tmp_path / "episode.svg").read_text()))
+        main(
+            ["recognise", str(mesh), "--max-views", "1", "--figure", str(tmp_path / "episode.svg")]
+        )
+    assert any(
+        text.startswith(f"{MATH}.off: ") for text in texts((tmp_path / "episode.svg").read_text())
+    )
 
 
 CLASSES = (MATH, COMMENT, "</script>", "<b>[red]")
@@ -53,7 +62,14 @@ def strange(tmp_path_factory):
     p = some_predictions(24, seed=1)
     logits = np.concatenate([p.logits, p.logits[..., :1] - 9], -1)
     names = (f"{COMMENT}{MATH}", *p.names[1:])
-    p = replace(p, logits=logits, classes=CLASSES, names=names, labels=np.arange(24) % 4, valley_classes={"lem": ()})
+    p = replace(
+        p,
+        logits=logits,
+        classes=CLASSES,
+        names=names,
+        labels=np.arange(24) % 4,
+        valley_classes={"lem": ()},
+    )
     p.save(folder / "p.npz")
     benchmark(folder / "p.npz", folder / "out", thresholds=(0.8, 0.97), runs=2, samples=50)
     report(folder / "out")
@@ -83,12 +99,19 @@ def test_a_terminal_gets_a_name_as_it_is(tmp_path, name, shown, capsys):
     main(["recognise", str(tmp_path / name), "--max-views", "1"])
     assert f"Looking at {shown}" in capsys.readouterr().out
     (tmp_path / name).unlink()
-    assert refused(capsys, "recognise", tmp_path / name) == f"nextview: {tmp_path}/{shown}: no such file"
+    assert (
+        refused(capsys, "recognise", tmp_path / name)
+        == f"nextview: {tmp_path}/{shown}: no such file"
+    )
 
 
-@pytest.mark.parametrize("name", ["a\nb", "a\x1b[1m", b"caf\xe9".decode("utf-8", "surrogateescape")])
+@pytest.mark.parametrize(
+    "name", ["a\nb", "a\x1b[1m", b"caf\xe9".decode("utf-8", "surrogateescape")]
+)
 def test_a_dataset_with_names_that_cannot_be_printed_is_refused(tmp_path, name):
     (tmp_path / name).mkdir()
     (tmp_path / name / "box.off").write_text("OFF\n")
-    with pytest.raises(DatasetError, match=r"left out: \S+( b)?: its name cannot be printed; rename it"):
+    with pytest.raises(
+        DatasetError, match=r"left out: \S+( b)?: its name cannot be printed; rename it"
+    ):
         list_dataset(tmp_path)

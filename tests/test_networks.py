@@ -1,4 +1,6 @@
-"""Networks: shapes and numbers as published, checkpoints that load and nothing else, and ONNX with the same answers."""
+"""Networks: shapes and numbers as published, checkpoints that load and nothing else, and ONNX
+with the same answers.
+"""
 
 import os
 import pickle
@@ -18,7 +20,13 @@ from nextview.learning.runs import start_from
 
 LITE0 = ((16, 3, 1), (24, 3, 2), (40, 5, 2), (80, 3, 3), (112, 5, 3), (192, 5, 4), (320, 3, 1))
 """Width, kernel and blocks of the stages of EfficientNet-Lite0."""
-BLOCKS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3), 50: (3, 4, 6, 3), 101: (3, 4, 23, 3), 152: (3, 8, 36, 3)}
+BLOCKS = {
+    18: (2, 2, 2, 2),
+    34: (3, 4, 6, 3),
+    50: (3, 4, 6, 3),
+    101: (3, 4, 23, 3),
+    152: (3, 8, 36, 3),
+}
 PUBLISHED = {18: 11_689_512, 34: 21_797_672, 50: 25_557_032, 101: 44_549_160, 152: 60_192_808}
 """Parameters at 1,000 classes, from torchvision's table of models."""
 
@@ -39,7 +47,9 @@ def torchvisions_shapes(depth, classes=1000, channels=3, counts_batches=True):
     convolution("conv1", 64, channels, 7)
     norm("bn1", 64)
     before = 64
-    for stage, (blocks, width) in enumerate(zip(BLOCKS[depth], (64, 128, 256, 512), strict=True), 1):
+    for stage, (blocks, width) in enumerate(
+        zip(BLOCKS[depth], (64, 128, 256, 512), strict=True), 1
+    ):
         after = width if depth < 50 else 4 * width
         # (inner convolutions, each: outputs, inputs, side)
         for block in range(blocks):
@@ -51,7 +61,8 @@ def torchvisions_shapes(depth, classes=1000, channels=3, counts_batches=True):
             for k, (outputs, inputs, side) in enumerate(inner, 1):
                 convolution(f"{at}.conv{k}", outputs, inputs, side)
                 norm(f"{at}.bn{k}", outputs)
-            if block == 0 and before != after:  # ResNet-50 and deeper widen already in the first stage
+            # ResNet-50 and deeper widen already in the first stage
+            if block == 0 and before != after:
                 convolution(f"{at}.downsample.0", after, before, 1)
                 norm(f"{at}.downsample.1", after)
             before = after
@@ -75,7 +86,9 @@ def test_resnet_is_torchvisions(depth):
     with torch.device("meta"):  # shapes only
         network = ResNet(depth, 1000, 3)
     assert sum(p.numel() for p in network.parameters()) == PUBLISHED[depth]
-    assert {name: tuple(value.shape) for name, value in network.state_dict().items()} == torchvisions_shapes(depth)
+    assert {
+        name: tuple(value.shape) for name, value in network.state_dict().items()
+    } == torchvisions_shapes(depth)
 
 
 @pytest.mark.parametrize("depth", [34, 50])
@@ -88,7 +101,9 @@ def test_a_torchvision_checkpoint_loads_whole(tmp_path, depth):
 
 
 @pytest.mark.parametrize("channels", [1, 4])
-def test_other_channels_answer_grey_images_as_before_and_other_classes_keep_the_last_layer(tmp_path, channels):
+def test_other_channels_answer_grey_images_as_before_and_other_classes_keep_the_last_layer(
+    tmp_path, channels
+):
     state = checkpoint(tmp_path / "rgb.pth", classes=5)
     rgb, ours = ResNet(18, 5, 3), ResNet(18, 10, channels)
     before = ours.fc.weight.clone()
@@ -99,7 +114,9 @@ def test_other_channels_answer_grey_images_as_before_and_other_classes_keep_the_
     grey = torch.rand(2, 1, 32, 32)
     with torch.no_grad():
         expected = rgb.conv1(grey.expand(-1, 3, -1, -1))
-        assert torch.allclose(ours.conv1(grey.expand(-1, channels, -1, -1)), expected, rtol=1e-4, atol=1e-5)
+        assert torch.allclose(
+            ours.conv1(grey.expand(-1, channels, -1, -1)), expected, rtol=1e-4, atol=1e-5
+        )
 
 
 class Bomb:
@@ -118,8 +135,12 @@ def damaged(path, name, value):
 
 BROKEN = {
     "there is no such": lambda path: None,
-    "cannot be a pickle": lambda path: path.write_bytes(pickle.dumps(Bomb(path.parent / "executed"))),
-    "cannot be a pickle inside torch's own file": lambda path: torch.save({"x": Bomb(path.parent / "executed")}, path),
+    "cannot be a pickle": lambda path: path.write_bytes(
+        pickle.dumps(Bomb(path.parent / "executed"))
+    ),
+    "cannot be a pickle inside torch's own file": lambda path: torch.save(
+        {"x": Bomb(path.parent / "executed")}, path
+    ),
     "truncated": lambda path: (checkpoint(path), path.write_bytes(path.read_bytes()[: 2 << 20])),
     "another network": lambda path: torch.save({"features.0.weight": torch.zeros(3)}, path),
     "wrong shape": lambda path: damaged(path, "layer2.0.conv1.weight", torch.zeros(128, 64, 1, 1)),
@@ -141,11 +162,15 @@ def test_broken_and_foreign_files_are_refused_and_nothing_is_executed(tmp_path, 
 
 
 def lite_checkpoint(path: Path, classes: int = 1000, seed: int = 0) -> dict:
-    """Random weights under the names that published checkpoints use, from the network's plan in words."""
+    """Random weights under the names that published checkpoints use, from the network's plan in
+    words.
+    """
     rng, state = torch.Generator().manual_seed(seed), {}
 
     def convolution(name, *shape):
-        state[f"{name}.weight"] = torch.randn(shape, generator=rng) / (shape[1] * shape[2] * shape[3]) ** 0.5
+        state[f"{name}.weight"] = (
+            torch.randn(shape, generator=rng) / (shape[1] * shape[2] * shape[3]) ** 0.5
+        )
 
     def norm(name, width):
         for part in ("weight", "bias", "running_mean"):
@@ -176,12 +201,16 @@ def lite_checkpoint(path: Path, classes: int = 1000, seed: int = 0) -> dict:
 
 
 def test_it_is_as_large_as_published():
-    """4.7 million parameters and 407 million multiplications (TensorFlow's EfficientNet-Lite, 2020)."""
+    """4.7 million parameters and 407 million multiplications (TensorFlow's EfficientNet-Lite,
+    2020).
+    """
     network, products = LiteNet(1000, 3).eval(), []
     for part in network.modules():
         if isinstance(part, torch.nn.Conv2d | torch.nn.Linear):
             weights = part.weight.numel()
-            part.register_forward_hook(lambda _, __, out, weights=weights: products.append(weights * out[0, 0].numel()))
+            part.register_forward_hook(
+                lambda _, __, out, weights=weights: products.append(weights * out[0, 0].numel())
+            )
     network(torch.zeros(1, 3, 224, 224))
     assert sum(p.numel() for p in network.parameters()) == pytest.approx(4.7e6, rel=0.02)
     assert sum(products) == pytest.approx(407e6, rel=0.06)
@@ -194,7 +223,9 @@ def test_a_published_checkpoint_loads_whole(tmp_path):
     ours = network.state_dict()
     assert len(ours) == len(state)
     assert torch.equal(ours["stem.weight"], state["_conv_stem.weight"])
-    assert torch.equal(ours["stages.15.depthwise.weight"], state["_blocks.15._depthwise_conv.weight"])
+    assert torch.equal(
+        ours["stages.15.depthwise.weight"], state["_blocks.15._depthwise_conv.weight"]
+    )
     assert torch.equal(ours["stages.3.norm2.running_var"], state["_blocks.3._bn2.running_var"])
     assert torch.equal(ours["norm1.bias"], state["_bn1.bias"])
     assert torch.equal(ours["fc.weight"], state["_fc.weight"])
@@ -236,7 +267,9 @@ def test_export_keeps_the_answers(tmp_path):
         expected = network(more)
     for ours, theirs in zip(session.run(None, {"input": more.numpy()}), expected, strict=True):
         assert np.abs(ours - theirs.numpy()).max() < 0.01 * theirs.abs().max()
-    assert sys.modules[ResNet.__module__].__file__.encode() not in (tmp_path / "net.onnx").read_bytes()
+    assert (
+        sys.modules[ResNet.__module__].__file__.encode() not in (tmp_path / "net.onnx").read_bytes()
+    )
     full = sum(p.numel() for p in network.parameters()) * 4
     assert (tmp_path / "net.onnx").stat().st_size < 0.6 * full
 
@@ -250,7 +283,9 @@ def test_eight_bits_a_weight_are_enough_for_the_answers_and_nearly_halve_the_fil
     output = {}
     for bits in (16, 8):
         export_onnx(network, x, "input", ["logits"], tmp_path / f"{bits}.onnx", bits)
-        session = ort.InferenceSession(tmp_path / f"{bits}.onnx", providers=["CPUExecutionProvider"])
+        session = ort.InferenceSession(
+            tmp_path / f"{bits}.onnx", providers=["CPUExecutionProvider"]
+        )
         output[bits] = session.run(["logits"], {"input": x})[0]
     true = network(torch.from_numpy(x))[0].detach().numpy()
     assert np.abs(output[8] - true).max() < 0.02 * np.abs(true).max()

@@ -29,21 +29,33 @@ SPHERE = ViewSphere.named("40")
 
 
 def features(logits, seen=None, azimuth_bins=None) -> Evidence:
-    return Evidence(np.asarray(logits, float), azimuth_bins=azimuth_bins, seen=None if seen is None else np.array(seen))
+    return Evidence(
+        np.asarray(logits, float),
+        azimuth_bins=azimuth_bins,
+        seen=None if seen is None else np.array(seen),
+    )
 
 
 # Evidence
 
 
-@pytest.mark.parametrize("calibration", [Calibration(), Calibration(0.7, 0.5), Calibration(0.7, 1.0, None, 2.0)])
+@pytest.mark.parametrize(
+    "calibration", [Calibration(), Calibration(0.7, 0.5), Calibration(0.7, 1.0, None, 2.0)]
+)
 def test_episodes_are_believed_as_if_their_empty_views_had_not_been_taken(calibration):
-    """Each of 40 episodes has empty views of its own; alone and without them it believes the same."""
+    """Each of 40 episodes has empty views of its own; alone and without them it believes the
+    same.
+    """
     rng, b, k = np.random.default_rng(0), 40, 6
     logits, empty = rng.normal(size=(b, k, 3)), rng.random((b, k)) < 0.4
     empty[0], empty[1] = True, False
-    azimuth_bins = np.log(rng.dirichlet(np.ones(8), (b, k, 3))) if calibration.bin_correlation else None
+    azimuth_bins = (
+        np.log(rng.dirichlet(np.ones(8), (b, k, 3))) if calibration.bin_correlation else None
+    )
     sure = Stopping(1.0, k)
-    together = Episodes(SPHERE, Unidirectional(SPHERE), np.arange(b), sure, np.random.default_rng(0), calibration)
+    together = Episodes(
+        SPHERE, Unidirectional(SPHERE), np.arange(b), sure, np.random.default_rng(0), calibration
+    )
     for observation in range(k):
         unread = np.where(empty[:, observation, None], np.nan, logits[:, observation])
         bins = None if azimuth_bins is None else azimuth_bins[:, observation]
@@ -58,7 +70,9 @@ def test_episodes_are_believed_as_if_their_empty_views_had_not_been_taken(calibr
         if azimuth_bins is not None:
             zero = np.zeros((3, 8))  # by the azimuth of the object's azimuth bin 0
             for k, side in product(kept, range(8)):
-                zero[:, (SPHERE.azimuth_index[views[e, k]] - side) % 8] += azimuth_bins[e, k, :, side]
+                zero[:, (SPHERE.azimuth_index[views[e, k]] - side) % 8] += azimuth_bins[
+                    e, k, :, side
+                ]
             total = total + np.log(np.exp(zero / (1 + 2.0 * (max(len(kept), 1) - 1))).sum(1))
         np.testing.assert_allclose(together.steps[-1].belief[e], softmax(total), atol=1e-12)
     np.testing.assert_array_equal(together.steps[-1].belief[0], np.full(3, 1 / 3))
@@ -80,7 +94,9 @@ def test_an_empty_view_is_taken_but_never_confident(threshold):
 
 def test_a_threshold_that_comes_down_does_not_come_down_by_empty_views():
     stopping = Stopping(0.9, 6, threshold_decay=2.0)
-    episodes = Episodes(SPHERE, Unidirectional(SPHERE), np.array([0]), stopping, np.random.default_rng(0))
+    episodes = Episodes(
+        SPHERE, Unidirectional(SPHERE), np.array([0]), stopping, np.random.default_rng(0)
+    )
     logits = np.array([[1.5, 0.0]])
     assert softmax(logits[0]).max() > stopping.threshold_at(2)
     for seen in (True, False, False, False):
@@ -106,7 +122,8 @@ def test_every_kind_of_policy_goes_on_past_an_empty_view(name):
     result = Session(system.models, system.policy, SPHERE, 9, Stopping(1.0, 5)).run(Covered())
     assert len({view.index for view in result.views}) == 5
     np.testing.assert_array_equal(result.views[1].belief, np.full(10, 0.1))
-    np.testing.assert_allclose(result.views[2].belief, result.views[2].alone, atol=1e-6)  # the first that counts
+    # the first that counts
+    np.testing.assert_allclose(result.views[2].belief, result.views[2].alone, atol=1e-6)
     assert result.answer == "chair"
 
 
@@ -123,7 +140,12 @@ def test_nothing_seen_is_no_answer(tiny):
         session.update(view_of(np.zeros((32, 32)), session.pose))
     result = session.result
     assert len(result.views) == 3
-    assert (result.answer, result.confidence, result.confident, result.seen) == (None, 0.0, False, False)
+    assert (result.answer, result.confidence, result.confident, result.seen) == (
+        None,
+        0.0,
+        False,
+        False,
+    )
     drawn = result.plot(title="air")
     assert any("nothing is seen" in text.get_text() for text in drawn.findobj(Text))
 
@@ -133,14 +155,20 @@ def test_nothing_seen_is_no_answer(tiny):
 
 @pytest.mark.parametrize("gap", [20, 300])
 def test_two_boxes_far_apart_are_nothing(gap):
-    """Most of their bounding sphere is empty; the networks would name what they see of it a table, confidently."""
+    """Most of their bounding sphere is empty; the networks would name what they see of it a
+    table, confidently.
+    """
     found = nextview.recognise(meshed(*(box((1, 1, 1), (x, 0, 0)) for x in (0, gap + 1))), start=9)
     assert (found.answer, found.confident) == (None, False)
 
 
 def test_predictions_and_cameras_have_one_idea_of_nothing(tmp_path):
     """Four balls far apart fill enough of the picture together, but no one of them does."""
-    balls = [trimesh.creation.icosphere(2, 0.09).apply_translation((x, y, 0)) for x in (-1, 1) for y in (-1, 1)]
+    balls = [
+        trimesh.creation.icosphere(2, 0.09).apply_translation((x, y, 0))
+        for x in (-1, 1)
+        for y in (-1, 1)
+    ]
     file = tmp_path / "meshes/ball/test/balls.off"
     file.parent.mkdir(parents=True)
     trimesh.util.concatenate(balls).export(file)
@@ -159,7 +187,9 @@ def test_predictions_and_cameras_have_one_idea_of_nothing(tmp_path):
 @pytest.mark.parametrize("json_too", [[], ["--json"]])
 def test_the_command_has_no_answer_about_next_to_nothing(tmp_path, capsys, json_too):
     path = tmp_path / "specks.off"
-    specks = [trimesh.creation.box((1e-4, 1e-4, 1e-4)).apply_translation((x, x, x)) for x in (-1, 1)]
+    specks = [
+        trimesh.creation.box((1e-4, 1e-4, 1e-4)).apply_translation((x, x, x)) for x in (-1, 1)
+    ]
     trimesh.util.concatenate(specks).export(path)
     said = refused(capsys, "recognise", path, "--threshold", "0", *json_too)
     assert "specks.off: there is no answer" in said

@@ -57,7 +57,13 @@ def test_a_view_shows_something_from_so_many_pixels_on(size):
 
 def test_specks_far_apart_show_nothing_until_they_are_many_or_touch():
     """Squares of 8 x 8 pixels in an image of 112: below LEAST_SHARE each."""
-    for squares, apart, seen in [(1, 9, False), (4, 9, False), (10, 9, True), (2, 8, True), (4, 8, True)]:
+    for squares, apart, seen in [
+        (1, 9, False),
+        (4, 9, False),
+        (10, 9, True),
+        (2, 8, True),
+        (4, 8, True),
+    ]:
         depth = np.zeros((112, 112), np.float32)
         for k in range(squares):
             row, column = divmod(apart * k, 108)
@@ -89,7 +95,10 @@ BAD = {
     "image from 0 to 1": ({"image": VIEW.image / 255}, "not float64"),
     "no size": ({"radius": 0.0}, "radius is a positive number"),
     "millimetres": ({"depth": VIEW.depth * 450}, "looks like millimetres"),
-    "whole millimetres": ({"depth": np.rint(VIEW.depth * 450).astype(np.uint16)}, "looks like millimetres"),
+    "whole millimetres": (
+        {"depth": np.rint(VIEW.depth * 450).astype(np.uint16)},
+        "looks like millimetres",
+    ),
     "millimetres with a few pixels of noise": ({"depth": NOISY}, "looks like millimetres"),
 }
 
@@ -130,6 +139,11 @@ def test_what_is_written_into_the_callers_arrays_later_changes_no_observation():
     seen = Observation(depth, pose, intrinsics, image=image)
     for array in (depth, pose, intrinsics, image):
         array[:] = 1
-    assert (seen.depth[0, 0], seen.pose[0, 1], seen.intrinsics[0, 1], seen.image[0, 0]) == (3, 0, 0, 7)
+    assert (seen.depth[0, 0], seen.pose[0, 1], seen.intrinsics[0, 1], seen.image[0, 0]) == (
+        3,
+        0,
+        0,
+        7,
+    )
     with pytest.raises(ValueError, match="read-only"):
         seen.depth[0] = 0

@@ -10,7 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
-from nextview.sensing.expected_visibility import FREE, OBJECT, OCCLUDER, UNSEEN, Occupancy, VoxelGrid
+from nextview.sensing.expected_visibility import (
+    FREE,
+    OBJECT,
+    OCCLUDER,
+    UNSEEN,
+    Occupancy,
+    VoxelGrid,
+)
 
 GRID = VoxelGrid(64)
 BALL = GRID.within(1.0)
@@ -54,7 +61,9 @@ def test_a_ball_leaves_unseen_what_lies_behind_its_face():
     middles = GRID.middles[:, BALL.ravel()].T.astype(float)
     hidden, slack = hidden_by_ball(middles, EYE, radius), GRID.pitch * np.sqrt(3) / 2
     # Exact but for voxels that the surface, or the border of the shadow, passes through.
-    near = hidden_by_ball(middles, EYE, radius + slack) & ~hidden_by_ball(middles, EYE, radius - slack)
+    near = hidden_by_ball(middles, EYE, radius + slack) & ~hidden_by_ball(
+        middles, EYE, radius - slack
+    )
     near |= np.abs(np.linalg.norm(middles, axis=1) - radius) < slack
     assert near.mean() < 0.15
     np.testing.assert_array_equal(cells[~near] == UNSEEN, hidden[~near])
@@ -69,7 +78,8 @@ def test_occupied_are_the_voxels_that_the_visible_cap_passes_through():
     assert np.abs(distance - radius)[occupied].max() <= GRID.pitch * np.sqrt(3) / 2 + 1e-6
     rim = radius**2 / 3  # the tangents from the eye touch the ball there
     assert x[occupied].min() > rim - GRID.pitch
-    # Where the surface passes the very middle of a voxel and is not seen at too low an angle, that voxel is found.
+    # Where the surface passes the very middle of a voxel and is not seen at too low an angle, that
+    # voxel is found.
     through = (np.abs(distance - radius) < 0.2 * GRID.pitch) & (x > rim + 0.2)
     assert through.sum() > 100
     assert occupied[through].all()
@@ -94,7 +104,9 @@ def test_object_and_occluder_are_kept_apart():
 @given(st.lists(st.integers(0, 39), min_size=2, max_size=4), st.permutations(range(4)))
 def test_more_views_never_make_seen_space_unseen_and_their_order_counts_for_nothing(views, order):
     small = pinhole(32, 3.0)
-    frames = [(ball_depth(SPHERE.poses[v], small, 32, 0.5, (0.2, 0, 0.1)), SPHERE.poses[v]) for v in views]
+    frames = [
+        (ball_depth(SPHERE.poses[v], small, 32, 0.5, (0.2, 0, 0.1)), SPHERE.poses[v]) for v in views
+    ]
 
     def seen(frames):
         found = [Occupancy.unseen(SMALL)]
@@ -113,9 +125,16 @@ def test_more_views_never_make_seen_space_unseen_and_their_order_counts_for_noth
 
 
 @settings(deadline=None, max_examples=20)
-@given(st.integers(0, 39), st.integers(0, 3), st.tuples(*[st.floats(-5, 5)] * 3), st.sampled_from([0.25, 1.0, 10.0]))
+@given(
+    st.integers(0, 39),
+    st.integers(0, 3),
+    st.tuples(*[st.floats(-5, 5)] * 3),
+    st.sampled_from([0.25, 1.0, 10.0]),
+)
 def test_nothing_changes_if_all_moves_or_is_measured_in_another_unit(view, quarters, shift, unit):
-    """The scene, the cameras and the grid turned by quarters about z, moved, and in another unit."""
+    """The scene, the cameras and the grid turned by quarters about z, moved, and in another
+    unit.
+    """
     pose, centre = SPHERE.poses[view], np.array([0.15, -0.2, 0.1])
     depth = ball_depth(pose, K, 224, 0.5, centre)
     here = Occupancy.unseen(SMALL).seen(depth, pose, K)
@@ -130,4 +149,5 @@ def test_nothing_changes_if_all_moves_or_is_measured_in_another_unit(view, quart
     grid = VoxelGrid(SMALL.n, unit, tuple(shift))
     there = Occupancy.unseen(grid).seen(depth * unit, moved(pose), K)
     same = np.rot90(here.cells, quarters, (0, 1)) == there.cells
-    assert same.mean() > 0.999  # a voxel whose middle lies on the edge of a pixel may fall to either side
+    # a voxel whose middle lies on the edge of a pixel may fall to either side
+    assert same.mean() > 0.999

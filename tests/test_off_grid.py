@@ -20,12 +20,21 @@ from nextview.session.episode import VISITED, Episodes
 SPHERE = ViewSphere.named("40")
 CLASSES = 10
 LAYOUTS = ("40", "12", "rings:0,30,60x12", "fibonacci:60", "fibonacci:7")
-BUNDLED = ("gain", "visible-gain", "fixed-sequence", "fixed-ring", "class-table", "class-table-local")
+BUNDLED = (
+    "gain",
+    "visible-gain",
+    "fixed-sequence",
+    "fixed-ring",
+    "class-table",
+    "class-table-local",
+)
 NAMES = (*POLICIES, "lem", "lem-peak", "lcm", "lcm-peak", "lem-sphere-peak", *BUNDLED)
 
 
 def evidence(rng, b=1) -> Evidence:
-    maps = {name: rng.random((b, 5, 3)) for name in ("lem", "lcm")} | {"lem-sphere": rng.random((b, 5, 8))}
+    maps = {name: rng.random((b, 5, 3)) for name in ("lem", "lcm")} | {
+        "lem-sphere": rng.random((b, 5, 8))
+    }
     bins = np.log(rng.dirichlet(np.ones(8), (b, CLASSES)))
     return Evidence(rng.normal(size=(b, CLASSES)), maps, bins)
 
@@ -43,20 +52,30 @@ def test_a_fibonacci_hemisphere_is_even():
     assert (directions[:, 2] > 0).all()
     angles = np.degrees(np.arccos(np.clip(directions @ directions.T, -1, 1)))
     np.fill_diagonal(angles, 180)
-    even = np.degrees(np.sqrt(2 * np.pi / 200))  # side of a square of each one's share of the half sphere
+    # side of a square of each one's share of the half sphere
+    even = np.degrees(np.sqrt(2 * np.pi / 200))
     assert angles.min(1).min() > 0.75 * even
     assert angles.min(1).max() < 1.1 * even
     heights = np.sort(directions[:, 2])  # equal areas: heights are uniform (Archimedes)
     np.testing.assert_allclose(heights, (np.arange(200) + 0.5) / 200)
 
 
-@given(st.lists(st.tuples(st.floats(-90, 90), st.floats(0, 360)), min_size=1, max_size=12), st.floats(0.5, 9))
+@given(
+    st.lists(st.tuples(st.floats(-90, 90), st.floats(0, 360)), min_size=1, max_size=12),
+    st.floats(0.5, 9),
+)
 def test_a_list_of_directions_or_poses_gives_its_views(angles, distance):
     elevation, azimuth = np.radians(np.array(angles)).T
     poses = look_at_origin(elevation, azimuth, distance)
-    for layout in (viewpoints_of(poses), viewpoints_of(poses[:, :3, 3]), Directions(poses[:, :3, 3])):
+    for layout in (
+        viewpoints_of(poses),
+        viewpoints_of(poses[:, :3, 3]),
+        Directions(poses[:, :3, 3]),
+    ):
         assert len(layout) == len(angles)
-        np.testing.assert_allclose(layout.poses[:, :3, 3], 3 * poses[:, :3, 3] / distance, atol=1e-9)
+        np.testing.assert_allclose(
+            layout.poses[:, :3, 3], 3 * poses[:, :3, 3] / distance, atol=1e-9
+        )
         np.testing.assert_allclose(layout.poses[:, :3, 2], poses[:, :3, 2], atol=1e-9)
         cosines = np.einsum("id,jd->ij", layout.directions, layout.directions)
         np.testing.assert_allclose(np.cos(layout.arc), cosines, atol=1e-9)
@@ -64,8 +83,12 @@ def test_a_list_of_directions_or_poses_gives_its_views(angles, distance):
 
 def test_travel_of_directions_is_counted_in_the_cells_of_the_40_views():
     np.testing.assert_allclose(Directions(SPHERE.directions).travel, SPHERE.travel, atol=1e-9)
-    assert SPHERE.travel_between(direction(27, 350), direction(36, 10)) == pytest.approx(np.hypot(0.5, 20 / 45))
-    assert viewpoints_of("12").travel_between(direction(45, 5), direction(45, 350)) == pytest.approx(0.5)
+    assert SPHERE.travel_between(direction(27, 350), direction(36, 10)) == pytest.approx(
+        np.hypot(0.5, 20 / 45)
+    )
+    assert viewpoints_of("12").travel_between(
+        direction(45, 5), direction(45, 350)
+    ) == pytest.approx(0.5)
 
 
 # Policies off their grid
@@ -78,18 +101,33 @@ def state_at(sphere, place, rng, visited=(), reachable=None) -> EpisodeState:
     e, bins = evidence(rng), rng.dirichlet(np.ones(8), (1, CLASSES))
     belief = rng.dirichlet(np.ones(CLASSES))[None]
     return EpisodeState(
-        np.array([view]), seen, belief, e, 1, np.zeros(1, int), bins, reachable, None, place[None, None],
+        np.array([view]),
+        seen,
+        belief,
+        e,
+        1,
+        np.zeros(1, int),
+        bins,
+        reachable,
+        None,
+        place[None, None],
         visibility=rng.random(seen.shape),
-    )  # fmt: skip
+    )
 
 
-@pytest.mark.parametrize("name", ["gain", "visible-gain", "lem-peak", "class-table", "class-table-local"])
+@pytest.mark.parametrize(
+    "name", ["gain", "visible-gain", "lem-peak", "class-table", "class-table-local"]
+)
 def test_on_views_that_happen_to_be_the_grid_the_interpolation_is_the_policy(name):
-    """The 40 views as a mere list of directions: the same decisions and values as on the grid itself."""
+    """The 40 views as a mere list of directions: the same decisions and values as on the grid
+    itself.
+    """
     policy, rng = make_policy(name, SPHERE), np.random.default_rng(0)
     off = OffGrid(policy, SPHERE, Directions(SPHERE.directions))
     for k in range(40):
-        state = state_at(SPHERE, SPHERE.directions[k], rng, rng.integers(0, 40, 6), rng.random((1, 40)) < 0.7)
+        state = state_at(
+            SPHERE, SPHERE.directions[k], rng, rng.integers(0, 40, 6), rng.random((1, 40)) < 0.7
+        )
         assert off.next_views(state, rng) == policy.next_views(state, rng)
         if name in ("gain", "visible-gain", "lem-peak"):
             np.testing.assert_allclose(off.view_values(state), policy.view_values(state), atol=1e-9)
@@ -113,7 +151,9 @@ def test_values_lie_between_those_of_the_turned_grid(elevation, azimuth, layout,
             raise AssertionError
 
     sphere, rng = Directions(viewpoints_of(layout).directions), np.random.default_rng(seed)
-    state = state_at(sphere, direction(elevation, azimuth), rng, reachable=rng.random((1, len(sphere))) < 0.5)
+    state = state_at(
+        sphere, direction(elevation, azimuth), rng, reachable=rng.random((1, len(sphere))) < 0.5
+    )
     travel = rng.random((1, len(sphere)))
     state = replace(state, travel=travel)
     if not state.free.any():
@@ -126,7 +166,10 @@ def test_values_lie_between_those_of_the_turned_grid(elevation, azimuth, layout,
         column = (round_ - azimuth) % 360 / 45
         r, c = min(int(row), 3), min(int(column), 7)
         a, b = row - r, column - c
-        corners = grid[r, c] * (1 - b) + grid[r, c + 1] * b, grid[r + 1, c] * (1 - b) + grid[r + 1, c + 1] * b
+        corners = (
+            grid[r, c] * (1 - b) + grid[r, c + 1] * b,
+            grid[r + 1, c] * (1 - b) + grid[r + 1, c + 1] * b,
+        )
         expected.append(corners[0] * (1 - a) + corners[1] * a - 0.5 * travel[0, view])
     expected = np.where(state.free[0], expected, -np.inf)
     chosen = OffGrid(Fixed(), SPHERE, sphere).next_views(state, rng)[0]
@@ -136,10 +179,15 @@ def test_values_lie_between_those_of_the_turned_grid(elevation, azimuth, layout,
 
 @settings(deadline=None, max_examples=150)
 @given(st.data(), st.sampled_from(LAYOUTS), st.sampled_from(NAMES), st.integers(0, 10**6))
-def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(data, layout, name, seed):
+def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(
+    data, layout, name, seed
+):
     sphere = viewpoints_of(layout)
     policy = make_policy_anywhere(name, sphere)
-    policy = anywhere(replace(policy, sphere=SPHERE) if isinstance(policy, MapPeak | SpherePeak) else policy, sphere)
+    policy = anywhere(
+        replace(policy, sphere=SPHERE) if isinstance(policy, MapPeak | SpherePeak) else policy,
+        sphere,
+    )
     share = data.draw(st.sampled_from([0.1, 0.5, 1.0]))
     jitter = data.draw(st.sampled_from([0.0, 0.02, 0.3]))
     paths = []
@@ -153,7 +201,9 @@ def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(da
             place = sphere.directions[episodes.current] + jitter * rng.normal(size=(1, 3))
             place /= np.linalg.norm(place)
             places.append(place[0])
-            step = episodes.update(evidence(rng), place, partial(replace, reachable=reachable[None]))
+            step = episodes.update(
+                evidence(rng), place, partial(replace, reachable=reachable[None])
+            )
             assert step.belief.sum() == pytest.approx(1)
             to = int(step.next_views[0])
             path.append(to)
@@ -172,5 +222,7 @@ def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(da
 
 @pytest.mark.parametrize("layout", ["fibonacci:99999", "rings:0,10,20,30x2000", np.ones((5001, 3))])
 def test_more_views_than_their_distances_fit_into_memory_are_refused(layout):
-    with pytest.raises(UsageError, match="the number of viewpoints is a whole number from 1 to 5000"):
+    with pytest.raises(
+        UsageError, match="the number of viewpoints is a whole number from 1 to 5000"
+    ):
         viewpoints_of(layout)

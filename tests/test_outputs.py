@@ -1,4 +1,5 @@
-"""Every command that writes: what exists is refused and unchanged, --overwrite replaces it, nothing is left beside it.
+"""Every command that writes: what exists is refused and unchanged, --overwrite replaces it, nothing
+is left beside it.
 
 Commands that write into what they are given (measure, fit into a card) and download are not here.
 """
@@ -25,12 +26,28 @@ WRITES = {
     "recognise --record": (f"recognise {SAMPLE} --max-views 1 --record", "e.rrd"),
     "demo": ("demo --figure", "demo.svg"),
     "capture": (f"capture {SAMPLE}", "folder", "--radius 0.4 --viewpoints 12"),
-    "scenes": ("scenes {furniture}", "folder", "--scenes 1 --levels light --split test --workers 0"),
-    "render": ("render {furniture}", "v.zarr", "--viewpoints 12 --size 16 --split test --workers 0"),
-    "predict": ("predict {views}", "p.npz", "--models {models} --maps lem --split test --workers 0"),
+    "scenes": (
+        "scenes {furniture}",
+        "folder",
+        "--scenes 1 --levels light --split test --workers 0",
+    ),
+    "render": (
+        "render {furniture}",
+        "v.zarr",
+        "--viewpoints 12 --size 16 --split test --workers 0",
+    ),
+    "predict": (
+        "predict {views}",
+        "p.npz",
+        "--models {models} --maps lem --split test --workers 0",
+    ),
     "learn": (f"learn {Path(SAMPLE).parent}", "folder", "--upright --workers 0"),
     "evaluate": ("evaluate {predictions}", "folder", "--split test --samples 10"),
-    "benchmark": ("benchmark {predictions}", "folder", "--split test --runs 1 --samples 10 --policies random"),
+    "benchmark": (
+        "benchmark {predictions}",
+        "folder",
+        "--split test --runs 1 --samples 10 --policies random",
+    ),
     "report": ("report {results}/out", "r.html"),
     "train gain": ("train gain {training}", "g.json", f"{GAIN} --folds 2 --epochs 1"),
     "train recogniser": ("train recogniser {views}", "folder", SMALL),
@@ -57,7 +74,16 @@ def contents(folder):
 
 
 def test_no_command_is_forgotten():
-    others = {"measure", "check", "completion", "explore", "list", "download", "export recogniser", "export map"}
+    others = {
+        "measure",
+        "check",
+        "completion",
+        "explore",
+        "list",
+        "download",
+        "export recogniser",
+        "export map",
+    }
     assert {name.partition(" --")[0] for name in WRITES} == COMMANDS.keys() - FITS - others
 
 
@@ -74,7 +100,9 @@ def test_the_demo_draws_over_its_own_picture_and_no_other(tmp_path, monkeypatch,
 
 
 @pytest.mark.parametrize("name", WRITES)
-def test_what_exists_is_refused_and_overwritten_on_demand_only(name, made, tmp_path, monkeypatch, capsys):
+def test_what_exists_is_refused_and_overwritten_on_demand_only(
+    name, made, tmp_path, monkeypatch, capsys
+):
     if name.startswith("train"):
         pytest.importorskip("torch")
     monkeypatch.chdir(tmp_path)
@@ -84,7 +112,8 @@ def test_what_exists_is_refused_and_overwritten_on_demand_only(name, made, tmp_p
     written = contents(tmp_path)
     assert written
     tops = {path.relative_to(tmp_path).parts[0] for path in tmp_path.iterdir()}
-    assert all(top.startswith(Path(out).stem) for top in tops), tops  # nothing else is left, no lock either
+    # nothing else is left, no lock either
+    assert all(top.startswith(Path(out).stem) for top in tops), tops
 
     folder = (tmp_path / out).is_dir()
     mine = dict.fromkeys(written, b"mine") if not folder else {tmp_path / out / "mine.txt": b"mine"}
@@ -114,9 +143,14 @@ def test_what_exists_is_refused_and_overwritten_on_demand_only(name, made, tmp_p
 # The home folder
 
 HOMELY = {
-    "recognise": "from nextview.cli.main import main; main(['recognise', SAMPLE, '--max-views', '1'])",
+    "recognise": (
+        "from nextview.cli.main import main; main(['recognise', SAMPLE, '--max-views', '1'])"
+    ),
     "from Python": "import nextview; nextview.recognise(SAMPLE)",
-    "learn": "from nextview.cli.main import main; main(['learn', FOLDER, 'mine', '--upright', '--workers', '0'])",
+    "learn": (
+        "from nextview.cli.main import main; main(['learn', FOLDER, 'mine', '--upright',"
+        " '--workers', '0'])"
+    ),
     "a figure": "import nextview; nextview.recognise(SAMPLE).plot('e.png')",
 }
 
@@ -127,18 +161,27 @@ def test_a_run_writes_nothing_in_the_home_folder(job, tmp_path):
     home.mkdir()
     code = f"SAMPLE, FOLDER = {SAMPLE!r}, {str(Path(SAMPLE).parent)!r}\n{HOMELY[job]}"
     hidden = ("ORT_DISABLE_TELEMETRY", "MPLCONFIGDIR", "XDG_CACHE_HOME", "XDG_CONFIG_HOME")
-    environment = {name: value for name, value in os.environ.items() if name not in hidden} | {"HOME": str(home)}
+    environment = {name: value for name, value in os.environ.items() if name not in hidden} | {
+        "HOME": str(home)
+    }
     done = run_python(code, env=environment, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     written = {path.relative_to(home).parts[:2] for path in home.rglob("*") if path.is_file()}
-    assert written <= ({(".cache", "matplotlib")} if job in ("a figure", "learn") else set())  # its list of fonts
+    # its list of fonts
+    assert written <= ({(".cache", "matplotlib")} if job in ("a figure", "learn") else set())
 
 
 def test_who_wants_telemetry_keeps_it():
     code = "import os, nextview; print(os.environ['ORT_DISABLE_TELEMETRY'])"
-    environment = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
+    environment = {
+        name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"
+    }
     assert run_python(code, env=environment).stdout.strip() == "1"
     tops = ("src", "benchmarks", "research", "examples", "docs", "workflow")
     sources = [path for top in tops for path in (ROOT / top).rglob("*.py")]
-    with_it = {path.name for path in sources if re.search(r"^\s*(import|from) onnxruntime", path.read_text(), re.M)}
+    with_it = {
+        path.name
+        for path in sources
+        if re.search(r"^\s*(import|from) onnxruntime", path.read_text(), re.M)
+    }
     assert with_it == {"runtime.py"}  # all others take it from there

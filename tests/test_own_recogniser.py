@@ -1,4 +1,6 @@
-"""A recogniser of a user's own: by views or by all views together, and what is refused at the door."""
+"""A recogniser of a user's own: by views or by all views together, and what is refused at the
+door.
+"""
 
 from types import SimpleNamespace
 
@@ -38,12 +40,16 @@ class NearestPoints:
 
 
 def turn(angle: float) -> np.ndarray:
-    return np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    return np.array(
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+    )
 
 
 def sample_points(name: str) -> np.ndarray:
     camera = nextview.SimulatedCamera(sample_mesh(name), 96)
-    return np.concatenate([camera.observe(pose).points for pose in nextview.ViewSphere.named("12").poses])
+    return np.concatenate(
+        [camera.observe(pose).points for pose in nextview.ViewSphere.named("12").poses]
+    )
 
 
 class Filled:
@@ -108,7 +114,10 @@ def believes(value):
     ("given", "sentence"),
     [
         (Fails(), "recogniser Fails raised ZeroDivisionError: .*test_own_recogniser.py"),
-        (says(np.zeros((1, 3))), r"gives logits of \(1, 2\) numbers, not float64 of the shape \(1, 3\)"),
+        (
+            says(np.zeros((1, 3))),
+            r"gives logits of \(1, 2\) numbers, not float64 of the shape \(1, 3\)",
+        ),
         (says(np.zeros(2)), r"of the shape \(2,\)"),
         (says([["a", "b"]]), r"gives logits of \(1, 2\) numbers"),
         (says([[1], [1, 2]]), r"gives logits of \(1, 2\) numbers"),
@@ -120,12 +129,20 @@ def believes(value):
         (believes([1.0]), r"gives a belief of \(2,\) numbers"),
         (believes(None), r"gives a belief of \(2,\) numbers"),
         (believes(JointBelief(np.array([0.5, 0.5]), p_value=2.0)), "a p-value is 0 to 1"),
-        (believes(JointBelief(np.array([0.5, 0.5]), ("here",))), "a pose is a PoseCandidate, not a str"),
         (
-            believes(JointBelief(np.array([0.5, 0.5]), (PoseCandidate("a", 0, 2 * np.eye(4), 1.0),))),
+            believes(JointBelief(np.array([0.5, 0.5]), ("here",))),
+            "a pose is a PoseCandidate, not a str",
+        ),
+        (
+            believes(
+                JointBelief(np.array([0.5, 0.5]), (PoseCandidate("a", 0, 2 * np.eye(4), 1.0),))
+            ),
             "not a rigid motion",
         ),
-        (believes(JointBelief(np.array([0.5, 0.5]), (PoseCandidate("a", 5, np.eye(4), 1.0),))), "of class 5"),
+        (
+            believes(JointBelief(np.array([0.5, 0.5]), (PoseCandidate("a", 5, np.eye(4), 1.0),))),
+            "of class 5",
+        ),
     ],
 )
 def test_what_it_says_is_checked(given, sentence):
@@ -142,12 +159,24 @@ def test_what_it_says_is_checked(given, sentence):
     [
         (object(), ModelError, "can be called with observations, or has a method belief"),
         (SimpleNamespace(belief=print), ModelError, "has no classes .AttributeError"),
-        (SimpleNamespace(belief=print, classes="chair"), ModelError, "are a tuple of names, not 'chair'"),
+        (
+            SimpleNamespace(belief=print, classes="chair"),
+            ModelError,
+            "are a tuple of names, not 'chair'",
+        ),
         (SimpleNamespace(belief=print, classes=()), ModelError, "are a tuple of names"),
         (SimpleNamespace(belief=print, classes=("a", 2)), ModelError, "are a tuple of names"),
         (SimpleNamespace(belief=print, classes=("a", "a")), ModelError, "have the same name"),
-        (SimpleNamespace(belief=print, classes=("a",), calibration=2), ModelError, "calibration of recogniser"),
-        (SimpleNamespace(belief=print, classes=("a",), azimuth_bins=-1), UsageError, "number of azimuth bins"),
+        (
+            SimpleNamespace(belief=print, classes=("a",), calibration=2),
+            ModelError,
+            "calibration of recogniser",
+        ),
+        (
+            SimpleNamespace(belief=print, classes=("a",), azimuth_bins=-1),
+            UsageError,
+            "number of azimuth bins",
+        ),
         (Filled, ModelError, "not the class Filled: call it first"),
         ("here", UsageError, "is named MODULE:NAME"),
         ("nowhere_at_all:Thing", UsageError, "cannot be made .ModuleNotFoundError"),

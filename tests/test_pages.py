@@ -64,7 +64,9 @@ def test_a_grasp_point_arrives_where_the_handle_is(monkeypatch, capsys):
 
 
 def test_tests_that_a_page_names_are_there():
-    tests = [path for folder in ("tests", "research/tests") for path in (ROOT / folder).glob("test_*.py")]
+    tests = [
+        path for folder in ("tests", "research/tests") for path in (ROOT / folder).glob("test_*.py")
+    ]
     names = {name for path in tests for name in re.findall(r"def (test_\w+)", path.read_text())}
     for page in (ROOT / "docs").glob("*.md"):
         text = page.read_text()
@@ -79,8 +81,12 @@ def test_tests_that_a_page_names_are_there():
 
 
 def test_each_page_has_commands_and_each_reason_not_to_run_one_holds():
-    steps = [step for page in documented_commands.PAGES for step in documented_commands.steps_of(page)]
-    assert {"README.md", "docs/arm.md", "docs/training.md", "research/README.md"} <= {step.page for step in steps}
+    steps = [
+        step for page in documented_commands.PAGES for step in documented_commands.steps_of(page)
+    ]
+    assert {"README.md", "docs/arm.md", "docs/training.md", "research/README.md"} <= {
+        step.page for step in steps
+    }
     for pattern in documented_commands.NOT_RUN:
         assert any(re.search(pattern, step.text) for step in steps), pattern
     run = [step for step in steps if step.why_not is None]
@@ -93,7 +99,8 @@ def test_each_page_has_commands_and_each_reason_not_to_run_one_holds():
 def test_a_command_that_fails_is_told(tmp_path, monkeypatch, capsys):
     page = tmp_path / "page.md"
     page.write_text(
-        "```sh\nnextview list models   # fine\nnextview list nonsense\n```\n\n```python\nprint(1 / 0)\n```\n"
+        "```sh\nnextview list models   # fine\nnextview list nonsense\n```\n\n```python\nprint(1 /"
+        " 0)\n```\n"
     )
     monkeypatch.setattr(documented_commands, "ROOT", tmp_path)
     environments = documented_commands.Environments(tmp_path / "environments")
@@ -127,7 +134,9 @@ def test_a_command_has_nothing_but_what_it_needs(tmp_path):
     status, said, _ = environments.run("nextview --version && python -c 'import pandas'", tmp_path)
     assert said.startswith("nextview 0")
     assert "No module named 'pandas'" in said
-    status, said, _ = environments.run("python -c 'import pandas'", tmp_path, frozenset(["nextview[benchmark]"]))
+    status, said, _ = environments.run(
+        "python -c 'import pandas'", tmp_path, frozenset(["nextview[benchmark]"])
+    )
     assert (status, said) == (0, "")
 
 
@@ -154,7 +163,9 @@ def test_its_session_runs(capsys):
     assert "chair (belief" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("line", re.findall(r"^nextview recognise samples/.*?(?=\s+#|$)", README, re.M))
+@pytest.mark.parametrize(
+    "line", re.findall(r"^nextview recognise samples/.*?(?=\s+#|$)", README, re.M)
+)
 def test_its_commands_on_the_samples_run(line, there, capsys):
     if "--models" in line:
         pytest.skip("with models that the commands before it make")
@@ -176,7 +187,9 @@ def test_its_options_are_there(line, capsys):
 
 SMALL = {
     "render": "--workers 1",
-    "train recogniser": "--size 32 --epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4",
+    "train recogniser": (
+        "--size 32 --epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4"
+    ),
     "predict": "--workers 1",
     "fit calibration": "--delta 0.2",
     "train gain": "--folds 2 --epochs 1 --episodes 1 --networks-per-fold 1",
@@ -193,10 +206,19 @@ def test_making_it_ones_own_works_from_the_first_line_to_the_last(furniture, the
     lines = [line.partition("#")[0].strip() for line in part.splitlines()]
     assert lines[0] == "nextview download modelnet10 data"  # into the folder that is there already
     for line in lines[1:]:
-        small = next((options for command, options in SMALL.items() if line.startswith(f"nextview {command} ")), "")
+        small = next(
+            (
+                options
+                for command, options in SMALL.items()
+                if line.startswith(f"nextview {command} ")
+            ),
+            "",
+        )
         capsys.readouterr()
         main([*line.split()[1:], *small.split()])
         if line.startswith("nextview recognise "):
             assert "It is a" in capsys.readouterr().out
-    assert (there / "benchmark/leaderboard.md").exists() or (there / "benchmark/summary.csv").exists()
+    assert (there / "benchmark/leaderboard.md").exists() or (
+        there / "benchmark/summary.csv"
+    ).exists()
     assert list(there.rglob("*.html"))

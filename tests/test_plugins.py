@@ -1,4 +1,6 @@
-"""Code of users' own: what it raises is one sentence that says where, and its traceback is to be had."""
+"""Code of users' own: what it raises is one sentence that says where, and its traceback is to be
+had.
+"""
 
 import numpy as np
 import pytest
@@ -51,7 +53,10 @@ def asked(name: str) -> None:
     [
         ("Lines", r"raised ValueError: first second \\x1b\[31mx+\.\.\., at code_of_mine.py:8"),
         ("Leaves", "raised SystemExit: bye, at code_of_mine.py:8"),
-        ("Values", r"asked what it values views at, raised ZeroDivisionError: .*, at code_of_mine.py:20"),
+        (
+            "Values",
+            r"asked what it values views at, raised ZeroDivisionError: .*, at code_of_mine.py:20",
+        ),
         ("Flat", r"values views by \(B, V\) numbers, here \(1, 40\)"),
     ],
 )
@@ -81,7 +86,10 @@ def test_ctrl_c_is_not_taken_for_an_error_of_a_plugin():
 def test_a_callable_that_says_nothing_of_a_pose_is_refused_and_the_session_goes_on(said):
     camera = nextview.SimulatedCamera(sample_mesh("chair"), 112)
     session = nextview.load(policy="spread", threads=1, threshold=1.0).session(start=3)
-    for name, what in (("reachable", "whether a view can be reached"), ("travel_cost", "a travel cost")):
+    for name, what in (
+        ("reachable", "whether a view can be reached"),
+        ("travel_cost", "a travel cost"),
+    ):
         setattr(session, name, lambda *poses: said)
         with pytest.raises(UsageError, match=f"^{what} is "):
             session.update(camera.observe(session.pose))

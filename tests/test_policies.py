@@ -14,7 +14,14 @@ from skimage.feature import peak_local_max
 from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState, Evidence
-from nextview.policies.baselines import Furthest, Random, RandomAll, Spread, Unidirectional, Visibility
+from nextview.policies.baselines import (
+    Furthest,
+    Random,
+    RandomAll,
+    Spread,
+    Unidirectional,
+    Visibility,
+)
 from nextview.policies.learned_tables import ClassTable, FixedRing, FixedSequence
 from nextview.policies.maps import MapPeak, SpherePeak, local_peaks
 from nextview.policies.oracle import OracleGain, OracleValley
@@ -40,13 +47,19 @@ def state_of(sphere, current, visited=None, belief=None, **local_maps) -> Episod
     for row, views in enumerate(visited or []):
         seen[row, list(views)] = True
     belief = np.full((len(current), 2), 0.5) if belief is None else np.asarray(belief)
-    evidence = Evidence(np.zeros((len(current), 2)), {k: np.asarray(m, float) for k, m in local_maps.items()})
-    return EpisodeState(current, seen, belief, evidence, int(seen.sum(1).max()), np.arange(len(current)))
+    evidence = Evidence(
+        np.zeros((len(current), 2)), {k: np.asarray(m, float) for k, m in local_maps.items()}
+    )
+    return EpisodeState(
+        current, seen, belief, evidence, int(seen.sum(1).max()), np.arange(len(current))
+    )
 
 
 def random_state(sphere, rng, episodes=50) -> EpisodeState:
     """Episodes under way, with maps whose values often tie."""
-    state = state_of(sphere, rng.integers(len(sphere), size=episodes), belief=rng.dirichlet([1, 1], episodes))
+    state = state_of(
+        sphere, rng.integers(len(sphere), size=episodes), belief=rng.dirichlet([1, 1], episodes)
+    )
     state.visited[:] |= rng.random(state.visited.shape) < rng.random((episodes, 1))
     cells = rng.integers(0, 4, (episodes, sphere.rings, 3)) / 4.0
     whole = rng.integers(0, 4, (episodes, sphere.rings, sphere.azimuths)) / 4.0
@@ -62,7 +75,8 @@ def test_local_peaks_are_those_of_scikit_image(seed, rows, columns):
     cells = np.random.default_rng(seed).random((rows, columns))
     expected = peak_local_max(cells, min_distance=1, threshold_abs=-1, exclude_border=False)
     found = np.argwhere(local_peaks(cells[None])[0])
-    # Of two diagonal or straight neighbours scikit-image keeps one; without ties no two peaks are neighbours.
+    # Of two diagonal or straight neighbours scikit-image keeps one; without ties no two peaks are
+    # neighbours.
     assert sorted(map(tuple, found)) == sorted(map(tuple, expected))
 
 
@@ -76,7 +90,15 @@ def policies(sphere, rng):
     yield OracleValley(sphere, labels, (1,), "lem")
     log_evidence = rng.normal(size=(50, len(sphere), 2 * 9))
     yield OracleGain(sphere, log_evidence, 2, labels, objects)
-    yield OracleGain(sphere, log_evidence, 2, labels, objects, "global", calibration=Calibration(bin_correlation=0.1))
+    yield OracleGain(
+        sphere,
+        log_evidence,
+        2,
+        labels,
+        objects,
+        "global",
+        calibration=Calibration(bin_correlation=0.1),
+    )
     for scope in ("global", "local"):
         yield FixedSequence(sphere, rng.integers(len(sphere), size=(sphere.rings, 4)), scope)
         yield ClassTable(sphere, rng.random((2, sphere.rings, len(sphere))), scope)
@@ -103,7 +125,9 @@ def test_no_row_depends_on_another(sphere, seed):
     rng = np.random.default_rng(seed)
     state = random_state(sphere, rng)
     for policy in policies(sphere, rng):
-        if isinstance(policy, (Random, RandomAll, Furthest, Spread, FixedSequence, FixedRing, Visibility)):
+        if isinstance(
+            policy, (Random, RandomAll, Furthest, Spread, FixedSequence, FixedRing, Visibility)
+        ):
             continue  # they draw, or may
         together = policy.next_views(state, rng)
         for row in range(0, 50, 7):
@@ -142,11 +166,15 @@ def test_unidirectional_walks_the_ring(sphere, data):
     start = data.draw(st.integers(0, len(sphere) - 1))
     state, walked = state_of(sphere, start), [start]
     for _ in range(sphere.azimuths - 1):
-        state = replace(state, current=Unidirectional(sphere).next_views(state, np.random.default_rng(0)))
+        state = replace(
+            state, current=Unidirectional(sphere).next_views(state, np.random.default_rng(0))
+        )
         state.visited[0, state.current] = True
         walked.append(int(state.current[0]))
     ring, first = divmod(start, sphere.azimuths)
-    assert walked == [ring * sphere.azimuths + (first + k) % sphere.azimuths for k in range(sphere.azimuths)]
+    assert walked == [
+        ring * sphere.azimuths + (first + k) % sphere.azimuths for k in range(sphere.azimuths)
+    ]
     if sphere.rings > 1:  # round: on to the ring next to it
         following = int(Unidirectional(sphere).next_views(state, np.random.default_rng(0))[0])
         assert sphere.ring[following] != ring
@@ -222,7 +250,9 @@ def test_map_peak_is_the_highest_free_peak_of_scikit_image(seed):
 
 def test_a_valley_is_chosen_by_the_believed_class():
     state = state_of(SPHERE, [11, 11], belief=[[0.9, 0.1], [0.2, 0.8]], lem=[HILLS, HILLS])
-    peak, valley = MapPeak(SPHERE, "lem", valley_classes=(1,)).next_views(state, np.random.default_rng(0))
+    peak, valley = MapPeak(SPHERE, "lem", valley_classes=(1,)).next_views(
+        state, np.random.default_rng(0)
+    )
     assert peak == 3
     assert HILLS[SPHERE.ring[valley]][[2, 3, 4].index(SPHERE.azimuth_index[valley])] == 0.1
     both = MapPeak(SPHERE, "lem", valley_classes=(0, 1)).next_views(state, np.random.default_rng(0))
@@ -233,14 +263,22 @@ def test_a_valley_is_chosen_by_the_believed_class():
 # By name
 
 
-@pytest.mark.parametrize(("name", "maps"), [("lem", ()), ("view_area", ["view_area"]), ("a:b", ["a:b"])])
+@pytest.mark.parametrize(
+    ("name", "maps"), [("lem", ()), ("view_area", ["view_area"]), ("a:b", ["a:b"])]
+)
 def test_every_map_has_policies_by_one_rule(name, maps):
     assert make_policy(name, SPHERE, [1], maps=maps) == MapPeak(SPHERE, name, (1,))
     assert make_policy(f"{name}-peak", SPHERE, [1], maps=maps) == MapPeak(SPHERE, name)
-    assert make_policy(f"{name}-sphere-peak", SPHERE, [1], maps=maps) == SpherePeak(SPHERE, f"{name}-sphere")
-    with pytest.raises(PolicyError, match=f"is called 'best'; there are random, .*{name}-sphere-peak, .*gain"):
+    assert make_policy(f"{name}-sphere-peak", SPHERE, [1], maps=maps) == SpherePeak(
+        SPHERE, f"{name}-sphere"
+    )
+    with pytest.raises(
+        PolicyError, match=f"is called 'best'; there are random, .*{name}-sphere-peak, .*gain"
+    ):
         make_policy("best", SPHERE, maps=maps)
-    with pytest.raises(PolicyError, match=rf"no policy is called|policy {name}-peak-peak cannot be made"):
+    with pytest.raises(
+        PolicyError, match=rf"no policy is called|policy {name}-peak-peak cannot be made"
+    ):
         make_policy(f"{name}-peak-peak", SPHERE, maps=maps)
 
 

@@ -1,4 +1,6 @@
-"""Polygons fall into triangles that cover them exactly: concave, bent, degenerate, and in every format."""
+"""Polygons fall into triangles that cover them exactly: concave, bent, degenerate, and in every
+format.
+"""
 
 from pathlib import Path
 
@@ -30,7 +32,18 @@ OUTLINES = {
     "a comb": [(x, 5 * (x % 2)) for x in range(20)] + [(19, 6), (0, 6)],
     "corners on its edges": [(0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2), (0, 1)],
     "corners twice": [p for p in BENCH for _ in range(2)],
-    "a frame with a slit": [(0, 0), (4, 0), (4, 4), (0, 4), (0, 0), (1, 1), (1, 3), (3, 3), (3, 1), (1, 1)],
+    "a frame with a slit": [
+        (0, 0),
+        (4, 0),
+        (4, 4),
+        (0, 4),
+        (0, 0),
+        (1, 1),
+        (1, 3),
+        (3, 3),
+        (3, 1),
+        (1, 1),
+    ],
 }
 
 
@@ -57,7 +70,8 @@ def test_the_triangles_cover_the_polygon_and_nothing_else(name, first):
     points = np.column_stack([outline, np.zeros(len(outline))]) @ turn.T + (100, -200, 300)
     faces = cut(points)
     found = areas(points, faces)
-    # All of them are wound as the polygon is, and none lies over another one: then the areas add up to the polygon's.
+    # All of them are wound as the polygon is, and none lies over another one: then the areas add up
+    # to the polygon's.
     np.testing.assert_allclose(np.linalg.norm(found, axis=1).sum(), abs(shoelace(outline)))
     np.testing.assert_allclose(found.sum(0), shoelace(outline) * turn[:, 2], atol=1e-9)
     middles = outline[faces[np.linalg.norm(found, axis=1) > 1e-9]].mean(1)
@@ -65,7 +79,9 @@ def test_the_triangles_cover_the_polygon_and_nothing_else(name, first):
 
 
 @settings(deadline=None, max_examples=60)
-@given(st.lists(st.floats(0.05, 1), min_size=4, max_size=60), st.floats(0, 0.02), st.integers(0, 100))
+@given(
+    st.lists(st.floats(0.05, 1), min_size=4, max_size=60), st.floats(0, 0.02), st.integers(0, 100)
+)
 def test_any_polygon_without_crossings_bent_or_not(radii, bend, seed):
     rng = np.random.default_rng(seed)
     turns = np.linspace(0, 2 * np.pi, len(radii), endpoint=False)
@@ -79,7 +95,8 @@ def test_any_polygon_without_crossings_bent_or_not(radii, bend, seed):
 @pytest.mark.parametrize("first", range(4))
 def test_a_polygon_that_crosses_itself_is_still_seen(first):
     points = np.roll([(0, 0, 0), (1, 1, 0), (1, 0, 0), (0, 1, 0.0)], first, axis=0)
-    assert 0.5 <= np.linalg.norm(areas(points, cut(points)), axis=1).sum() <= 1  # two wings of a quarter each
+    # two wings of a quarter each
+    assert 0.5 <= np.linalg.norm(areas(points, cut(points)), axis=1).sum() <= 1
 
 
 @pytest.mark.parametrize(
@@ -104,7 +121,9 @@ def test_a_degenerate_polygon_breaks_nothing(points):
 def test_polygons_of_many_sizes_keep_their_order():
     points = np.array([(*p, 0.0) for p in [*BENCH, (9, 9)]])
     corners = [[0, 1, 8], [0, 1, 2, 8], list(range(8)), [0, 1], [], [5, 6, 7], [8, 7, 6, 5]]
-    together = triangulate(points, np.concatenate(corners).astype(int), np.array([len(c) for c in corners]))
+    together = triangulate(
+        points, np.concatenate(corners).astype(int), np.array([len(c) for c in corners])
+    )
     alone = [triangulate(points, np.array(c, int), np.array([len(c)])) for c in corners]
     np.testing.assert_array_equal(together, np.concatenate(alone))
 
@@ -138,23 +157,38 @@ def bench() -> tuple[np.ndarray, list[list[int]]]:
 
 
 def as_obj(points, faces) -> bytes:
-    rows = ["v {} {} {}".format(*p) for p in points] + ["f " + " ".join(str(i + 1) for i in face) for face in faces]
+    rows = ["v {} {} {}".format(*p) for p in points] + [
+        "f " + " ".join(str(i + 1) for i in face) for face in faces
+    ]
     return "\n".join(rows).encode()
 
 
 def as_off(points, faces) -> bytes:
-    rows = ["{} {} {}".format(*p) for p in points] + [" ".join(map(str, [len(face), *face])) for face in faces]
+    rows = ["{} {} {}".format(*p) for p in points] + [
+        " ".join(map(str, [len(face), *face])) for face in faces
+    ]
     return "\n".join(["OFF", f"{len(points)} {len(faces)} 0", *rows]).encode()
 
 
 def as_ply(points, faces, kind="ascii", order="<") -> bytes:
-    header = [f"ply\nformat {kind} 1.0\nelement vertex {len(points)}", *(f"property double {axis}" for axis in "xyz")]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header\n"]
+    header = [
+        f"ply\nformat {kind} 1.0\nelement vertex {len(points)}",
+        *(f"property double {axis}" for axis in "xyz"),
+    ]
+    header += [
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header\n",
+    ]
     if kind == "ascii":
-        rows = ["{} {} {}".format(*p) for p in points] + [" ".join(map(str, [len(face), *face])) for face in faces]
+        rows = ["{} {} {}".format(*p) for p in points] + [
+            " ".join(map(str, [len(face), *face])) for face in faces
+        ]
         return ("\n".join(header) + "\n".join(rows)).encode()
     rows = [np.array(face, f"{order}i4").tobytes() for face in faces]
-    body = np.array(points, f"{order}f8").tobytes() + b"".join(bytes([len(r) // 4]) + r for r in rows)
+    body = np.array(points, f"{order}f8").tobytes() + b"".join(
+        bytes([len(r) // 4]) + r for r in rows
+    )
     return "\n".join(header).encode() + body
 
 
@@ -187,7 +221,8 @@ def test_a_prism_of_polygons_is_the_solid_that_it_is_drawn_as(tmp_path: Path, na
     # Seen from everywhere, it is three boxes: two legs and a top.
     legs = [((0.1, 0.5, 0.7), (x, 0.25, 0.35)) for x in (0.05, 1.15)]
     boxes = [
-        trimesh.creation.box(size).apply_translation(at) for size, at in [*legs, ((1.2, 0.5, 0.1), (0.6, 0.25, 0.65))]
+        trimesh.creation.box(size).apply_translation(at)
+        for size, at in [*legs, ((1.2, 0.5, 0.1), (0.6, 0.25, 0.65))]
     ]
     drawn = trimesh.util.concatenate(boxes)
     cameras = [SimulatedCamera(each, 64) for each in (mesh, make_mesh(drawn.vertices, drawn.faces))]

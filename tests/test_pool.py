@@ -33,29 +33,31 @@ def test_a_plain_script_without_a_guard_may_use_workers(tmp_path, way):
         "standard input": ["-"],
         "a line": ["-c", LINES],
     }[way]
-    done = subprocess.run([sys.executable, *call], input=LINES, cwd=tmp_path, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, *call], input=LINES, cwd=tmp_path, capture_output=True, text=True
+    )
     assert done.stderr == ""
     assert done.stdout == "script runs\n[1.0, 2.0, 3.0]\n"
 
 
 def test_functions_of_a_guarded_script_reach_the_workers(tmp_path):
     (tmp_path / "script.py").write_text(OWN_FUNCTION)
-    done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True
+    )
     assert (done.stderr, done.stdout) == ("", "[2, 8, 18]\n")
 
 
 def test_other_processes_of_a_program_are_started_as_ever(tmp_path):
     """Also in the very moment in which a worker is started."""
     done = run_python(
-        "from multiprocessing import spawn; from nextview.data import pool\n"
-        "usual, names = spawn.get_preparation_data, []\n"
-        "import multiprocessing.context as context\n"
-        "def popen(process):\n"
-        "    data = spawn.get_preparation_data(process.name), spawn.get_preparation_data('another')\n"
-        "    names.extend(any(key.startswith('init_main') for key in of) for of in data)\n"
-        "context.SpawnProcess._Popen = staticmethod(popen)\n"
-        "import sys; sys.modules['__main__'].__file__ = 'script.py'\n"
-        "pool._OwnMain._Popen(pool._OwnMain(target=print))\n"
-        "print(names, spawn.get_preparation_data is usual)\n"
+        "from multiprocessing import spawn; from nextview.data import pool\nusual, names ="
+        " spawn.get_preparation_data, []\nimport multiprocessing.context as context\ndef"
+        " popen(process):\n    data = spawn.get_preparation_data(process.name),"
+        " spawn.get_preparation_data('another')\n    names.extend(any(key.startswith('init_main')"
+        " for key in of) for of in data)\ncontext.SpawnProcess._Popen = staticmethod(popen)\nimport"
+        " sys; sys.modules['__main__'].__file__ ="
+        " 'script.py'\npool._OwnMain._Popen(pool._OwnMain(target=print))\nprint(names,"
+        " spawn.get_preparation_data is usual)\n"
     )
     assert done.stdout == "[False, True] True\n", done.stderr

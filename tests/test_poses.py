@@ -1,4 +1,6 @@
-"""Taught things through the front door: named by their geometry, with poses where a robot needs them."""
+"""Taught things through the front door: named by their geometry, with poses where a robot needs
+them.
+"""
 
 import json
 import pickle
@@ -92,7 +94,9 @@ def placed(name: str, yaw: float, at=SPOT) -> np.ndarray:
     return pose
 
 
-def frame_of(name: str, pose: np.ndarray, camera: np.ndarray, seed=0, sigma=0.001, posed=True) -> Frame:
+def frame_of(
+    name: str, pose: np.ndarray, camera: np.ndarray, seed=0, sigma=0.001, posed=True
+) -> Frame:
     """A noisy depth frame of a scan on the table."""
     scan = THINGS[name]().apply_translation(ORIGIN).apply_transform(pose)
     depth, _ = cast([scan, TABLE], camera)
@@ -113,7 +117,9 @@ def test_a_pose_is_where_the_thing_is_in_the_world(system, name):
     true = placed(name, 0.7)
     session = session_of(system, 2, distance=0.5)
     for seed, (up, around) in enumerate([(35, 20), (40, 100)]):
-        session.update(frame_of(name, true, pose_at(up, around, 0.5, np.add(SPOT, (0, 0, 0.03))), seed))
+        session.update(
+            frame_of(name, true, pose_at(up, around, 0.5, np.add(SPOT, (0, 0, 0.03))), seed)
+        )
         result = session.result
         assert (result.answer, result.pose_frame) == (name, "world")
         turn, moved = off_by(result.pose, true, name)
@@ -199,7 +205,9 @@ def test_without_a_scale_features_answer_and_it_says_so(system, known, meshes):
     assert result.pose_candidates == ()
     assert "not known in metres" in result.why_no_pose
     plain = nextview.load(models=known, recogniser=TaughtRecogniser(known / "memory.json", 1))
-    np.testing.assert_array_equal(plain.recognise(mug_of_no_size, seed=2).views[0].belief, result.views[0].belief)
+    np.testing.assert_array_equal(
+        plain.recognise(mug_of_no_size, seed=2).views[0].belief, result.views[0].belief
+    )
 
 
 def test_what_has_no_geometry_is_known_by_features_alone(known, meshes):
@@ -219,7 +227,9 @@ def test_what_no_scan_explains_is_unknown_with_a_p_value(known, meshes):
     recogniser = recogniser_of(known)
     recogniser.things.residuals = usual
     system = nextview.load(models=known, threads=1, recogniser=recogniser, unknown=0.02)
-    stranger = trimesh.util.concatenate([box((0.1, 0.1, 0.02)), box((0.02, 0.02, 0.12), (0, 0, 0.05))])
+    stranger = trimesh.util.concatenate(
+        [box((0.1, 0.1, 0.02)), box((0.02, 0.02, 0.12), (0, 0, 0.05))]
+    )
     result = system.recognise(make_mesh(stranger.vertices, stranger.faces, unit="m"), seed=1)
     assert result.unknown
     assert (result.answer, result.pose, result.novelty) == (None, None, pytest.approx(0.01))
@@ -228,7 +238,9 @@ def test_what_no_scan_explains_is_unknown_with_a_p_value(known, meshes):
     assert (taught.answer, taught.unknown) == ("mug", False)
     assert taught.novelty > 0.5
     never = nextview.load(models=known, threads=1, recogniser=recogniser, unknown=0)
-    assert not never.recognise(make_mesh(stranger.vertices, stranger.faces, unit="m"), seed=1).unknown
+    assert not never.recognise(
+        make_mesh(stranger.vertices, stranger.faces, unit="m"), seed=1
+    ).unknown
 
 
 @pytest.mark.parametrize("again", [deepcopy, lambda session: pickle.loads(pickle.dumps(session))])
@@ -242,7 +254,9 @@ def test_a_copy_of_a_session_with_geometry_goes_on_alike(system, meshes, again):
 
 
 def test_errors_are_as_large_as_the_uncertainty_says(system):
-    """Cameras that stand 3 mm and look 0.3 degrees elsewhere than they are said to, as behind the wrist sensor."""
+    """Cameras that stand 3 mm and look 0.3 degrees elsewhere than they are said to, as behind
+    the wrist sensor.
+    """
     rng = np.random.default_rng(3)
     turns, places = [], []
     for episode in range(8):
@@ -253,9 +267,16 @@ def test_errors_are_as_large_as_the_uncertainty_says(system):
             camera = pose_at(rng.uniform(25, 50), around, 0.5, np.add(SPOT, (0, 0, 0.04)))
             shown = frame_of(name, true, camera, seed=episode, sigma=0.0015)
             believed = camera.copy()
-            believed[:3, :3] = camera[:3, :3] @ Rotation.from_rotvec(np.radians(rng.normal(0, 0.3, 3))).as_matrix()
+            believed[:3, :3] = (
+                camera[:3, :3] @ Rotation.from_rotvec(np.radians(rng.normal(0, 0.3, 3))).as_matrix()
+            )
             believed[:3, 3] += rng.normal(0, 0.003, 3)
-            seen = np.isin(cast([THINGS[name]().apply_translation(ORIGIN).apply_transform(true), TABLE], camera)[1], 0)
+            seen = np.isin(
+                cast(
+                    [THINGS[name]().apply_translation(ORIGIN).apply_transform(true), TABLE], camera
+                )[1],
+                0,
+            )
             session.update(replace(shown, pose=believed, mask=seen, pixel_centre=0.5))
         result = session.result
         degrees, millimetres = off_by(result.pose, true, name)
@@ -269,14 +290,31 @@ def test_errors_are_as_large_as_the_uncertainty_says(system):
 
 
 def test_json_and_the_table_tell_the_pose(known, metric_scans, capsys):
-    asked = ["recognise", str(metric_scans / "carton.ply"), "--models", str(known), "--unit", "m", "--start", "12"]
+    asked = [
+        "recognise",
+        str(metric_scans / "carton.ply"),
+        "--models",
+        str(known),
+        "--unit",
+        "m",
+        "--start",
+        "12",
+    ]
     main([*asked, "--json"])
     printed = json.loads(capsys.readouterr().out)
-    assert (printed["answer"], printed["pose_of"], printed["pose_frame"]) == ("carton", "carton", "object")
+    assert (printed["answer"], printed["pose_of"], printed["pose_frame"]) == (
+        "carton",
+        "carton",
+        "object",
+    )
     pose = np.array(printed["pose"])
-    np.testing.assert_allclose((pose @ [*ORIGIN, 1])[:3], 0, atol=0.002)  # its middle is that of the object frame
-    assert [each["thing"] for each in printed["pose_candidates"]] == ["carton"] * 2  # from both sides it is the same
-    assert sum(each["probability"] for each in printed["pose_candidates"]) == pytest.approx(1, abs=1e-5)
+    # its middle is that of the object frame
+    np.testing.assert_allclose((pose @ [*ORIGIN, 1])[:3], 0, atol=0.002)
+    # from both sides it is the same
+    assert [each["thing"] for each in printed["pose_candidates"]] == ["carton"] * 2
+    assert sum(each["probability"] for each in printed["pose_candidates"]) == pytest.approx(
+        1, abs=1e-5
+    )
     assert printed["pose_uncertainty"]["millimetres"] < 3
     assert printed["why_no_pose"] == ""
 
@@ -302,7 +340,9 @@ def test_the_outline_of_the_scan_is_that_of_what_was_seen(system, meshes, tmp_pa
 
 
 def test_a_recording_shows_the_scan_where_it_was_found(system, meshes, tmp_path):
-    recording = pytest.importorskip("nextview.viewers.recording", reason="the extra 'record' is not installed")
+    recording = pytest.importorskip(
+        "nextview.viewers.recording", reason="the extra 'record' is not installed"
+    )
     reading = pytest.importorskip("test_recording")
     session = session_of(system, 1, start=12)
     session.observers.append(recording.Recorder(tmp_path / "mug.rrd"))
@@ -326,7 +366,9 @@ def test_the_explorer_tells_the_place(known, metric_scans):
 # How sure it is
 
 
-def candidate(turn=(0, 0, 0), at=(0, 0, 0), probability=1.0, symmetry=None, degrees=0.0, millimetres=0.0):
+def candidate(
+    turn=(0, 0, 0), at=(0, 0, 0), probability=1.0, symmetry=None, degrees=0.0, millimetres=0.0
+):
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_rotvec(np.radians(turn)).as_matrix()
     pose[:3, 3] = at
@@ -341,7 +383,10 @@ class About:
 
 
 def test_the_uncertainty_is_the_root_mean_square_of_all_candidates():
-    both = [candidate(probability=0.75, degrees=1.0, millimetres=2.0), candidate((0, 0, 90), (0.01, 0, 0), 0.25)]
+    both = [
+        candidate(probability=0.75, degrees=1.0, millimetres=2.0),
+        candidate((0, 0, 90), (0.01, 0, 0), 0.25),
+    ]
     found = uncertainty_of(both, camera=3.0)
     assert found.degrees == pytest.approx(np.sqrt(0.75 * 1 + 0.25 * 90**2))
     assert found.millimetres == pytest.approx(np.sqrt(0.75 * 4 + 0.25 * 100 + 9))
@@ -364,7 +409,10 @@ def test_the_uncertainty_is_the_root_mean_square_of_all_candidates():
     ],
 )
 def test_turns_that_change_nothing_are_no_uncertainty(symmetry, turn, left):
-    both = [candidate(probability=0.0, symmetry=symmetry), candidate(turn, probability=1.0, symmetry=symmetry)]
+    both = [
+        candidate(probability=0.0, symmetry=symmetry),
+        candidate(turn, probability=1.0, symmetry=symmetry),
+    ]
     assert uncertainty_of(both).degrees == pytest.approx(left, abs=1e-5)
 
 
@@ -386,7 +434,9 @@ def test_the_next_view_is_chosen_by_geometry_and_views_are_ranked(system):
     np.testing.assert_allclose(ranked[0].pose, session.poses[ranked[0].index])
     assert ranked[0].words
 
-    mine = np.stack([pose_at(20, 200, 0.6, SPOT), pose_at(60, 20, 0.4, SPOT), pose_at(35, 110, 0.5, SPOT)])
+    mine = np.stack(
+        [pose_at(20, 200, 0.6, SPOT), pose_at(60, 20, 0.4, SPOT), pose_at(35, 110, 0.5, SPOT)]
+    )
     own = session.ranked(mine, goal="pose")
     assert sorted(each.index for each in own) == [0, 1, 2]
     assert "the pose of" in own[0].words

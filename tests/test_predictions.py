@@ -1,4 +1,6 @@
-"""Predictions: what the networks say of a store, kept whole, resumed, and refused where the file is damaged."""
+"""Predictions: what the networks say of a store, kept whole, resumed, and refused where the file
+is damaged.
+"""
 
 import io
 import resource
@@ -32,7 +34,11 @@ SPEC = InputSpec("geometry", 32)
 
 def test_what_is_saved_is_what_is_loaded(tmp_path):
     calibration = Calibration(0.8, 0.3, RiskBounds((0.9,), ((0.1,),), 0.1))
-    saved = replace(some_predictions(), calibration=calibration, of_size=np.arange(18, dtype=np.float32).reshape(6, 3))
+    saved = replace(
+        some_predictions(),
+        calibration=calibration,
+        of_size=np.arange(18, dtype=np.float32).reshape(6, 3),
+    )
     saved.save(tmp_path / "p.npz")
     loaded = Predictions.load(tmp_path / "p.npz")
     for name in ("logits", "of_size", "depth_entropy", "labels", "splits", "conflicting"):
@@ -65,9 +71,17 @@ def test_a_flipped_bit_is_harmless_or_refused_in_one_sentence(tmp_path):
     some_predictions(2).save(path)
     sound = path.read_bytes()
     with zipfile.ZipFile(path) as file:
-        heads = [info.header_offset + k for info in file.infolist() for k in range(30 + len(info.filename))]
+        heads = [
+            info.header_offset + k
+            for info in file.infolist()
+            for k in range(30 + len(info.filename))
+        ]
     # Everywhere, in the heads of the members, and in the list of members at the end.
-    places = [*rng.integers(len(sound), size=150), *rng.choice(heads, 150), *range(len(sound) - 150, len(sound))]
+    places = [
+        *rng.integers(len(sound), size=150),
+        *rng.choice(heads, 150),
+        *range(len(sound) - 150, len(sound)),
+    ]
     refused: list[str] = []
     for place in places:
         damaged = bytearray(sound)
@@ -117,7 +131,8 @@ def test_predictions_are_what_the_networks_say_of_each_look(views, models, predi
     evidence = NetworkRecogniser(models / "tiny.json")([observation])
     np.testing.assert_allclose(found.logits[i, v], evidence.logits[0], atol=1e-5)
     np.testing.assert_allclose(found.azimuth_bins[i, v], evidence.azimuth_bins[0], atol=1e-5)
-    # Here the points come from the stored depth, which is rounded; those in the store are from the depth as rendered.
+    # Here the points come from the stored depth, which is rounded; those in the store are from the
+    # depth as rendered.
     lem = MapNetwork(models / "tiny-lem.json")([observation])["lem"][0]
     np.testing.assert_allclose(found.maps["lem"][i, v], lem, atol=5e-4)
 
@@ -125,7 +140,9 @@ def test_predictions_are_what_the_networks_say_of_each_look(views, models, predi
 def test_logits_of_ones_own_make_the_predictions_that_the_networks_make(views, models, predictions):
     made, store = Predictions.load(predictions).by_shape(), ViewStore.open(views)
     recogniser = NetworkRecogniser(models / "tiny.json")
-    logits = np.stack([recogniser.from_inputs(from_store(SPEC, store, i)).logits for i in range(18)])
+    logits = np.stack(
+        [recogniser.from_inputs(from_store(SPEC, store, i)).logits for i in range(18)]
+    )
     own = Predictions.from_logits(views, logits, made.classes)
     np.testing.assert_allclose(own.logits, made.logits, atol=1e-5)
     assert own.models == {}
@@ -147,11 +164,20 @@ def test_the_same_mesh_under_two_labels_is_marked_across_splits(furniture, model
     for place in ("chair/test/chair_4", "table/train/twin", "monitor/test/monitor_4"):
         path = tmp_path / f"meshes/{place}.off"
         path.parent.mkdir(parents=True)
-        shutil.copy(furniture / f"{place.replace('table/train/twin', 'chair/test/chair_4')}.off", path)
+        shutil.copy(
+            furniture / f"{place.replace('table/train/twin', 'chair/test/chair_4')}.off", path
+        )
     list(render(tmp_path / "meshes", tmp_path / "views.zarr", SPHERE, 32, workers=0))
-    list(predict(tmp_path / "views.zarr", tmp_path / "p.npz", cards(models)[0], {}, "test", workers=0))
+    list(
+        predict(
+            tmp_path / "views.zarr", tmp_path / "p.npz", cards(models)[0], {}, "test", workers=0
+        )
+    )
     found = Predictions.load(tmp_path / "p.npz")
-    assert dict(zip(found.names, found.conflicting, strict=True)) == {"chair_4": True, "monitor_4": False}
+    assert dict(zip(found.names, found.conflicting, strict=True)) == {
+        "chair_4": True,
+        "monitor_4": False,
+    }
 
 
 KILLED = """
@@ -172,23 +198,31 @@ if __name__ == "__main__":
 def test_a_killed_run_goes_on_where_it_was(views, models, predictions, tmp_path):
     out, (recogniser, maps) = tmp_path / "again.npz", cards(models)
     (tmp_path / "killed.py").write_text(KILLED)
-    killed = subprocess.run([sys.executable, tmp_path / "killed.py", views, models, out], check=False)
+    killed = subprocess.run(
+        [sys.executable, tmp_path / "killed.py", views, models, out], check=False
+    )
     assert killed.returncode == -signal.SIGKILL
     assert not out.exists()
     steps = list(predict(views, out, recogniser, maps, workers=1))
     assert 2 <= steps[0][0] < 18  # the worker may have finished another one before it ended
     assert not out.with_name("again.npz.part").exists()
-    np.testing.assert_array_equal(Predictions.load(out).logits, Predictions.load(predictions).logits)
+    np.testing.assert_array_equal(
+        Predictions.load(out).logits, Predictions.load(predictions).logits
+    )
 
 
-def test_an_array_that_announces_more_than_the_file_holds_is_refused_before_it_takes_memory(tmp_path):
+def test_an_array_that_announces_more_than_the_file_holds_is_refused_before_it_takes_memory(
+    tmp_path,
+):
     some_predictions().save(tmp_path / "p.npz")
     with np.load(tmp_path / "p.npz") as file:
         arrays = {name: file[name] for name in file.files}
     zeros = np.broadcast_to(np.float32(0), (300, 40, 5000))
     np.savez_compressed(tmp_path / "zeros.npz", **(arrays | {"logits": zeros}))
     header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<f4", "fortran_order": False, "shape": (10**9,)})
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f4", "fortran_order": False, "shape": (10**9,)}
+    )
     with zipfile.ZipFile(tmp_path / "header.npz", "w") as file:
         file.writestr("logits.npy", header.getvalue())
     for name in ("zeros", "header"):

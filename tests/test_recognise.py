@@ -32,7 +32,9 @@ def chair():
 
 
 def test_json_holds_the_whole_episode(chair, capsys):
-    main(["recognise", str(chair), "--json", "--start", "3", "--threshold", "1", "--max-views", "4"])
+    main(
+        ["recognise", str(chair), "--json", "--start", "3", "--threshold", "1", "--max-views", "4"]
+    )
     views = json.loads(capsys.readouterr().out)["views"]
     assert next(view["view"] for view in views) == 3
     assert len(views) == len({view["view"] for view in views}) == 4
@@ -40,7 +42,8 @@ def test_json_holds_the_whole_episode(chair, capsys):
     for view in views:
         assert sum(view["belief"].values()) == pytest.approx(1, abs=1e-4)
         assert view["azimuth_bin"]["belief"] > 0.5
-    assert len({(view["azimuth"] - view["azimuth_bin"]["degrees"]) % 360 for view in views}) == 1  # it stands still
+    # it stands still
+    assert len({(view["azimuth"] - view["azimuth_bin"]["degrees"]) % 360 for view in views}) == 1
     assert views[0]["belief"] == views[0]["alone"]
     sphere = ViewSphere.named("40")
     legs = [sphere.travel[a["view"], b["view"]] for a, b in itertools.pairwise(views)]
@@ -50,20 +53,40 @@ def test_json_holds_the_whole_episode(chair, capsys):
 def test_several_are_a_line_of_json_each_and_what_cannot_be_used_is_named(chair, capsys):
     table = chair.with_name("table.off")
     with pytest.raises(SystemExit) as end:
-        main(["recognise", str(chair), "no.off", str(table), "--unit", "cm", "--json", "--start", "3"])
+        main(
+            [
+                "recognise",
+                str(chair),
+                "no.off",
+                str(table),
+                "--unit",
+                "cm",
+                "--json",
+                "--start",
+                "3",
+            ]
+        )
     out, err = capsys.readouterr()
     assert end.value.code == 2
     assert "no.off" in err
     assert "1 of 3 were left out" in err
     found = [json.loads(line) for line in out.splitlines()]
-    assert [(one["name"], one["answer"]) for one in found] == [("chair.off", "chair"), ("table.off", "table")]
+    assert [(one["name"], one["answer"]) for one in found] == [
+        ("chair.off", "chair"),
+        ("table.off", "table"),
+    ]
     for one, path in zip(found, (chair, table), strict=True):
-        assert (one["radius"], one["unit"]) == (pytest.approx(nextview.load_mesh(path, unit="cm").metres), "m")
+        assert (one["radius"], one["unit"]) == (
+            pytest.approx(nextview.load_mesh(path, unit="cm").metres),
+            "m",
+        )
         assert one["beliefs"] == one["views"][-1]["belief"]
         assert (one["unknown"], one["warnings"]) == (False, [])
 
 
-def test_a_rule_of_ones_own_shows_no_threshold_that_it_does_not_have(chair, tmp_path, monkeypatch, capsys):
+def test_a_rule_of_ones_own_shows_no_threshold_that_it_does_not_have(
+    chair, tmp_path, monkeypatch, capsys
+):
     rule = "def second(seen, threshold):\n    return seen.n_views >= 2 + 0 * seen.highest\n"
     (tmp_path / "own_rule.py").write_text(rule)
     monkeypatch.chdir(tmp_path)
@@ -74,7 +97,10 @@ def test_a_rule_of_ones_own_shows_no_threshold_that_it_does_not_have(chair, tmp_
     assert "2 views" in shown
     assert "enough: inf" not in (tmp_path / "episode.svg").read_text()
     main([*command, "--json"])
-    assert [view["threshold"] for view in json.loads(capsys.readouterr().out)["views"]] == [None, None]
+    assert [view["threshold"] for view in json.loads(capsys.readouterr().out)["views"]] == [
+        None,
+        None,
+    ]
 
 
 @pytest.mark.parametrize("wrong", [{"models": 3}, {"policy": 3}, {"risk": "low"}])
@@ -85,7 +111,17 @@ def test_what_is_no_name_is_refused(wrong):
 
 def test_every_bundled_policy_runs_live(chair, capsys):
     for name in bundled_policies():
-        arguments = ["--policy", name, "--threshold", "1", "--max-views", "3", "--start", "9", "--json"]
+        arguments = [
+            "--policy",
+            name,
+            "--threshold",
+            "1",
+            "--max-views",
+            "3",
+            "--start",
+            "9",
+            "--json",
+        ]
         main(["recognise", str(chair), *arguments])
         views = json.loads(capsys.readouterr().out)["views"]
         assert len({view["view"] for view in views}) == 3
@@ -117,7 +153,8 @@ def test_mistakes_end_in_one_sentence(chair, monkeypatch, capsys, arguments, wor
 def test_bundled_models_are_what_their_cards_say():
     cards = bundled_cards()
     assert {card.kind for card in cards.values()} >= {"recogniser", "lem"}
-    assert {path.suffix for path in BUNDLED.iterdir()} <= {".onnx", ".json", ".safetensors"}  # nothing that is pickled
+    # nothing that is pickled
+    assert {path.suffix for path in BUNDLED.iterdir()} <= {".onnx", ".json", ".safetensors"}
     assert sum(card.path.stat().st_size for card in cards.values()) < 90e6
     for card in cards.values():
         training = card.training
@@ -138,7 +175,10 @@ def test_wrong_models_are_refused():
 
 
 def test_inference_never_imports_torch(chair):
-    code = f"main(['recognise', {str(chair)!r}, '--json']); assert not {{'torch', 'onnx'}} & {{*sys.modules}}"
+    code = (
+        f"main(['recognise', {str(chair)!r}, '--json']); assert not {{'torch', 'onnx'}} &"
+        " {*sys.modules}"
+    )
     assert run_python(f"import sys; from nextview.cli.main import main; {code}").returncode == 0
 
 
@@ -156,8 +196,13 @@ def test_the_figure_says_what_its_colours_and_angles_mean():
 def test_an_output_of_any_encoding_shows_everything(encoding, tmp_path):
     mesh = tmp_path / "椅子ü.off"
     shutil.copy(SAMPLE_FILES / "chair.off", mesh)
-    code = f"from nextview.cli.main import main; main(['recognise', {str(mesh)!r}, '--max-views', '1'])"
-    done = run_python(code, env=os.environ | {"PYTHONIOENCODING": encoding}, encoding=encoding.partition(":")[0])
+    code = (
+        f"from nextview.cli.main import main; main(['recognise', {str(mesh)!r}, '--max-views',"
+        " '1'])"
+    )
+    done = run_python(
+        code, env=os.environ | {"PYTHONIOENCODING": encoding}, encoding=encoding.partition(":")[0]
+    )
     assert done.returncode == 0, done.stderr
     name = "椅子" if encoding == "utf-8" else "\\u6905\\u5b50"
     assert name in done.stdout
@@ -210,7 +255,8 @@ def test_a_figure_takes_a_font_that_has_the_name(with_font, caplog):
     assert text.get_text() == CHARACTER
     assert not caplog.records
     dark = pixels[..., 0] < 100
-    assert dark[np.ix_(dark.any(1), dark.any(0))].mean() > 0.9  # the square of that font, and no empty box
+    # the square of that font, and no empty box
+    assert dark[np.ix_(dark.any(1), dark.any(0))].mean() > 0.9
 
 
 def test_a_name_that_no_font_has_is_written_as_codes_and_one_line_says_so(caplog):

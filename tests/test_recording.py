@@ -17,11 +17,14 @@ from nextview.viewers.recording import Recorder
 
 
 class Recording:
-    """The rows of a recording by entity, component and step; the last one that was written counts."""
+    """The rows of a recording by entity, component and step; the last one that was written
+    counts.
+    """
 
     def __init__(self, path):
         self.rows = {}
-        chunks = sorted(RrdReader(path).stream().to_chunks(), key=lambda chunk: str(chunk.id))  # by time
+        # by time
+        chunks = sorted(RrdReader(path).stream().to_chunks(), key=lambda chunk: str(chunk.id))
         for chunk in chunks:
             if chunk.is_static:
                 continue
@@ -29,7 +32,9 @@ class Recording:
             for row, step in enumerate(batch["step"]):
                 for component, values in batch.items():
                     if ":" in component:
-                        self.rows.setdefault((chunk.entity_path.strip("/"), component), {}).setdefault(step, [])
+                        self.rows.setdefault(
+                            (chunk.entity_path.strip("/"), component), {}
+                        ).setdefault(step, [])
                         self.rows[chunk.entity_path.strip("/"), component][step].append(values[row])
 
     def at(self, entity, component, step):
@@ -58,9 +63,13 @@ def test_belief_and_travel_over_the_steps(made):
             assert recording.at(f"belief/{name}", "Scalars:scalars", step) == [belief]
         assert recording.at("travel/cells", "Scalars:scalars", step) == [view.travel]
         assert recording.at("travel/radians", "Scalars:scalars", step) == [view.arc]
-        assert recording.at("threshold", "Scalars:scalars", step) == [session.stopping.threshold_at(step)]
+        assert recording.at("threshold", "Scalars:scalars", step) == [
+            session.stopping.threshold_at(step)
+        ]
         for name, values in (("belief_now", view.belief), ("this_view_alone", view.alone)):
-            np.testing.assert_array_equal(recording.at(name, "BarChart:values", step)[0]["buffer"], values)
+            np.testing.assert_array_equal(
+                recording.at(name, "BarChart:values", step)[0]["buffer"], values
+            )
     assert recording.steps("belief/chair", "Scalars:scalars") == steps
 
 
@@ -70,8 +79,12 @@ def test_candidates_values_and_choices(made):
     for step, view in enumerate(result.views, 1):
         shown = np.array(recording.at("world/candidates", "Points3D:positions", step).tolist())
         np.testing.assert_allclose(shown, poses, atol=1e-6)
-        chosen = np.array(recording.at("world/next", "Points3D:positions", step).tolist()).reshape(-1, 3)
-        np.testing.assert_allclose(chosen, poses[[] if view.next_view is None else [view.next_view]], atol=1e-6)
+        chosen = np.array(recording.at("world/next", "Points3D:positions", step).tolist()).reshape(
+            -1, 3
+        )
+        np.testing.assert_allclose(
+            chosen, poses[[] if view.next_view is None else [view.next_view]], atol=1e-6
+        )
         values = np.array(recording.at("values", "BarChart:values", step)[0]["buffer"])
         if view.values is None:
             assert len(values) == 0

@@ -1,4 +1,6 @@
-"""The store survives what happens to long jobs, done for real: kills, full disks, broken meshes, second runs."""
+"""The store survives what happens to long jobs, done for real: kills, full disks, broken meshes,
+second runs.
+"""
 
 import os
 import shutil
@@ -90,7 +92,10 @@ def test_kill_of_the_parent_loses_nothing_and_leaves_no_orphans(furniture, whole
 def test_a_full_disk_says_so_and_the_next_run_goes_on(furniture, whole, tmp_path):
     disk = tmp_path / "disk"
     disk.mkdir()
-    if os.geteuid() or subprocess.run(["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", disk]).returncode:
+    if (
+        os.geteuid()
+        or subprocess.run(["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", disk]).returncode
+    ):
         pytest.skip("only root can mount a small disk")
     try:
         path = disk / "views.zarr"
@@ -127,12 +132,16 @@ def test_identical_meshes_are_known_by_their_bytes(meshes, tmp_path):
 
 
 def test_a_box_is_stored_as_it_is_seen(tmp_path):
-    """The nearest face of a box, straight ahead: its depth, its points and its silhouette are known."""
+    """The nearest face of a box, straight ahead: its depth, its points and its silhouette are
+    known.
+    """
     half = np.array([0.3, 0.5, 0.7])
     path = tmp_path / "meshes/box/box.off"
     path.parent.mkdir(parents=True)
     trimesh.creation.box(2 * half * 12.5).export(path)  # in any unit
-    list(render(tmp_path / "meshes", tmp_path / "views.zarr", ViewSphere.named("40"), 224, workers=0))
+    list(
+        render(tmp_path / "meshes", tmp_path / "views.zarr", ViewSphere.named("40"), 224, workers=0)
+    )
     store = ViewStore.open(tmp_path / "views.zarr")
     half /= np.linalg.norm(half)
     image, depth, points = store.image(0), store.depth(0), store.points(0)
@@ -163,7 +172,8 @@ KILLER = """
 import multiprocessing, os, sys
 
 def hook(event, arguments):
-    if event == "open" and str(arguments[0]).endswith("chair_1.off") and multiprocessing.parent_process():
+    opens = event == "open" and str(arguments[0]).endswith("chair_1.off")
+    if opens and multiprocessing.parent_process():
         os._exit(9)
 
 sys.addaudithook(hook)
@@ -171,15 +181,31 @@ sys.addaudithook(hook)
 """As sitecustomize.py: a worker that opens this mesh dies, as one does that runs out of memory."""
 
 
-def test_a_mesh_that_kills_its_worker_twice_is_left_out_and_listed_and_the_others_are_rendered(meshes, tmp_path):
+def test_a_mesh_that_kills_its_worker_twice_is_left_out_and_listed_and_the_others_are_rendered(
+    meshes, tmp_path
+):
     (tmp_path / "sitecustomize.py").write_text(KILLER)
     for mesh in (meshes / "chair/train").glob("chair_[23].off"):
         mesh.unlink()
     path = tmp_path / "views.zarr"
     place = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
-    command = [sys.executable, "-m", "nextview", "render", meshes, path, "--viewpoints", "12", "--size", "16"]
+    command = [
+        sys.executable,
+        "-m",
+        "nextview",
+        "render",
+        meshes,
+        path,
+        "--viewpoints",
+        "12",
+        "--size",
+        "16",
+    ]
     ran = subprocess.run(
-        [*command, "--workers", "2"], env=os.environ | {"PYTHONPATH": place}, capture_output=True, text=True
+        [*command, "--workers", "2"],
+        env=os.environ | {"PYTHONPATH": place},
+        capture_output=True,
+        text=True,
     )
     assert ran.returncode == 0, ran.stderr
     said = " ".join((ran.stdout + ran.stderr).split())
@@ -188,7 +214,9 @@ def test_a_mesh_that_kills_its_worker_twice_is_left_out_and_listed_and_the_other
 
     store = ViewStore.open(path)
     assert store.attributes.failures.keys() == {"chair_1"}
-    assert {name for name, done in zip(store.names, store.done, strict=True) if done} == set(store.names) - {"chair_1"}
+    assert {name for name, done in zip(store.names, store.done, strict=True) if done} == set(
+        store.names
+    ) - {"chair_1"}
 
     # Where nothing kills the worker, the next run renders it, and its reason goes.
     assert dict(render(meshes, path, ViewSphere.named("12"), 16, workers=0)) == {"chair_1": None}
@@ -201,6 +229,11 @@ def test_a_dask_cluster_renders_the_same(furniture, whole, tmp_path):
     with distributed.LocalCluster(
         n_workers=2, processes=True, threads_per_worker=1, dashboard_address=None, silence_logs=50
     ) as cluster:
-        names = [name for name, _ in render(furniture, path, SPHERE, SIZE, scheduler=cluster.scheduler_address)]
+        names = [
+            name
+            for name, _ in render(
+                furniture, path, SPHERE, SIZE, scheduler=cluster.scheduler_address
+            )
+        ]
     assert sorted(names) == sorted(ViewStore.open(path).names)
     assert_same(whole, path)

@@ -1,4 +1,6 @@
-"""Replay against episodes one by one, against a live camera, and what entries and oracles promise."""
+"""Replay against episodes one by one, against a live camera, and what entries and oracles
+promise.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -32,7 +34,10 @@ def specs():
 def evidence_of(predictions: Predictions, objects: np.ndarray):
     def observe(episodes, views):
         rows = objects[episodes]
-        logits, maps = predictions.logits[rows, views], {"lem": predictions.maps["lem"][rows, views]}
+        logits, maps = (
+            predictions.logits[rows, views],
+            {"lem": predictions.maps["lem"][rows, views]},
+        )
         return Evidence(logits, maps, seen=logits.any(1))
 
     return observe
@@ -41,21 +46,32 @@ def evidence_of(predictions: Predictions, objects: np.ndarray):
 @pytest.mark.parametrize(("threshold_decay", "empty"), [(0.0, False), (0.6, False), (1.0, True)])
 @pytest.mark.parametrize("threshold", [0.0, 0.7, 0.9, 0.99])
 @pytest.mark.parametrize("name", ["lem", "lem-peak", "unidirectional"])
-def test_a_path_cut_at_a_threshold_is_the_episode_under_that_threshold(specs, name, threshold, threshold_decay, empty):
-    """A view in which nothing is seen counts neither for the decay nor as the end, as in live use."""
+def test_a_path_cut_at_a_threshold_is_the_episode_under_that_threshold(
+    specs, name, threshold, threshold_decay, empty
+):
+    """A view in which nothing is seen counts neither for the decay nor as the end, as in live
+    use.
+    """
     p = specs.predictions
     if empty:
         p = replace(p, logits=np.where(np.arange(40)[:, None] % 2, p.logits, 0))
         specs = replace(specs, predictions=p)
-    policy, stopping = make_policy(name, p.sphere, specs.valley_classes("lem")), Stopping(threshold, 5, threshold_decay)
+    policy, stopping = (
+        make_policy(name, p.sphere, specs.valley_classes("lem")),
+        Stopping(threshold, 5, threshold_decay),
+    )
     observe, rng = evidence_of(p, specs.objects), np.random.default_rng(0)
     episodes = run_episodes(observe, p.sphere, policy, specs.starts, stopping, rng).outcome
     paths = replay(name, specs, max_views=5, seed=0)
     ends = truncate(paths, stopping)
     for field in ("answer", "confidence", "n_views", "confident", "travel", "arc"):
-        np.testing.assert_allclose(getattr(ends, field), getattr(episodes, field), atol=1e-12, err_msg=field)
+        np.testing.assert_allclose(
+            getattr(ends, field), getattr(episodes, field), atol=1e-12, err_msg=field
+        )
     taken = np.arange(5) < ends.n_views[:, None]
-    np.testing.assert_array_equal(np.where(taken, paths.views, -1)[:, : episodes.views.shape[1]], episodes.views)
+    np.testing.assert_array_equal(
+        np.where(taken, paths.views, -1)[:, : episodes.views.shape[1]], episodes.views
+    )
 
 
 def uncertain(seen, threshold):
@@ -66,7 +82,10 @@ def uncertain(seen, threshold):
 @pytest.mark.parametrize("threshold", [0.2, 0.6])
 def test_a_stopping_rule_of_ones_own_ends_a_path_as_it_ends_the_episode(specs, threshold):
     p, rule = specs.predictions, own_stopping("test_replay:uncertain", threshold, 5)
-    policy, paths = make_policy("lem", p.sphere, specs.valley_classes("lem")), replay("lem", specs, 5, 0, beliefs=True)
+    policy, paths = (
+        make_policy("lem", p.sphere, specs.valley_classes("lem")),
+        replay("lem", specs, 5, 0, beliefs=True),
+    )
     episodes = Episodes(p.sphere, policy, specs.starts, rule, np.random.default_rng(0))
     observe, stopped = evidence_of(p, specs.objects), np.zeros(len(specs.starts), int)
     while len(episodes.running):
@@ -74,12 +93,16 @@ def test_a_stopping_rule_of_ones_own_ends_a_path_as_it_ends_the_episode(specs, t
         entropy = -(step.belief * np.log2(step.belief)).sum(1)
         lead = np.subtract(*np.sort(step.belief, 1)[:, [-1, -2]].T)
         k = len(episodes.steps)
-        np.testing.assert_array_equal(step.stopped, (entropy < threshold) | ((k > 3) & (lead > 0.2)) | (k == 5))
+        np.testing.assert_array_equal(
+            step.stopped, (entropy < threshold) | ((k > 3) & (lead > 0.2)) | (k == 5)
+        )
         stopped[step.episodes] = k
     ends = truncate(paths, rule)
     np.testing.assert_array_equal(ends.n_views, stopped)
     for field in ("answer", "confidence", "confident", "travel"):
-        np.testing.assert_allclose(getattr(ends, field), getattr(episodes.outcome, field), atol=1e-12, err_msg=field)
+        np.testing.assert_allclose(
+            getattr(ends, field), getattr(episodes.outcome, field), atol=1e-12, err_msg=field
+        )
     with pytest.raises(UsageError, match="beliefs=True"):
         truncate(replay("lem", specs, 5, 0), rule)
 
@@ -89,7 +112,10 @@ def test_what_a_stopping_rule_does_wrong_is_one_sentence():
     for rule, words in [
         ("test_replay:nothing", "cannot be made"),
         ("entropy", "MODULE:NAME"),
-        (lambda seen, threshold: seen.belief > threshold, r"bool of the shape \(4,\), not bool of \(4, 3\)"),
+        (
+            lambda seen, threshold: seen.belief > threshold,
+            r"bool of the shape \(4,\), not bool of \(4, 3\)",
+        ),
         (lambda seen, threshold: 1 / 0, "raised ZeroDivisionError"),
     ]:
         with pytest.raises(UsageError, match=words):
@@ -101,32 +127,50 @@ def test_oracle_gain_takes_the_view_that_helps_the_true_class_most(specs, knows_
     calibration, likely = Calibration(0.8, 0.5), None
     if knows_bins:
         calibration = msgspec.structs.replace(calibration, bin_correlation=0.1)
-        likely = log_softmax(np.random.default_rng(3).normal(size=(30, 40, 3, 8)), axis=3).astype(np.float32)
-    specs = replace(specs, predictions=replace(specs.predictions, calibration=calibration, azimuth_bins=likely))
+        likely = log_softmax(np.random.default_rng(3).normal(size=(30, 40, 3, 8)), axis=3).astype(
+            np.float32
+        )
+    specs = replace(
+        specs, predictions=replace(specs.predictions, calibration=calibration, azimuth_bins=likely)
+    )
     p = specs.predictions
     for name, everywhere in [("oracle-gain", False), ("oracle-gain-all", True)]:
         views = replay(name, specs, 3, seed=0).views
         for e in range(0, len(views), 7):
             i, seen = specs.objects[e], list(views[e, :2])
             around = range(40) if everywhere else p.sphere.windows[seen[-1]].ravel()
-            sums = {v: p.log_evidence[i, [*seen, v]].astype(float).sum(0) for v in around if v not in seen}
+            sums = {
+                v: p.log_evidence[i, [*seen, v]].astype(float).sum(0)
+                for v in around
+                if v not in seen
+            }
             belief = {v: calibration.belief(total, 3, 3)[p.labels[i]] for v, total in sums.items()}
             assert belief[views[e, 2]] == pytest.approx(max(belief.values()), abs=1e-9)
 
 
 def test_each_map_has_the_valley_classes_of_its_own_card():
     p = some_predictions(6)
-    lcm = {"maps": p.maps | {"lcm": p.maps["lem"]}, "valley_classes": {"lem": p.classes[:1], "lcm": p.classes[1:2]}}
+    lcm = {
+        "maps": p.maps | {"lcm": p.maps["lem"]},
+        "valley_classes": {"lem": p.classes[:1], "lcm": p.classes[1:2]},
+    }
     specs = make_specs(replace(p, **lcm), 2, 0)
     assert (specs.valley_classes("lem"), specs.valley_classes("lcm")) == ((0,), (1,))
-    peak, valley = (replay(name, specs, 2, 0).views[:, 1] for name in ("lcm-peak", "lcm-oracle-valley"))
+    peak, valley = (
+        replay(name, specs, 2, 0).views[:, 1] for name in ("lcm-peak", "lcm-oracle-valley")
+    )
     assert {*np.flatnonzero(peak != valley)} == {*np.flatnonzero(specs.labels == 1)}
 
 
 def test_a_true_map_is_found_by_the_name_of_its_measure(specs):
-    found = [replay(f"true-{name}-peak", specs, max_views=4, seed=0).views for name in ("depth_entropy", "lem")]
+    found = [
+        replay(f"true-{name}-peak", specs, max_views=4, seed=0).views
+        for name in ("depth_entropy", "lem")
+    ]
     np.testing.assert_array_equal(*found)
-    with pytest.raises(EntryError, match="no true map is called 'true-depth_entrop'; there are true-lem, "):
+    with pytest.raises(
+        EntryError, match="no true map is called 'true-depth_entrop'; there are true-lem, "
+    ):
         replay("true-depth_entrop", specs, max_views=4, seed=0)
 
 
@@ -134,7 +178,12 @@ def test_fixed_views_are_the_ones_their_name_says(specs):
     p = specs.predictions
     sure = softmax(p.logits.astype(float), axis=2)[np.arange(len(p)), :, p.labels][specs.objects]
     entropy = p.depth_entropy[specs.objects]
-    by_name = {"best-5": sure, "worst-5": -sure, "high-entropy-5": entropy, "low-entropy-5": -entropy}
+    by_name = {
+        "best-5": sure,
+        "worst-5": -sure,
+        "high-entropy-5": entropy,
+        "low-entropy-5": -entropy,
+    }
     for name, values in by_name.items():
         paths = replay(name, specs, max_views=3, seed=0)
         taken = np.take_along_axis(values, paths.views, 1)
@@ -143,7 +192,9 @@ def test_fixed_views_are_the_ones_their_name_says(specs):
         ends = truncate(paths, Stopping(0.1))
         np.testing.assert_array_equal(ends.n_views, 5)  # whatever is believed
         np.testing.assert_array_equal(ends.answer, total.argmax(1))
-        np.testing.assert_allclose(ends.confidence, softmax(total.astype(float), axis=1).max(1), rtol=1e-5)
+        np.testing.assert_allclose(
+            ends.confidence, softmax(total.astype(float), axis=1).max(1), rtol=1e-5
+        )
 
 
 @dataclass(frozen=True)
@@ -171,7 +222,9 @@ class Raises(Asked):
         ("Missing", "cannot be made"),
     ],
 )
-def test_a_policy_that_fails_is_named_with_the_object_and_the_others_are_kept(specs, name, sentence):
+def test_a_policy_that_fails_is_named_with_the_object_and_the_others_are_kept(
+    specs, name, sentence
+):
     grid = Grid(specs, 4, (0.9,), 5, 0)
     path = f"test_replay:{name}"
     assert list(run_grid(grid, ["furthest", path, "test_replay:Asked"])) == [1, 2, 3]
@@ -189,9 +242,14 @@ def test_the_contestants_are_those_that_the_predictions_allow(specs):
     with_lcm = make_specs(replace(p, maps={**p.maps, "lcm": p.maps["lem"]}), 1, 0)
     assert {"lcm", "lcm-peak", "lcm-oracle-valley"} <= set(default_entries(with_lcm))
     other = make_specs(replace(p, maps={"view_area": p.maps["lem"]}), 4, 0)  # of no valley classes
-    assert [name for name in default_entries(other) if "view_area" in name] == ["view_area", "view_area-peak"]
+    assert [name for name in default_entries(other) if "view_area" in name] == [
+        "view_area",
+        "view_area-peak",
+    ]
     for name, same in (("view_area", "lem-peak"), ("view_area-oracle-valley", "lem-peak")):
-        np.testing.assert_array_equal(replay(name, other, 3, 0).views, replay(same, specs, 3, 0).views)
+        np.testing.assert_array_equal(
+            replay(name, other, 3, 0).views, replay(same, specs, 3, 0).views
+        )
     without = make_specs(replace(p, maps={}), 1, 0)
     assert not {"lem", "lem-peak", "oracle-valley"} & set(default_entries(without))
     for name in default_entries(with_lcm):
@@ -199,7 +257,9 @@ def test_the_contestants_are_those_that_the_predictions_allow(specs):
 
 
 class ToItsBack:
-    """Goes round the ring to where the side opposite to that which the recogniser calls 0 is likely to be seen."""
+    """Goes round the ring to where the side opposite to that which the recogniser calls 0 is
+    likely to be seen.
+    """
 
     needs = ("azimuth_bins",)
 
@@ -214,14 +274,21 @@ class ToItsBack:
         return views[rows, np.where(state.visited[rows[:, None], views], -1.0, seen).argmax(1)]
 
 
-def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(furniture, models, predictions):
+def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(
+    furniture, models, predictions
+):
     p = Predictions.load(predictions).of_split("test")
     specs = make_specs(p, runs=2, seed=0)
-    networks = Models(NetworkRecogniser(models / "tiny.json", 1), {"lem": MapNetwork(models / "tiny-lem.json", 1)})
+    networks = Models(
+        NetworkRecogniser(models / "tiny.json", 1), {"lem": MapNetwork(models / "tiny-lem.json", 1)}
+    )
     # A threshold that some reach: the middle of all confidences after two views.
     threshold = float(np.median(replay("lem", specs, 2, 0).confidences[:, 1]))
     for name in ("lem", "lem-peak", "unidirectional", "test_replay:ToItsBack"):
-        policy, paths = make_policy(name, p.sphere, specs.valley_classes("lem")), replay(name, specs, 5, 0)
+        policy, paths = (
+            make_policy(name, p.sphere, specs.valley_classes("lem")),
+            replay(name, specs, 5, 0),
+        )
         stopping = Stopping.of(p.calibration, threshold, max_views=5)
         ends = truncate(paths, stopping)
         for e, (i, start) in enumerate(zip(specs.objects, specs.starts, strict=True)):
@@ -231,5 +298,6 @@ def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(furnitur
             assert [view.index for view in live.views] == paths.views[e, : ends.n_views[e]].tolist()
             assert live.answer == p.classes[ends.answer[e]]
             assert live.confident == ends.confident[e]
-            assert live.confidence == pytest.approx(ends.confidence[e], abs=0.01)  # the store rounds
+            # the store rounds
+            assert live.confidence == pytest.approx(ends.confidence[e], abs=0.01)
             assert live.travel == pytest.approx(ends.travel[e])

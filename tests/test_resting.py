@@ -72,12 +72,15 @@ def test_poses_that_look_alike_are_one_however_the_file_has_the_thing(shape, til
     mesh = of(Trimesh(away.apply(shape.vertices), shape.faces, process=False))
     upwards = np.abs(resting_poses(mesh) @ away.apply((0, 0, 1)))[:, 2]
     found = np.degrees(np.arccos(upwards.clip(max=1)))
-    expected = [turn[1], *tilts] if any(turn) else tilts  # its own pose is always among them, and the first
+    # its own pose is always among them, and the first
+    expected = [turn[1], *tilts] if any(turn) else tilts
     np.testing.assert_allclose(sorted(found), sorted(expected), atol=5)
     assert found[0] == pytest.approx(expected[0], abs=1e-3)
 
 
-@pytest.mark.parametrize("shape", [creation.icosphere(3), creation.box((1, 1, 1)), creation.icosphere(1)])
+@pytest.mark.parametrize(
+    "shape", [creation.icosphere(3), creation.box((1, 1, 1)), creation.icosphere(1)]
+)
 def test_a_ball_and_a_die_have_one_pose(shape):
     assert len(resting_poses(of(shape))) == 1
 
@@ -90,7 +93,9 @@ def test_a_handle_makes_sides_different():
 
 
 def test_what_falls_on_its_side_in_most_throws_has_that_pose():
-    """Dropped from random directions, by brute force: what points down decides on which face it lands."""
+    """Dropped from random directions, by brute force: what points down decides on which face it
+    lands.
+    """
     rng = np.random.default_rng(3)
     for shape in (cup(1.5), creation.cylinder(0.4, 2, sections=SIDE), with_handle()):
         mesh = of(shape)
@@ -103,7 +108,9 @@ def test_what_falls_on_its_side_in_most_throws_has_that_pose():
 
 
 def _rest(hull, down):
-    """The direction up after a thing fell with ``down`` ahead: it rolls over edges until its weight is above a face."""
+    """The direction up after a thing fell with ``down`` ahead: it rolls over edges until its
+    weight is above a face.
+    """
     for _ in range(100):
         face = int((hull.face_normals @ down / np.linalg.norm(down)).argmax())
         corners, normal = hull.triangles[face], hull.face_normals[face]
@@ -129,7 +136,10 @@ def test_a_fallback_is_logged(monkeypatch, caplog):
     monkeypatch.setattr(Trimesh, "convex_hull", property(fails))
     with caplog.at_level(logging.WARNING, "nextview"):
         np.testing.assert_array_equal(resting_poses(of(cup())), np.eye(3)[None])
-    assert "no convex hull (QH6154 initial simplex is flat); it is taken to lie only as in its file" in caplog.text
+    assert (
+        "no convex hull (QH6154 initial simplex is flat); it is taken to lie only as in its file"
+        in caplog.text
+    )
 
     def another(self):
         raise RuntimeError("a fault of another kind")

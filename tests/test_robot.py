@@ -1,4 +1,6 @@
-"""A session for a robot: frames of a depth camera from wherever it stands, and a robot that cannot go everywhere."""
+"""A session for a robot: frames of a depth camera from wherever it stands, and a robot that
+cannot go everywhere.
+"""
 
 import itertools
 from dataclasses import replace
@@ -25,7 +27,9 @@ from nextview.session.session import Session
 SPHERE = ViewSphere.named("40")
 SHAPE = 120, 160
 INTRINSICS = np.array([[260.0, 0, 80], [0, 260.0, 60], [0, 0, 1]])
-SOFA = trimesh.util.concatenate([box((0.2, 0.16, 0.1), (0, 0, 0.05)), box((0.06, 0.16, 0.08), (-0.07, 0, 0.14))])
+SOFA = trimesh.util.concatenate(
+    [box((0.2, 0.16, 0.1), (0, 0, 0.05)), box((0.06, 0.16, 0.08), (-0.07, 0, 0.14))]
+)
 
 
 def frame(pose, move=np.eye(4), scale=1.0, meshes=(TABLE, SOFA), masked=False, **more) -> Frame:
@@ -37,10 +41,20 @@ def frame(pose, move=np.eye(4), scale=1.0, meshes=(TABLE, SOFA), masked=False, *
     return Frame(scale * depth, INTRINSICS, moved, mask, pixel_centre=0.5, **more)
 
 
-def begin(models, policy=None, max_views=4, threshold=1.0, seed=0, sphere=SPHERE, **more) -> Session:
+def begin(
+    models, policy=None, max_views=4, threshold=1.0, seed=0, sphere=SPHERE, **more
+) -> Session:
     policy = policy or MapPeak(SPHERE, "lem")
     stopping = Stopping(threshold, max_views)
-    return Session(models, policy, sphere, 0, stopping, np.random.default_rng(seed), **({"distance": 0.7} | more))
+    return Session(
+        models,
+        policy,
+        sphere,
+        0,
+        stopping,
+        np.random.default_rng(seed),
+        **({"distance": 0.7} | more),
+    )
 
 
 def run(session, first, look=frame) -> Session:
@@ -53,8 +67,13 @@ def run(session, first, look=frame) -> Session:
 
 def snapshot(session):
     """All that a session says, for comparison."""
-    views = [(v.index, v.next_view, v.travel, v.arc, *v.belief, *v.direction, v.warnings) for v in session.views]
-    where = None if session.object is None else (len(session.object.sightings), session.object.revision)
+    views = [
+        (v.index, v.next_view, v.travel, v.arc, *v.belief, *v.direction, v.warnings)
+        for v in session.views
+    ]
+    where = (
+        None if session.object is None else (len(session.object.sightings), session.object.revision)
+    )
     return views, session.view, session.done, where
 
 
@@ -70,7 +89,9 @@ def same_decisions(a, b, atol):
 
 
 def test_the_whole_way_from_frames_to_a_name():
-    """The bundled networks name a sample chair on a table that stands anywhere, in its true size."""
+    """The bundled networks name a sample chair on a table that stands anywhere, in its true
+    size.
+    """
     mesh = sample_mesh("chair")
     chair = trimesh.Trimesh(0.12 * mesh.vertices, mesh.faces)
     chair.apply_translation([0.3, -0.2, -chair.vertices[:, 2].min()])
@@ -81,12 +102,16 @@ def test_the_whole_way_from_frames_to_a_name():
     assert session.result.confident
     assert not any(view.warnings for view in session.views)
     target = session.poses[3]
-    np.testing.assert_allclose(target[:3, 3] + 0.6 * target[:3, 2], session.object.object_frame.centre, atol=1e-9)
+    np.testing.assert_allclose(
+        target[:3, 3] + 0.6 * target[:3, 2], session.object.object_frame.centre, atol=1e-9
+    )
     assert np.linalg.norm(session.object.object_frame.centre - middle) < 0.02
 
 
 def test_a_better_object_frame_changes_what_the_earlier_views_say(tiny):
-    """Beliefs are those of all observations in the last object frame, each as if it had been seen so at once."""
+    """Beliefs are those of all observations in the last object frame, each as if it had been
+    seen so at once.
+    """
     session = begin(tiny)
     pose, firsts = pose_at(20, 30, 0.7, (0, 0, 0.08)), []
     while not session.done:
@@ -100,13 +125,24 @@ def test_a_better_object_frame_changes_what_the_earlier_views_say(tiny):
         assert view.observation is observation
         e = tiny.evidence([observation])
         x, y, _ = observation.pose[:3, 3]
-        total = total + log_evidence_of(e.logits, e.azimuth_bins, np.array([np.arctan2(y, x)])).astype(np.float64)
-    np.testing.assert_allclose(session.views[-1].belief, tiny.recogniser.calibration.belief(total, k, 3)[0], atol=1e-6)
+        total = total + log_evidence_of(
+            e.logits, e.azimuth_bins, np.array([np.arctan2(y, x)])
+        ).astype(np.float64)
+    np.testing.assert_allclose(
+        session.views[-1].belief, tiny.recogniser.calibration.belief(total, k, 3)[0], atol=1e-6
+    )
 
 
 @settings(deadline=None, max_examples=5)
-@given(st.integers(5, 70), st.integers(0, 359), st.floats(-3.1, 3.1), st.tuples(*[st.floats(-2, 2)] * 3))
-def test_moving_the_world_and_the_poses_together_changes_nothing(tiny, elevation, azimuth, turn, shift):
+@given(
+    st.integers(5, 70),
+    st.integers(0, 359),
+    st.floats(-3.1, 3.1),
+    st.tuples(*[st.floats(-2, 2)] * 3),
+)
+def test_moving_the_world_and_the_poses_together_changes_nothing(
+    tiny, elevation, azimuth, turn, shift
+):
     move = np.eye(4)
     move[:3, :3] = Rotation.from_euler("z", turn).as_matrix()
     move[:3, 3] = shift
@@ -137,11 +173,16 @@ def mistakes():
 
 
 @pytest.mark.parametrize("after", [0, 1, 2])
-@pytest.mark.parametrize(("what", "make", "error"), list(mistakes()), ids=lambda x: x if isinstance(x, str) else "")
+@pytest.mark.parametrize(
+    ("what", "make", "error"), list(mistakes()), ids=lambda x: x if isinstance(x, str) else ""
+)
 def test_a_session_is_as_it_was_after_each_mistake(tiny, what, make, error, after):
     if what == "no pose" and after == 0:
         pytest.skip("a first frame may be the only one")
-    poses = [pose_at(35, 0, 0.7, (0, 0, 0.08)), *(pose_at(35, a, 0.7, (0, 0, 0.08)) for a in (130, 250, 20))]
+    poses = [
+        pose_at(35, 0, 0.7, (0, 0, 0.08)),
+        *(pose_at(35, a, 0.7, (0, 0, 0.08)) for a in (130, 250, 20)),
+    ]
     ends = []
     for wrong in (False, True):
         session = begin(tiny, make_policy("random-all", SPHERE))
@@ -179,13 +220,21 @@ def test_the_pose_that_was_reached_counts(tiny):
 
 
 @settings(deadline=None, max_examples=30)
-@given(st.data(), st.sampled_from(["40", "fibonacci:30"]), st.sampled_from(["random-all", "spread", "lem"]))
+@given(
+    st.data(),
+    st.sampled_from(["40", "fibonacci:30"]),
+    st.sampled_from(["random-all", "spread", "lem"]),
+)
 def test_failed_and_unreachable_views_never_come(tiny, data, layout, name):
     sphere = viewpoints_of(layout)
     policy = MapPeak(SPHERE, "lem") if name == "lem" else make_policy(name, sphere)
     camera = SimulatedCamera(sample_mesh("chair"), 32)
-    session = begin(tiny, policy, sphere=sphere, max_views=6, distance=None, seed=data.draw(st.integers(0, 99)))
-    mask = np.random.default_rng(data.draw(st.integers(0, 999))).random(len(sphere)) < data.draw(st.floats(0.05, 1))
+    session = begin(
+        tiny, policy, sphere=sphere, max_views=6, distance=None, seed=data.draw(st.integers(0, 99))
+    )
+    mask = np.random.default_rng(data.draw(st.integers(0, 999))).random(len(sphere)) < data.draw(
+        st.floats(0.05, 1)
+    )
     assume(mask.any())
     session.reachable = mask
     if data.draw(st.booleans()):
@@ -227,7 +276,9 @@ def test_a_view_that_becomes_unreachable_is_replaced_at_once(tiny):
 
 
 def test_travel_in_seconds_is_weighed_as_travel_in_cells(tiny):
-    """A cost that is proportional to travel changes nothing; another one is what decides where gains are alike."""
+    """A cost that is proportional to travel changes nothing; another one is what decides where
+    gains are alike.
+    """
 
     class Flat:
         """Values all views alike."""
@@ -286,7 +337,9 @@ def test_reach_and_cost_are_asked_in_the_world(tiny):
 def test_a_distance_that_cannot_be_is_refused_once_the_radius_is_known(tiny, distance, words):
     session = begin(tiny, distance=distance)
     before = snapshot(session)
-    with pytest.raises(UsageError, match=f"{distance} m from the centre of an object of 0.16 m radius .*{words}"):
+    with pytest.raises(
+        UsageError, match=f"{distance} m from the centre of an object of 0.16 m radius .*{words}"
+    ):
         session.update(frame(pose_at(20, 30, 0.7, (0, 0, 0.08))))
     assert snapshot(session) == before
 
@@ -296,11 +349,16 @@ def test_a_small_thing_may_be_looked_at_from_some_way_off(tiny):
     session = begin(tiny, distance=0.7)
     session.update(frame(pose_at(30, 30, 0.3, (0, 0, 0.01)), meshes=(TABLE, die)))
     assert session.object.object_frame.radius < 0.03
-    assert np.linalg.norm(session.target[:3, 3] - session.object.object_frame.centre) == pytest.approx(0.7)
+    assert np.linalg.norm(
+        session.target[:3, 3] - session.object.object_frame.centre
+    ) == pytest.approx(0.7)
 
 
 def test_a_frame_that_comes_again_counts_once_and_moves_no_object(tiny):
-    """Whatever pose is told with it. The camera is asked for the same view still, as nobody knows where it was."""
+    """Whatever pose is told with it.
+
+    The camera is asked for the same view still, as nobody knows where it was.
+    """
     first = frame(pose_at(20, 30, 0.7, (0, 0, 0.08)))
     session = begin(tiny)
     session.update(first)

@@ -1,4 +1,6 @@
-"""Finding an object in a room: walls, support planes, what stands aside or far behind, and flying pixels."""
+"""Finding an object in a room: walls, support planes, what stands aside or far behind, and
+flying pixels.
+"""
 
 import numpy as np
 import pytest
@@ -21,7 +23,9 @@ FLOOR = box((12, 12, 0.02), (0, 0, -0.01))
 FAR_WALL = box((0.02, 12, 3), (-3.0, 0, 1.4))
 NEAR_WALL = box((0.02, 12, 3), (-0.5, 0, 1.4))
 SIDE_WALL = box((12, 0.02, 3), (0, 1.2, 1.4))
-SLANTED_WALL = box((0.02, 14, 3)).apply_transform(trimesh.transformations.rotation_matrix(0.6, UP, (0, 0, 0)))
+SLANTED_WALL = box((0.02, 14, 3)).apply_transform(
+    trimesh.transformations.rotation_matrix(0.6, UP, (0, 0, 0))
+)
 SLANTED_WALL.apply_translation((-2.5, 0, 1.4))
 CRATE = box((0.4, 0.4, 0.4), (0.2, 0.9, 0.2))
 
@@ -40,7 +44,9 @@ DESK = trimesh.util.concatenate(
     + [box((0.05, 0.05, 0.68), (x, y, 0.34)) for x in (-0.35, 0.35) for y in (-0.7, 0.7)]
 )
 MONITOR = sample_of_size("monitor", 0.45, (0, 0.1, 0.72))
-BED = trimesh.util.concatenate([box((2.0, 1.5, 0.45), (0, 0, 0.225)), box((0.06, 1.5, 0.5), (-1.0, 0, 0.7))])
+BED = trimesh.util.concatenate(
+    [box((2.0, 1.5, 0.45), (0, 0, 0.225)), box((0.06, 1.5, 0.5), (-1.0, 0, 0.7))]
+)
 SOFA = trimesh.util.concatenate(
     [box((0.9, 1.8, 0.4), (0, 0, 0.2)), box((0.2, 1.8, 0.45), (-0.35, 0, 0.62))]
     + [box((0.9, 0.2, 0.25), (0, y, 0.52)) for y in (-0.8, 0.8)]
@@ -57,7 +63,13 @@ def frame(meshes, pose, seed=0, sigma=0.003, mask_of=None, wide=0) -> Frame:
     if mask_of is not None:
         mask = which == mask_of
         for _ in range(wide):
-            mask = mask | np.roll(mask, 1, 0) | np.roll(mask, -1, 0) | np.roll(mask, 1, 1) | np.roll(mask, -1, 1)
+            mask = (
+                mask
+                | np.roll(mask, 1, 0)
+                | np.roll(mask, -1, 0)
+                | np.roll(mask, 1, 1)
+                | np.roll(mask, -1, 1)
+            )
     return Frame(np.where(depth > 0, noisy, 0), INTRINSICS, pose, mask=mask, pixel_centre=0.5)
 
 
@@ -125,7 +137,10 @@ def test_a_front_that_fills_the_picture_is_no_wall_where_the_object_is_behind_it
 @pytest.mark.parametrize("elevation", [10, 25])
 def test_what_is_far_behind_a_table_does_not_draw_the_eye(elevation, behind, asked):
     mug = box((0.08, 0.08, 0.1), (0.1, 0, 0.05))
-    clutter = [box((0.02, 3, 2), (-behind, 0, 0.2)), box((0.3, 0.5, 0.8), (-behind + 0.4, 0.3, -0.1))]
+    clutter = [
+        box((0.02, 3, 2), (-behind, 0, 0.2)),
+        box((0.3, 0.5, 0.8), (-behind + 0.4, 0.3, -0.1)),
+    ]
     thing = ObservedObject(point=middle_of(mug) if asked == "point" else None)
     pose = pose_at(elevation, 35, 0.5, middle_of(mug))
     thing.add(frame([mug, box((0.9, 1.2, 0.04), (0, 0, -0.02)), *clutter], pose))
@@ -153,7 +168,12 @@ def test_a_monitor_stands_on_its_desk(asked, elevation):
     target = middle_of(MONITOR)
     thing = ObservedObject(point=target if asked == "point" else None)
     by_mask = 0 if "mask" in asked else None
-    seen = frame([MONITOR, DESK, FLOOR, FAR_WALL], pose_at(elevation, 15, 2.0, target), mask_of=by_mask, wide=2)
+    seen = frame(
+        [MONITOR, DESK, FLOOR, FAR_WALL],
+        pose_at(elevation, 15, 2.0, target),
+        mask_of=by_mask,
+        wide=2,
+    )
     thing.add(seen)
     assert_is(thing, MONITOR, radius=0.2)
 
@@ -165,7 +185,9 @@ def test_a_level_part_of_the_object_is_not_its_support(mesh, asked, azimuth):
     target = middle_of(mesh)
     thing = ObservedObject(point=target if asked == "point" else None)
     scene = [mesh, FLOOR, box((0.02, 12, 3), (-1.6, 0, 1.4))]
-    thing.add(frame(scene, pose_at(18, azimuth, 3.2, target), mask_of=0 if asked == "mask" else None))
+    thing.add(
+        frame(scene, pose_at(18, azimuth, 3.2, target), mask_of=0 if asked == "mask" else None)
+    )
     assert_is(thing, mesh)
 
 
@@ -176,7 +198,9 @@ def test_a_level_part_of_the_object_is_not_its_support(mesh, asked, azimuth):
 @pytest.mark.parametrize("elevation", [4, 20])
 def test_a_top_is_held_by_the_foot_that_shows_below_it(elevation, gap):
     side = 0.2 + 2 * gap
-    table = trimesh.util.concatenate([box((side, 2 * side, 0.05), (0, 0, 0.7)), box((0.2, 0.2, 0.68), (0, 0, 0.34))])
+    table = trimesh.util.concatenate(
+        [box((side, 2 * side, 0.05), (0, 0, 0.7)), box((0.2, 0.2, 0.68), (0, 0, 0.34))]
+    )
     thing = ObservedObject(point=middle_of(table))
     thing.add(frame([table, FLOOR, FAR_WALL], pose_at(elevation, 10, 2.2, middle_of(table))))
     assert_is(thing, table)
@@ -233,13 +257,20 @@ def test_what_stands_in_a_corner_is_no_part_of_it(azimuth):
     corner = [box((0.06, 1.2, 0.9), (-0.6, 0, 0.45)), box((1.2, 0.06, 0.9), (0, 0.6, 0.45))]
     crate = box((0.2, 0.2, 0.25), (-0.15, 0.15, 0.125))
     thing = ObservedObject(point=middle_of(crate))
-    thing.add(frame([crate, trimesh.util.concatenate(corner), FLOOR], pose_at(30, azimuth, 2.2, middle_of(crate))))
+    thing.add(
+        frame(
+            [crate, trimesh.util.concatenate(corner), FLOOR],
+            pose_at(30, azimuth, 2.2, middle_of(crate)),
+        )
+    )
     assert_is(thing, crate)
 
 
 @pytest.mark.parametrize("shift", [-0.8, 0.8])
 @pytest.mark.parametrize("share", [0.0, 0.004])
-def test_where_noise_is_large_few_pixels_before_and_behind_a_thing_say_nothing_of_its_size(share, shift):
+def test_where_noise_is_large_few_pixels_before_and_behind_a_thing_say_nothing_of_its_size(
+    share, shift
+):
     crate = box((0.4, 0.5, 0.5), (0, 0, 0.25))
     pose = pose_at(20, 30, 3.0, middle_of(crate))
     seen = frame([crate, FLOOR], pose, sigma=0.008, mask_of=0)
@@ -271,7 +302,9 @@ def test_thin_things_keep_their_length(thick):
 
 
 def test_a_second_look_does_not_make_an_object_of_another_order_of_size(monkeypatch):
-    """All on the table would count as one where what touches is joined, and the score would prefer it."""
+    """All on the table would count as one where what touches is joined, and the score would
+    prefer it.
+    """
     parted = clusters.clusters
 
     def all_as_one(footprints, joins="by their border"):
@@ -288,7 +321,9 @@ def test_a_second_look_does_not_make_an_object_of_another_order_of_size(monkeypa
     assert thing.object_frame.radius == before < 0.1
 
 
-@pytest.mark.parametrize("mesh", [BED, SOFA, DESK, CUPBOARD], ids=["bed", "sofa", "desk", "cupboard"])
+@pytest.mark.parametrize(
+    "mesh", [BED, SOFA, DESK, CUPBOARD], ids=["bed", "sofa", "desk", "cupboard"]
+)
 @pytest.mark.parametrize("sigma", [0.001, 0.008])
 def test_depth_is_told_from_range_in_a_room(mesh, sigma):
     target = middle_of(mesh)
@@ -300,4 +335,6 @@ def test_depth_is_told_from_range_in_a_room(mesh, sigma):
     floor = frame([FLOOR], look_at_origin(np.radians(60), 0, 1.5), sigma=0.001)
     range_image = floor.depth * np.linalg.norm(rays, axis=-1)
     with pytest.raises(ObservationError, match="a range"):
-        ObservedObject().add(Frame(range_image.astype(np.float32), INTRINSICS, floor.pose, pixel_centre=0.5))
+        ObservedObject().add(
+            Frame(range_image.astype(np.float32), INTRINSICS, floor.pose, pixel_centre=0.5)
+        )

@@ -1,4 +1,7 @@
-"""The ROS 2 package: what it makes of messages that a bag has recorded. ROS itself is not here; ``rosbags`` is."""
+"""The ROS 2 package: what it makes of messages that a bag has recorded.
+
+ROS itself is not here; ``rosbags`` is.
+"""
 
 import ast
 import importlib
@@ -31,10 +34,25 @@ K = np.array([[260.0, 0, 79.5], [0, 265.0, 59.5], [0, 0, 1]])
 """First pixel's centre at 0, as in ROS."""
 SHAPE = 120, 160
 ROS_MODULES = (
-    "geometry_msgs", "geometry_msgs.msg", "message_filters", "nextview_msgs", "nextview_msgs.action", "rclpy",
-    "rclpy.action", "rclpy.callback_groups", "rclpy.duration", "rclpy.executors", "rclpy.node", "rclpy.qos",
-    "rclpy.time", "sensor_msgs", "sensor_msgs.msg", "std_srvs", "std_srvs.srv", "tf2_ros",
-)  # fmt: skip
+    "geometry_msgs",
+    "geometry_msgs.msg",
+    "message_filters",
+    "nextview_msgs",
+    "nextview_msgs.action",
+    "rclpy",
+    "rclpy.action",
+    "rclpy.callback_groups",
+    "rclpy.duration",
+    "rclpy.executors",
+    "rclpy.node",
+    "rclpy.qos",
+    "rclpy.time",
+    "sensor_msgs",
+    "sensor_msgs.msg",
+    "std_srvs",
+    "std_srvs.srv",
+    "tf2_ros",
+)
 """What the node imports from ROS."""
 
 
@@ -52,25 +70,52 @@ def image_message(depth, encoding, big=False, padding=0, **more):
     kind = np.dtype({"16UC1": "u2", "32FC1": "f4"}[encoding]).newbyteorder(">" if big else "<")
     rows = np.ascontiguousarray(depth, kind).view(np.uint8)
     rows = np.pad(rows.reshape(len(depth), -1), ((0, 0), (0, padding)), constant_values=7)
-    fields = {"height": depth.shape[0], "width": depth.shape[1], "encoding": encoding, "is_bigendian": int(big)}
+    fields = {
+        "height": depth.shape[0],
+        "width": depth.shape[1],
+        "encoding": encoding,
+        "is_bigendian": int(big),
+    }
     fields |= {"header": header("optical"), "step": rows.shape[1], "data": rows.ravel()}
     return message("sensor_msgs/msg/Image", **(fields | more))
 
 
 def roi(offset):
-    return message("sensor_msgs/msg/RegionOfInterest", x_offset=offset, y_offset=0, height=0, width=0, do_rectify=False)
+    return message(
+        "sensor_msgs/msg/RegionOfInterest",
+        x_offset=offset,
+        y_offset=0,
+        height=0,
+        width=0,
+        do_rectify=False,
+    )
 
 
 def info_message(k=K, shape=SHAPE, d=(), p=None, **more):
     p = np.hstack([k, np.zeros((3, 1))]) if p is None else p
-    fields = {"header": header("optical"), "height": shape[0], "width": shape[1], "distortion_model": "plumb_bob"}
-    fields |= {"d": np.array(d, float), "k": np.array(k, float).ravel(), "r": np.eye(3).ravel(), "p": p.ravel()}
-    return message("sensor_msgs/msg/CameraInfo", **(fields | {"binning_x": 0, "binning_y": 0, "roi": roi(0)} | more))
+    fields = {
+        "header": header("optical"),
+        "height": shape[0],
+        "width": shape[1],
+        "distortion_model": "plumb_bob",
+    }
+    fields |= {
+        "d": np.array(d, float),
+        "k": np.array(k, float).ravel(),
+        "r": np.eye(3).ravel(),
+        "p": p.ravel(),
+    }
+    return message(
+        "sensor_msgs/msg/CameraInfo",
+        **(fields | {"binning_x": 0, "binning_y": 0, "roi": roi(0)} | more),
+    )
 
 
 def transform_message(pose, child="optical", time=12.5):
     x, y, z, w = map(float, Rotation.from_matrix(pose[:3, :3]).as_quat())
-    translation = message("geometry_msgs/msg/Vector3", **dict(zip("xyz", map(float, pose[:3, 3]), strict=True)))
+    translation = message(
+        "geometry_msgs/msg/Vector3", **dict(zip("xyz", map(float, pose[:3, 3]), strict=True))
+    )
     rotation = message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
     transform = message("geometry_msgs/msg/Transform", translation=translation, rotation=rotation)
     fields = {"header": header("world", time), "child_frame_id": child, "transform": transform}
@@ -78,14 +123,19 @@ def transform_message(pose, child="optical", time=12.5):
 
 
 def recorded(folder, views):
-    """Messages by topic as they come out of a bag into which they were written: (image, info, transform) of each."""
+    """Messages by topic as they come out of a bag into which they were written: (image, info,
+    transform) of each.
+    """
     topics = {
         "depth": "sensor_msgs/msg/Image",
         "camera_info": "sensor_msgs/msg/CameraInfo",
         "tf": "tf2_msgs/msg/TFMessage",
     }
     with Writer(folder, version=9) as bag:
-        connections = {topic: bag.add_connection(topic, kind, typestore=STORE) for topic, kind in topics.items()}
+        connections = {
+            topic: bag.add_connection(topic, kind, typestore=STORE)
+            for topic, kind in topics.items()
+        }
         for k, (image, info, transform) in enumerate(views):
             for topic, what in (("depth", image), ("camera_info", info), ("tf", [transform])):
                 what = message("tf2_msgs/msg/TFMessage", transforms=what) if topic == "tf" else what
@@ -94,7 +144,14 @@ def recorded(folder, views):
     with Reader(folder) as bag:
         for connection, _, data in bag.messages():
             found[connection.topic].append(STORE.deserialize_cdr(data, connection.msgtype))
-    return list(zip(found["depth"], found["camera_info"], [tf.transforms[0] for tf in found["tf"]], strict=True))
+    return list(
+        zip(
+            found["depth"],
+            found["camera_info"],
+            [tf.transforms[0] for tf in found["tf"]],
+            strict=True,
+        )
+    )
 
 
 @pytest.fixture(scope="module")
@@ -108,13 +165,18 @@ def depth():
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
 def test_a_recorded_image_is_what_the_camera_saw(tmp_path, depth, encoding, padding, big):
     pose = pose_at(40, 70, 0.7, (0.4, 0.1, 0.0), turn=(3, -2, 5))
-    given = np.rint(1000 * depth).astype(np.uint16) if encoding == "16UC1" else np.where(depth > 0, depth, np.nan)
+    given = (
+        np.rint(1000 * depth).astype(np.uint16)
+        if encoding == "16UC1"
+        else np.where(depth > 0, depth, np.nan)
+    )
     written = image_message(given, encoding, big, padding), info_message(), transform_message(pose)
     ((image, info, transform),) = recorded(tmp_path / "bag", [written])
     frame = conversion.frame_of(image, info, transform)
     np.testing.assert_allclose(frame.depth, depth, atol=6e-4 if encoding == "16UC1" else 0)
     np.testing.assert_allclose(frame.pose, pose, atol=1e-9)
-    np.testing.assert_allclose(frame.intrinsics[:2, 2], [80, 60])  # the first pixel's centre is at 0.5 here
+    # the first pixel's centre is at 0.5 here
+    np.testing.assert_allclose(frame.intrinsics[:2, 2], [80, 60])
 
 
 def test_rectified_images_have_the_intrinsics_of_p():
@@ -132,21 +194,30 @@ def test_rectified_images_have_the_intrinsics_of_p():
         ({"info": {"width": 320}}, "its camera_info 320 x 120"),
         ({"info": {"roi": roi(8)}}, "binned or cropped"),
         ({"info": {"k": np.zeros(9)}}, "not calibrated: k of camera_info is zero"),
-        ({"info": {"header": header("depth_link")}}, "frames differ: 'optical' of the image, 'depth_link'"),
+        (
+            {"info": {"header": header("depth_link")}},
+            "frames differ: 'optical' of the image, 'depth_link'",
+        ),
         ({"info": {"header": header("optical", 12.6)}}, "0.100 s apart"),
         ({"transform": {"child_frame_id": "base_link"}}, "'base_link' of the transform"),
         ({"transform": {"header": header("world", 11.5)}}, "1.000 s apart"),
     ],
 )
 def test_messages_that_cannot_be_used_are_refused(depth, wrong, match):
-    made = {"image": image_message(depth, "32FC1"), "info": info_message(), "transform": transform_message(np.eye(4))}
+    made = {
+        "image": image_message(depth, "32FC1"),
+        "info": info_message(),
+        "transform": transform_message(np.eye(4)),
+    }
     made |= {name: replace(made[name], **fields) for name, fields in wrong.items()}
     with pytest.raises(ObservationError, match=match):
         conversion.frame_of(**made)
 
 
 def test_an_episode_from_a_bag_is_that_of_the_frames(tmp_path):
-    """Three views of a chair on a table, recorded and played back, end as the same frames without ROS do."""
+    """Three views of a chair on a table, recorded and played back, end as the same frames
+    without ROS do.
+    """
     mesh = sample_mesh("chair")
     chair = box((0.1, 0.1, 0.1))
     chair.vertices, chair.faces = 0.12 * mesh.vertices, mesh.faces
@@ -155,13 +226,22 @@ def test_an_episode_from_a_bag_is_that_of_the_frames(tmp_path):
     frames, messages = [], []
     for azimuth in (20, 110, 250):
         pose = pose_at(35, azimuth, 0.6, chair.bounds.mean(0))
-        depth, _ = cast((TABLE, chair), pose, k + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), shape)
+        depth, _ = cast(
+            (TABLE, chair), pose, k + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), shape
+        )
         depth = np.rint(1000 * depth).astype(np.uint16)
         frames.append(Frame(depth, k, pose))
-        messages.append((image_message(depth, "16UC1"), info_message(k, shape), transform_message(pose)))
+        messages.append(
+            (image_message(depth, "16UC1"), info_message(k, shape), transform_message(pose))
+        )
     ends = []
-    for given in (frames, [conversion.frame_of(*each) for each in recorded(tmp_path / "bag", messages)]):
-        session = nextview.load(threshold=1.0, max_views=3).session(object=ObservedObject(life_size=False))
+    for given in (
+        frames,
+        [conversion.frame_of(*each) for each in recorded(tmp_path / "bag", messages)],
+    ):
+        session = nextview.load(threshold=1.0, max_views=3).session(
+            object=ObservedObject(life_size=False)
+        )
         for frame in given:
             session.update(frame)
         ends.append(session)
@@ -174,16 +254,24 @@ def test_an_episode_from_a_bag_is_that_of_the_frames(tmp_path):
 
 @pytest.fixture
 def node(monkeypatch):
-    """A node that was never started, with a session before its first look; what it publishes is kept."""
+    """A node that was never started, with a session before its first look; what it publishes is
+    kept.
+    """
     for name in ROS_MODULES:
         monkeypatch.setitem(sys.modules, name, MagicMock())
     monkeypatch.setattr(sys.modules["rclpy.node"], "Node", object)
-    monkeypatch.setattr(sys.modules["tf2_ros"], "TransformException", type("TransformException", (Exception,), {}))
+    monkeypatch.setattr(
+        sys.modules["tf2_ros"], "TransformException", type("TransformException", (Exception,), {})
+    )
     monkeypatch.delitem(sys.modules, "nextview_ros.node", raising=False)
     made = object.__new__(importlib.import_module("nextview_ros.node").RecogniseNode)
     made.session = nextview.load().session(object=ObservedObject(life_size=False), distance=0.5)
     made.busy, made.ended, made.goal = threading.Lock(), threading.Event(), MagicMock()
-    made.next_pose, made.value, made.get_clock = MagicMock(), {"axes": "opencv", "world_frame": "base"}.get, MagicMock()
+    made.next_pose, made.value, made.get_clock = (
+        MagicMock(),
+        {"axes": "opencv", "world_frame": "base"}.get,
+        MagicMock(),
+    )
     return made
 
 
@@ -193,11 +281,15 @@ def test_a_pose_that_fails_before_the_first_look_is_an_answer(node):
     assert "call look" in answer.message
     assert not node.busy.locked()
     node.session = None
-    assert node.failed(None, SimpleNamespace(success=None, message=None)).message == "no goal is active"
+    assert (
+        node.failed(None, SimpleNamespace(success=None, message=None)).message
+        == "no goal is active"
+    )
 
 
 def test_whatever_fails_while_the_node_answers_is_an_answer(node, monkeypatch):
-    monkeypatch.setattr(type(node), "tell", lambda self: self.session.target)  # before the first look there is none
+    # before the first look there is none
+    monkeypatch.setattr(type(node), "tell", lambda self: self.session.target)
     answer = node.answer(SimpleNamespace(success=None, message=None), lambda session: None)
     assert answer.success is False
     assert answer.message
@@ -213,8 +305,12 @@ def test_the_pose_of_the_thing_goes_into_a_message(node, monkeypatch):
     message = node.pose_of(SimpleNamespace(pose=pose))
     assert message.header.frame_id == "base"
     x, y, z, w = (getattr(message.pose.orientation, part) for part in "xyzw")
-    np.testing.assert_allclose(Rotation.from_quat([x, y, z, w]).as_matrix(), pose[:3, :3], atol=1e-9)
-    np.testing.assert_allclose([getattr(message.pose.position, part) for part in "xyz"], pose[:3, 3])
+    np.testing.assert_allclose(
+        Rotation.from_quat([x, y, z, w]).as_matrix(), pose[:3, :3], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        [getattr(message.pose.position, part) for part in "xyz"], pose[:3, 3]
+    )
     assert node.pose_of(SimpleNamespace(pose=None)).header.frame_id == ""
 
 
@@ -228,7 +324,11 @@ def test_its_python_compiles_and_finds_what_it_takes_from_nextview(path):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("nextview."):
             module = __import__(node.module, fromlist=["_"])
             assert all(hasattr(module, name.name) for name in node.names)
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "nextview":
+        if (
+            isinstance(node, ast.Attribute)
+            and isinstance(node.value, ast.Name)
+            and node.value.id == "nextview"
+        ):
             assert hasattr(nextview, node.attr)
 
 
@@ -243,9 +343,17 @@ def test_the_action_is_what_the_node_fills():
     tree = ast.parse((ROS / "nextview_ros/nextview_ros/node.py").read_text())
     used = {"asked": set(), "feedback": set()}
     for node in ast.walk(tree):
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in used:
+        if (
+            isinstance(node, ast.Attribute)
+            and isinstance(node.value, ast.Name)
+            and node.value.id in used
+        ):
             used[node.value.id].add(node.attr)
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "Recognise.Result" and node.keywords:
+        if (
+            isinstance(node, ast.Call)
+            and ast.unparse(node.func) == "Recognise.Result"
+            and node.keywords
+        ):
             assert {word.arg for word in node.keywords} == fields["Result"]
     assert used == {"asked": fields["Goal"], "feedback": fields["Feedback"]}
 

@@ -1,4 +1,6 @@
-"""Choosing views among things: what is expected to show, by closed forms; policies by it; scenes in replay and live."""
+"""Choosing views among things: what is expected to show, by closed forms; policies by it; scenes
+in replay and live.
+"""
 
 import runpy
 from dataclasses import replace
@@ -76,7 +78,9 @@ def test_a_box_hides_what_is_behind_it_as_far_as_a_camera_without_errors_says():
 
 def test_the_denser_unseen_space_is_taken_to_be_the_less_shows():
     seen = SeenScene.of(looks(scene_of(BEFORE), 12))
-    shares = [expected_visibility(seen, POSITIONS, density).expected for density in (0, 0.2, 1, 1000)]
+    shares = [
+        expected_visibility(seen, POSITIONS, density).expected for density in (0, 0.2, 1, 1000)
+    ]
     for more, less in pairwise(shares):
         assert (less <= more + 1e-12).all()
     found = expected_visibility(seen, POSITIONS)
@@ -96,11 +100,16 @@ def test_visibility_goes_where_most_shows_and_may_go():
     assert policy.next_views(state_of(share, reachable=reachable), rng)[0] == 29
     near = make_policy("visibility@10", GRID).next_views(state_of(share), rng)[0]
     assert GRID.travel[0, near] == 1
-    assert len({int(policy.next_views(state_of(np.ones(40)), rng)[0]) for _ in range(50)}) > 10  # by chance
+    # by chance
+    assert len({int(policy.next_views(state_of(np.ones(40)), rng)[0]) for _ in range(50)}) > 10
 
 
 def test_the_product_goes_where_gain_goes_if_everything_shows():
-    rng, gain, product = np.random.default_rng(0), make_policy("gain", GRID), make_policy("visible-gain", GRID)
+    rng, gain, product = (
+        np.random.default_rng(0),
+        make_policy("gain", GRID),
+        make_policy("visible-gain", GRID),
+    )
     assert product.travel_weight == gain.travel_weight
     for _ in range(20):
         state = state_of(np.ones(40), rng.dirichlet(np.ones(10), 1))
@@ -170,11 +179,15 @@ def test_what_is_expected_in_a_store_is_what_its_frames_say(cluttered_views):
     visited[0, [3, 17]] = visited[1, [3]] = visited[2, [17, 3]] = True
     found = sight.visibility(np.array([2, 2, 2]), visited)
     scene = scene_views(opened, 3)
-    expected = expected_visibility(SeenScene.of([scene.scene_view(3), scene.scene_view(17)]), POSITIONS).expected
+    expected = expected_visibility(
+        SeenScene.of([scene.scene_view(3), scene.scene_view(17)]), POSITIONS
+    ).expected
     np.testing.assert_allclose(found[0], expected, atol=1e-6)
     np.testing.assert_array_equal(found[0], found[2])
     assert not np.allclose(found[0], found[1])
-    np.testing.assert_array_equal(sight.of_scenes(np.array([2, 0])).visibility(np.array([0]), visited[:1]), found[:1])
+    np.testing.assert_array_equal(
+        sight.of_scenes(np.array([2, 0])).visibility(np.array([0]), visited[:1]), found[:1]
+    )
     with pytest.raises(DatasetError, match="holds no scene"):
         SceneSight.of(opened, ["nothing@light-0"])
 
@@ -199,7 +212,9 @@ def test_visibility_sees_more_than_random_in_scenes(predictions):
     specs = make_specs(predictions, 4, 0)
     share = ViewStore.open(predictions.store).measure("visible_share")
     names = ("random-all", "visibility", "true-visible_share-all")
-    random, visibility, best = (share[specs.objects, replay(n, specs, 2, 0).views[:, 1]].mean() for n in names)
+    random, visibility, best = (
+        share[specs.objects, replay(n, specs, 2, 0).views[:, 1]].mean() for n in names
+    )
     assert random + 0.1 < visibility <= best
 
 
@@ -219,12 +234,18 @@ def test_gain_learns_in_scenes_what_to_make_of_what_shows(predictions, tmp_path)
 
     train = np.array(["train"] * len(predictions))
     replace(predictions, splits=train).save(tmp_path / "p.npz")
-    recipe = GainRecipe(("belief", "place", "visibility"), "camera", epochs=1, episodes=1, networks_per_fold=1)
-    made = train_gain(tmp_path / "p.npz", tmp_path / "in-scenes.json", recipe=recipe, folds=2, travel_weight=0.01)
+    recipe = GainRecipe(
+        ("belief", "place", "visibility"), "camera", epochs=1, episodes=1, networks_per_fold=1
+    )
+    made = train_gain(
+        tmp_path / "p.npz", tmp_path / "in-scenes.json", recipe=recipe, folds=2, travel_weight=0.01
+    )
     assert made.objects == len(predictions)
     assert make_policy(str(made.card), GRID, classes=predictions.classes).needs == ("visibility",)
     specs = make_specs(predictions, 1, 0)
-    assert specs.scenes.reachable[specs.objects[:, None], replay(str(made.card), specs, 4, 0).views].all()
+    assert specs.scenes.reachable[
+        specs.objects[:, None], replay(str(made.card), specs, 4, 0).views
+    ].all()
     replace(some_predictions(), splits=train).save(tmp_path / "alone.npz")
     with pytest.raises(PredictionsError, match="of no scenes"):
         train_gain(tmp_path / "alone.npz", tmp_path / "alone.json", recipe=recipe, folds=2)
@@ -235,7 +256,9 @@ def test_gain_learns_in_scenes_what_to_make_of_what_shows(predictions, tmp_path)
 
 def test_scenes_without_their_store_are_not_taken_for_single_objects(predictions, tmp_path):
     lost = replace(predictions, store=str(tmp_path / "lost.zarr"))
-    with pytest.raises(DatasetError, match=r"of scenes, and there is no view store at .*lost.zarr any more"):
+    with pytest.raises(
+        DatasetError, match=r"of scenes, and there is no view store at .*lost.zarr any more"
+    ):
         make_specs(lost, 1, 0)
     with pytest.raises(DatasetError, match="are of scenes, and name no view store; predict again"):
         make_specs(replace(predictions, store=""), 1, 0)
@@ -250,7 +273,9 @@ def test_scenes_around_one_target_are_drawn_together():
         np.testing.assert_array_equal(weights[:, 0], weights[:, same])
     np.testing.assert_array_equal(weights[:, [0, 1, 3]].sum(1), 3)  # as many targets as there are
     plain = statistics.resample(5, 200, np.random.default_rng(0))
-    np.testing.assert_array_equal(target_weights(tuple("abcde"), 200, np.random.default_rng(0)), plain)
+    np.testing.assert_array_equal(
+        target_weights(tuple("abcde"), 200, np.random.default_rng(0)), plain
+    )
 
 
 def test_what_the_script_judges_is_what_replay_believes(predictions):
@@ -261,7 +286,9 @@ def test_what_the_script_judges_is_what_replay_believes(predictions):
     np.testing.assert_allclose(found.confidence, path.confidences, rtol=1e-6)
     sure = found.confidence > 0.11  # else all classes are alike
     np.testing.assert_array_equal(found.right[sure], (path.answers == specs.labels[:, None])[sure])
-    np.testing.assert_allclose(found.loss[found.right], -np.log(found.confidence[found.right]), rtol=1e-6)
+    np.testing.assert_allclose(
+        found.loss[found.right], -np.log(found.confidence[found.right]), rtol=1e-6
+    )
     assert (found.loss[~found.right] >= np.log(2)).all()
 
 
@@ -276,7 +303,14 @@ def test_a_robot_sees_around_a_box(named):
     assert truth[0] < 0.6 < truth[3]
     camera = RobotCamera(scene, named=named)
     system = nextview.load(policy="visibility")
-    session = Session(system.models, system.policy, system.sphere, 0, FixedLength(max_views=3), object=camera.object)
+    session = Session(
+        system.models,
+        system.policy,
+        system.sphere,
+        0,
+        FixedLength(max_views=3),
+        object=camera.object,
+    )
     session.reachable = camera.reachable
     while not session.done:
         session.update(camera.observe(session.pose))

@@ -1,4 +1,6 @@
-"""Scenes: what hides what, by closed forms and another ray caster; nothing overlaps; the same seed, the same scene."""
+"""Scenes: what hides what, by closed forms and another ray caster; nothing overlaps; the same
+seed, the same scene.
+"""
 
 from itertools import combinations
 
@@ -17,7 +19,14 @@ from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.simulation.robot_camera import RobotCamera
 from nextview.simulation.scene import TABLE, Scene, block_item, build_scene, footprint, separation
 from nextview.simulation.scene_layout import LEVELS, Block, SceneLayout
-from nextview.simulation.simulated import NOTHING, OTHER, TABLE_TOP, TARGET, OccludedCamera, SceneCamera
+from nextview.simulation.simulated import (
+    NOTHING,
+    OTHER,
+    TABLE_TOP,
+    TARGET,
+    OccludedCamera,
+    SceneCamera,
+)
 
 GRID = ViewSphere.named("40")
 BALL = pipeline.meshed(trimesh.creation.icosphere(4))
@@ -63,11 +72,16 @@ def test_shares_are_those_of_another_ray_caster(cluttered, furniture):
     path = sorted(cluttered.rglob("*heavy*.json"))[0]
     layout, k = SceneLayout.load(path), np.array([[60.0, 0, 32], [0, 60.0, 32], [0, 0, 1]])
     scene = build_scene(layout, furniture)
-    things = [trimesh.Trimesh(item.vertices, item.faces, process=False) for item in (scene.target, *scene.items)]
+    things = [
+        trimesh.Trimesh(item.vertices, item.faces, process=False)
+        for item in (scene.target, *scene.items)
+    ]
     for view in (3, 14, 25, 36):
         _, alone = pipeline.cast(things[:1], GRID.poses[view], k, (64, 64))
         _, among = pipeline.cast(things, GRID.poses[view], k, (64, 64))
-        assert layout.visible[view] == pytest.approx((among == 0).sum() / (alone == 0).sum(), abs=0.03)
+        assert layout.visible[view] == pytest.approx(
+            (among == 0).sum() / (alone == 0).sum(), abs=0.03
+        )
 
 
 # Where things stand
@@ -79,8 +93,13 @@ def test_separation_of_squares():
     assert separation(square, square + np.array([0.75, 0.2])) == pytest.approx(-0.25)
     diamond = np.array([[0.5, -0.5], [1.5, 0.5], [0.5, 1.5], [-0.5, 0.5]])
     assert separation(square, diamond + np.array([2, 0])) == pytest.approx(0.5)
-    assert separation(square, square + np.array([1.3, 1.4])) == pytest.approx(0.4)  # corner to corner it is 0.5
-    assert separation(np.array([[-1, 0.5], [2, 0.5]]), square) < 0 < separation(np.array([[-1, 2], [2, 2.0]]), square)
+    # corner to corner it is 0.5
+    assert separation(square, square + np.array([1.3, 1.4])) == pytest.approx(0.4)
+    assert (
+        separation(np.array([[-1, 0.5], [2, 0.5]]), square)
+        < 0
+        < separation(np.array([[-1, 2], [2, 2.0]]), square)
+    )
 
 
 def test_drawn_scenes_stand_on_their_table_and_never_overlap(cluttered, furniture):
@@ -112,8 +131,11 @@ def test_cameras_reach_no_place_in_things_behind_walls_or_below_the_table():
     assert there[[0, 4, 6, 14]].all()
     assert scene_of(Block(0.0, 1.5, 0.0, 2.0, 0.1, 0.5)).reachable(GRID.poses[:, :3, 3]).all()
     below = look_at_origin(np.radians([-10.0, -30.0]), 0.0)[:, :3, 3]
-    np.testing.assert_array_equal(scene_of().reachable(below), [True, False])  # 0.48 above, 0.5 below
-    np.testing.assert_allclose(inside.clearance(np.array([[3.0, 2.3, 0.0], [3.0, 0.0, 2.0]])), [1.0, 1.5], atol=0.01)
+    # 0.48 above, 0.5 below
+    np.testing.assert_array_equal(scene_of().reachable(below), [True, False])
+    np.testing.assert_allclose(
+        inside.clearance(np.array([[3.0, 2.3, 0.0], [3.0, 0.0, 2.0]])), [1.0, 1.5], atol=0.01
+    )
 
 
 # The same again
@@ -159,7 +181,9 @@ def test_a_store_of_scenes_holds_what_shows_and_the_scene(cluttered_views, clutt
 @pytest.mark.parametrize("named", ["known", "mask", "box", "point"])
 def test_a_robot_sees_the_target_that_it_was_told_of(named):
     crate = pipeline.meshed(pipeline.box([1, 1.2, 0.9]))
-    scene = scene_of(Block(-1.9, 0.4, 0.2, 0.6, 0.6, 0.9), Block(0.5, 1.6, 0.5, 0.5, 0.4, 0.7), target=crate)
+    scene = scene_of(
+        Block(-1.9, 0.4, 0.2, 0.6, 0.6, 0.9), Block(0.5, 1.6, 0.5, 0.5, 0.4, 0.7), target=crate
+    )
     camera = RobotCamera(scene, named=named)
     frame = camera.observe(GRID.poses[16])
     seen = camera.object.add(frame)

@@ -1,4 +1,6 @@
-"""From frames to observations in whole scenes: what is found, where, and that it looks as a render would."""
+"""From frames to observations in whole scenes: what is found, where, and that it looks as a
+render would.
+"""
 
 import os
 import re
@@ -20,7 +22,9 @@ from nextview.sensing import Box, Frame, ObjectFrame, ObservedObject, check_obse
 from nextview.sensing.facets import fit_facets, look_again, virtual_pose
 from nextview.sensing.plausibility import check_frame, refuse_far
 
-WEDGE = trimesh.util.concatenate([box((0.2, 0.16, 0.1), (0, 0, 0.05)), box((0.06, 0.16, 0.08), (-0.07, 0, 0.14))])
+WEDGE = trimesh.util.concatenate(
+    [box((0.2, 0.16, 0.1), (0, 0, 0.05)), box((0.06, 0.16, 0.08), (-0.07, 0, 0.14))]
+)
 """A little sofa, 0.18 m high."""
 WALL = box((0.02, 1.4, 1.0), (-0.9, 0, 0.3))
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -61,7 +65,8 @@ def test_what_was_found_in_part_from_above_is_found_whole_in_the_same_place():
     vertices = 0.12 * (chair.vertices - [0, 0, chair.vertices[:, 2].min()])
     scene = [TABLE, trimesh.Trimesh(vertices, chair.faces, process=False)]
     thing = ObservedObject()
-    thing.add(frame(scene, pose_at(72, 135, 0.6, (0, 0, 0.1)), 1))  # its seat; the back stands on legs of its own
+    # its seat; the back stands on legs of its own
+    thing.add(frame(scene, pose_at(72, 135, 0.6, (0, 0, 0.1)), 1))
     assert thing.object_frame.radius < 0.1
     thing.add(frame(scene, pose_at(40, 155, 0.6, (0, 0, 0.1)), 2))
     assert thing.object_frame.radius == pytest.approx(0.12, rel=0.1)
@@ -79,7 +84,9 @@ def test_the_virtual_pose_is_that_of_the_view_sphere(elevation, azimuth):
 
 @pytest.mark.parametrize("distance", [0.4, 0.6, 1.2])
 def test_a_frame_is_seen_again_as_a_render_from_three_radii(distance):
-    """The camera is at another distance, rolled and aimed beside the object: against a camera that is not."""
+    """The camera is at another distance, rolled and aimed beside the object: against a camera
+    that is not.
+    """
     known = true_frame(WEDGE)
     pose = pose_at(35, 25, distance, known.centre, (3, -4, 17))
     depth, _ = cast([WEDGE], pose)
@@ -111,7 +118,10 @@ def test_a_frame_becomes_an_observation_of_the_object_alone():
 
 
 def test_of_several_objects_the_one_asked_for_is_taken():
-    small, large = box((0.08, 0.08, 0.1), (0.2, 0.2, 0.05)), box((0.2, 0.2, 0.15), (-0.15, -0.1, 0.075))
+    small, large = (
+        box((0.08, 0.08, 0.1), (0.2, 0.2, 0.05)),
+        box((0.2, 0.2, 0.15), (-0.15, -0.1, 0.075)),
+    )
     seen = frame([TABLE, small, large], pose_at(45, 20, 0.9), seed=1)
     for options, mesh in (
         ({}, large),
@@ -161,8 +171,15 @@ def test_a_frame_that_shows_next_to_nothing_says_nothing_of_the_size():
     one, thing = box((0.1, 0.1, 0.12), (0, 0, 0.06)), ObservedObject()
     for k, azimuth in enumerate((0, 30)):
         owner = cast([TABLE, one], pose_at(35, azimuth, 0.7))[1]
-        mask = (owner == 1 - k) & ((owner == 1) | (np.cumsum(owner == 0).reshape(owner.shape) < 300))  # some table
-        thing.add(replace(frame([TABLE, one], pose_at(35, azimuth, 0.7), seed=k), mask=mask, pixel_centre=0.5))
+        # some table
+        mask = (owner == 1 - k) & (
+            (owner == 1) | (np.cumsum(owner == 0).reshape(owner.shape) < 300)
+        )
+        thing.add(
+            replace(
+                frame([TABLE, one], pose_at(35, azimuth, 0.7), seed=k), mask=mask, pixel_centre=0.5
+            )
+        )
         assert_found(thing, one, 0.05, 0.05)
 
 
@@ -181,7 +198,10 @@ def test_things_of_which_only_the_tops_show_are_two():
 @pytest.mark.parametrize("wider", [0.006, 0.012])
 def test_a_narrow_strip_of_what_is_behind_belongs_to_it(wider):
     """The rear box shows all around the front one, a few pixels wide."""
-    front, rear = box((0.1, 0.1, 0.12), (0, 0, 0.06)), box((0.1, 0.1 + 2 * wider, 0.16), (-0.15, 0, 0.08))
+    front, rear = (
+        box((0.1, 0.1, 0.12), (0, 0, 0.06)),
+        box((0.1, 0.1 + 2 * wider, 0.16), (-0.15, 0, 0.08)),
+    )
     thing = ObservedObject(point=(0, 0, 0.1))
     thing.add(frame([TABLE, front, rear], pose_at(15, 0, 0.7, (0, 0, 0.06)), seed=0))
     _, seen = cast([TABLE, front, rear], pose_at(15, 0, 0.7, (0, 0, 0.06)))
@@ -224,7 +244,9 @@ def test_a_mask_on_a_table_reaches_down_to_it():
 
 
 def test_the_object_frame_gets_better_and_earlier_views_with_it():
-    """From the front at the height of the table the depth of a long box is not seen; from the side it is."""
+    """From the front at the height of the table the depth of a long box is not seen; from the
+    side it is.
+    """
     long = box((0.4, 0.12, 0.12), (0, 0, 0.06))
     thing = ObservedObject(life_size=False)
     first = thing.add(frame([TABLE, long], pose_at(4, 0, 0.8, (0, 0, 0.06)), seed=6))
@@ -272,7 +294,14 @@ def test_a_pose_that_contradicts_the_frames_before_is_warned_of():
     thing.add(frame([TABLE, WEDGE], pose_at(40, 25, 0.7)))
     wrong = pose_at(40, 120, 0.7)
     wrong[:3, 3] += 0.08, 0, 0
-    thing.add(replace(frame([TABLE, WEDGE], pose_at(40, 120, 0.7)), pose=wrong, axes="opencv", pixel_centre=0.5))
+    thing.add(
+        replace(
+            frame([TABLE, WEDGE], pose_at(40, 120, 0.7)),
+            pose=wrong,
+            axes="opencv",
+            pixel_centre=0.5,
+        )
+    )
     assert [warning.name for warning in thing.warnings] == ["contradiction"]
 
 
@@ -309,7 +338,11 @@ def in_millimetres(seen) -> Frame:
 
 def test_poses_in_millimetres_are_refused_where_the_target_or_another_frame_tells():
     first, second = (frame([TABLE, WEDGE], pose_at(40, azimuth, 0.7)) for azimuth in (25, 80))
-    for target in ({"point": (0, 0, 0.1)}, {"known": true_frame(WEDGE)}, {"box": Box([-1, -1, 0], [1, 1, 0.2])}):
+    for target in (
+        {"point": (0, 0, 0.1)},
+        {"known": true_frame(WEDGE)},
+        {"box": Box([-1, -1, 0], [1, 1, 0.2])},
+    ):
         with pytest.raises(ObservationError, match=r"the target is 700 m away.* in millimetres"):
             ObservedObject(**target).add(in_millimetres(first))
     thing = ObservedObject()
@@ -322,11 +355,18 @@ def test_poses_in_millimetres_are_refused_where_the_target_or_another_frame_tell
 
 @pytest.mark.parametrize("steps", [0.1, 0.2, 0.25])  # millimetres
 def test_sixteen_bits_in_other_steps_are_refused_with_the_depth_scale(steps):
-    """The target, or another frame, tells; a target that is not asked for and right millimetres are taken."""
+    """The target, or another frame, tells; a target that is not asked for and right millimetres
+    are taken.
+    """
 
     def counted(azimuth, of):
         seen = frame([TABLE, WEDGE], pose_at(azimuth, azimuth, 0.7))
-        return Frame(np.rint(1000 / of * seen.depth).astype(np.uint16), INTRINSICS, seen.pose, pixel_centre=0.5)
+        return Frame(
+            np.rint(1000 / of * seen.depth).astype(np.uint16),
+            INTRINSICS,
+            seen.pose,
+            pixel_centre=0.5,
+        )
 
     said = f"{1 / steps:g} times too large: its steps look like {steps:g} mm"
     for target in ({"point": (0, 0, 0.1)}, {"known": true_frame(WEDGE)}):
@@ -347,11 +387,15 @@ def test_depth_along_the_rays_is_refused():
     for support in ({}, {"point": (0, 0, 0.1)}):
         with pytest.raises(ObservationError, match="along the rays"):
             ranged = depth * np.sqrt(x**2 + y[:, None] ** 2 + 1)
-            ObservedObject(**support).add(Frame(ranged, seen.intrinsics, seen.pose, pixel_centre=0.5))
+            ObservedObject(**support).add(
+                Frame(ranged, seen.intrinsics, seen.pose, pixel_centre=0.5)
+            )
 
 
 def test_an_old_pose_and_a_missing_plane_are_warned_of():
-    first, second = (frame([TABLE, WEDGE], pose_at(40, azimuth, 0.7), seed=1) for azimuth in (25, 80))
+    first, second = (
+        frame([TABLE, WEDGE], pose_at(40, azimuth, 0.7), seed=1) for azimuth in (25, 80)
+    )
     thing = ObservedObject(point=(0, 0, 0.1))
     thing.add(first)
     assert thing.warnings == []
@@ -383,7 +427,10 @@ def test_a_point_may_lie_on_the_table_itself(height):
     for azimuth in (0, 90):
         thing = ObservedObject(point=(0, 0, height))
         thing.add(frame([TABLE, WEDGE], pose_at(20, azimuth, 0.7)))
-        assert np.linalg.norm(thing.object_frame.centre - true_frame(WEDGE).centre) < true_frame(WEDGE).radius / 3
+        assert (
+            np.linalg.norm(thing.object_frame.centre - true_frame(WEDGE).centre)
+            < true_frame(WEDGE).radius / 3
+        )
         assert thing.warnings == []
 
 
@@ -433,8 +480,12 @@ def test_correct_views_get_no_warning(elevation, distance):
 
 @pytest.mark.parametrize(("screen", "seen"), [(True, False), (False, True)])
 def test_what_hid_the_object_shows_nothing_of_it_and_another_side_does(screen, seen):
-    """The first frame shows a screen before a cube, or a cube's front alone; the second one the cube from behind."""
-    scene = [TABLE, box((0.1, 0.1, 0.1), (0, 0, 0.05))] + [box((0.04, 0.3, 0.3), (0.2, 0, 0.15))] * screen
+    """The first frame shows a screen before a cube, or a cube's front alone; the second one the
+    cube from behind.
+    """
+    scene = [TABLE, box((0.1, 0.1, 0.1), (0, 0, 0.05))] + [
+        box((0.04, 0.3, 0.3), (0.2, 0, 0.15))
+    ] * screen
     thing = ObservedObject(point=(0, 0, 0.05), life_size=False)
     for k, (elevation, azimuth) in enumerate(((5, 0), (40, 180))):
         thing.add(frame(scene, pose_at(elevation, azimuth, 0.8, (0, 0, 0.05)), seed=k))
@@ -447,12 +498,20 @@ def test_what_hid_the_object_shows_nothing_of_it_and_another_side_does(screen, s
     [
         ("nothing seen", lambda o: with_depth(o, 0)),
         ("opengl axes", lambda o: replace(o, pose=o.pose @ FLIP)),
-        ("ros axes", lambda o: replace(o, pose=turned(o.pose, np.array([[0, -1.0, 0], [0, 0, -1], [1, 0, 0]])))),
+        (
+            "ros axes",
+            lambda o: replace(
+                o, pose=turned(o.pose, np.array([[0, -1.0, 0], [0, 0, -1], [1, 0, 0]]))
+            ),
+        ),
         ("inverse pose", lambda o: replace(o, pose=np.linalg.inv(o.pose))),
         ("scale", lambda o: with_depth(o, 0.12)),
         ("scale", lambda o: with_depth(o, 2.5)),
         ("scale", lambda o: in_metres(o, 0.12)),
-        ("outside", lambda o: replace(o, pose=turned(o.pose, Rotation.from_euler("y", 1.0).as_matrix()))),
+        (
+            "outside",
+            lambda o: replace(o, pose=turned(o.pose, Rotation.from_euler("y", 1.0).as_matrix())),
+        ),
     ],
 )
 def test_mistakes_in_observations_are_named(name, wrong):
@@ -465,9 +524,15 @@ def test_mistakes_in_observations_are_named(name, wrong):
 
 
 KINECT = Path(os.environ.get("NEXTVIEW_DATA", ".")) / "real_kinect"
-real = pytest.mark.skipif(not (KINECT / "camera-intrinsics.txt").exists(), reason="NEXTVIEW_DATA has no real_kinect")
+real = pytest.mark.skipif(
+    not (KINECT / "camera-intrinsics.txt").exists(), reason="NEXTVIEW_DATA has no real_kinect"
+)
 UPRIGHT = np.array(
-    [[0.99997497, 0.00632106, 0.00317997], [0, -0.44941069, 0.89332528], [0.00707587, -0.89330292, -0.44939944]]
+    [
+        [0.99997497, 0.00632106, 0.00317997],
+        [0, -0.44941069, 0.89332528],
+        [0.00707587, -0.89330292, -0.44939944],
+    ]
 )
 CHAIR = Box([-1.38, 1.40, -1.497], [-0.90, 2.05, -0.587], UPRIGHT)
 
@@ -484,7 +549,10 @@ def kinect(number: int) -> Frame:
 def test_a_real_chair_is_a_chair():
     """Single frames in which at least half of the chair's box is in the picture."""
     recogniser = NetworkRecogniser()
-    grid = np.stack(np.meshgrid(*(np.linspace(*ends, 8) for ends in zip(CHAIR.low, CHAIR.high, strict=True))), -1)
+    grid = np.stack(
+        np.meshgrid(*(np.linspace(*ends, 8) for ends in zip(CHAIR.low, CHAIR.high, strict=True))),
+        -1,
+    )
     answers = []
     for number in range(0, 1000, 20):
         seen = kinect(number)

@@ -44,11 +44,17 @@ def test_any_byte_order_and_masked_arrays_are_taken(kind, masked):
 
 
 def two_surfaces():
-    """A slanted wall and a slanted board before it, 1 / depth linear in the image, and which pixel shows which."""
+    """A slanted wall and a slanted board before it, 1 / depth linear in the image, and which
+    pixel shows which.
+    """
     y, x = np.mgrid[:120, :160]
     wall = 1 / (0.8 + 0.0006 * x + 0.0004 * y)
     board = 1 / (1.3 - 0.0005 * x + 0.0003 * y)
-    return wall.astype(np.float32), board.astype(np.float32), (y > 40) & (y < 90) & (x > 50) & (x < 120)
+    return (
+        wall.astype(np.float32),
+        board.astype(np.float32),
+        (y > 40) & (y < 90) & (x > 50) & (x < 120),
+    )
 
 
 def kept(kind):
@@ -66,11 +72,17 @@ def kept(kind):
         "every second row and column": (rows % 2 == 0) & (columns % 2 == 0),
         "one of 16 pixels": (rows % 4 == 1) & (columns % 4 == 2),
         "a turned grid": turned,
-        "rows, and a fifth of the others": (rows % 4 > 0) & (np.random.default_rng(0).random((120, 160)) > 0.2),
+        "rows, and a fifth of the others": (rows % 4 > 0)
+        & (np.random.default_rng(0).random((120, 160)) > 0.2),
     }[kind]
 
 
-GAPS = ["every fourth row", "every second column", "a grid of single pixels", "every second row and column"]
+GAPS = [
+    "every fourth row",
+    "every second column",
+    "a grid of single pixels",
+    "every second row and column",
+]
 GAPS += ["one of 16 pixels", "a turned grid", "rows, and a fifth of the others"]
 K = np.array([[140.0, 0, 80], [0, 140, 60], [0, 0, 1]])
 
@@ -78,7 +90,8 @@ K = np.array([[140.0, 0, 80], [0, 140, 60], [0, 0, 1]])
 @pytest.mark.parametrize("gaps", GAPS)
 def test_regular_gaps_are_filled_without_making_up_depth(gaps):
     wall, board, where = two_surfaces()
-    hole = (np.mgrid[:120, :160] - np.array([20, 20])[:, None, None]).max(0) ** 2 < 100  # larger than the gaps
+    # larger than the gaps
+    hole = (np.mgrid[:120, :160] - np.array([20, 20])[:, None, None]).max(0) ** 2 < 100
     measured = kept(gaps) & ~hole
     depth = Frame(np.where(measured, np.where(where, board, wall), 0), K, pixel_centre=0.5).depth
     inner = np.s_[8:-8, 8:-8]
@@ -126,7 +139,9 @@ def test_the_axes_of_a_pose_are_known_by_name():
 def test_the_first_pixel_may_have_its_centre_at_zero():
     k = INTRINSICS.copy()
     k[:2, 2] -= 0.5
-    np.testing.assert_array_equal(Frame(DEPTH, k).intrinsics, Frame(DEPTH, INTRINSICS, pixel_centre=0.5).intrinsics)
+    np.testing.assert_array_equal(
+        Frame(DEPTH, k).intrinsics, Frame(DEPTH, INTRINSICS, pixel_centre=0.5).intrinsics
+    )
     np.testing.assert_array_equal(Frame(DEPTH, INTRINSICS, pixel_centre=0.5).intrinsics, INTRINSICS)
 
 
@@ -135,7 +150,9 @@ def test_positions_lie_on_what_is_seen():
     frame = Frame(DEPTH, INTRINSICS, POSE, pixel_centre=0.5)
     rows, columns = np.nonzero(frame.depth)
     np.testing.assert_allclose(frame.positions(rows, columns)[:, 2], 0, atol=1e-5)
-    np.testing.assert_allclose(frame.along(np.array([0, 0, 2.0]), 0.5)[frame.depth > 0], 0.5, atol=1e-5)
+    np.testing.assert_allclose(
+        frame.along(np.array([0, 0, 2.0]), 0.5)[frame.depth > 0], 0.5, atol=1e-5
+    )
 
 
 def test_colour_becomes_grey():

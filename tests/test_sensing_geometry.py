@@ -41,14 +41,21 @@ def circle_through(points) -> tuple[np.ndarray, float]:
     return np.array([x, y]), np.linalg.norm(a - [x, y])
 
 
-@given(st.lists(st.tuples(st.integers(-20, 20), st.integers(-20, 20)), min_size=2, max_size=12, unique=True))
+@given(
+    st.lists(
+        st.tuples(st.integers(-20, 20), st.integers(-20, 20)), min_size=2, max_size=12, unique=True
+    )
+)
 def test_the_smallest_circle_is_that_of_brute_force(corners):
     points = np.array(corners, float)
     holding = []
     for count in (2, 3):
         for chosen in combinations(points, count):
             centre, radius = circle_through(np.array(chosen))
-            if np.isfinite(radius) and (np.linalg.norm(points - centre, axis=1) <= radius + 1e-9).all():
+            if (
+                np.isfinite(radius)
+                and (np.linalg.norm(points - centre, axis=1) <= radius + 1e-9).all()
+            ):
                 holding.append(radius)
     centre, radius = smallest_circle(points)
     assert radius == pytest.approx(min(holding), abs=1e-6)
@@ -68,7 +75,8 @@ def test_poses_go_to_the_object_frame_and_back():
     pose = pose_at(33, 80, 1.7, (0.9, -2.1, 0.4), (4, 5, 6))
     there = frame.pose_in_object(pose)
     np.testing.assert_allclose(frame.pose_in_world(there), pose, atol=1e-12)
-    point = np.array([1.1, -1.9, 0.6])  # the camera sees the same in either frame, but for the scale
+    # the camera sees the same in either frame, but for the scale
+    point = np.array([1.1, -1.9, 0.6])
     seen = pose[:3, :3].T @ (point - pose[:3, 3])
     again = there[:3, :3].T @ (frame.axes @ (point - frame.centre) / frame.radius - there[:3, 3])
     np.testing.assert_allclose(again, seen / 0.2, atol=1e-12)
@@ -84,8 +92,12 @@ def test_the_plane_is_that_of_least_squares_through_what_lies_on_it():
     order, camera = np.arange(800), np.array([0, 0, 1.0])
     seen = Samples(np.vstack([points, clutter]), np.full(800, 0.005), order, order, camera)
     plane = find_plane(seen, rng(), UP)
-    a, b, c = np.linalg.lstsq(np.column_stack([points[:, :2], np.ones(500)]), points[:, 2], rcond=None)[0]
-    np.testing.assert_allclose(plane.normal, np.array([-a, -b, 1]) / np.sqrt(a * a + b * b + 1), atol=1e-3)
+    a, b, c = np.linalg.lstsq(
+        np.column_stack([points[:, :2], np.ones(500)]), points[:, 2], rcond=None
+    )[0]
+    np.testing.assert_allclose(
+        plane.normal, np.array([-a, -b, 1]) / np.sqrt(a * a + b * b + 1), atol=1e-3
+    )
     assert plane.offset == pytest.approx(-c, abs=1e-3)
 
 
@@ -102,7 +114,8 @@ def table_depth():
 @pytest.mark.parametrize("sigma", [0.0005, 0.002, 0.01])
 def test_noise_is_measured_at_every_depth(sigma):
     depth = table_depth()
-    noisy = (1 / (1 / depth + sigma * depth * rng().normal(size=depth.shape))).astype(np.float32)  # grows with depth
+    # grows with depth
+    noisy = (1 / (1 / depth + sigma * depth * rng().normal(size=depth.shape))).astype(np.float32)
     noise = estimate_noise(noisy, noisy > 0)
     at = np.quantile(depth, [0.15, 0.5, 0.85])
     np.testing.assert_allclose(noise.at(at), sigma * at, rtol=0.1)
@@ -135,11 +148,15 @@ def test_the_facets_of_a_plane_are_that_plane():
         facets = fit_facets(depth, depth > 0, INTRINSICS, denoise=denoise)
         assert len(facets.planes) == depth.size
         np.testing.assert_allclose(np.median(facets.planes, 0), n, atol=1e-3)
-        np.testing.assert_allclose(facets.points[:, 2], depth[facets.rows, facets.columns], rtol=1e-5)
+        np.testing.assert_allclose(
+            facets.points[:, 2], depth[facets.rows, facets.columns], rtol=1e-5
+        )
 
 
 def test_smoothing_takes_noise_away_and_leaves_the_edge():
-    """A box on a table: most of the noise goes, and hardly a pixel ends up between the box and the table."""
+    """A box on a table: most of the noise goes, and hardly a pixel ends up between the box and
+    the table.
+    """
     pose = pose_at(60, 30, 0.7)
     clean = cast([TABLE, box((0.2, 0.15, 0.1), (0, 0, 0.05))], pose)[0]
     part = slice(90, 390), slice(170, 450)
@@ -159,7 +176,9 @@ def test_holes_are_filled_but_what_lies_behind_is_not():
     of_box = seen == 1
     assert (filled[of_box] > 0).mean() > 0.99
     assert (filled[~of_box & (holed > 0)] == 0).all()
-    np.testing.assert_allclose(filled[of_box & (filled > 0)], clean[of_box & (filled > 0)], atol=0.01)
+    np.testing.assert_allclose(
+        filled[of_box & (filled > 0)], clean[of_box & (filled > 0)], atol=0.01
+    )
 
 
 def test_a_mask_that_is_too_wide_loses_what_is_behind_and_keeps_what_is_thin():

@@ -1,4 +1,6 @@
-"""The sensor models against closed forms, against casting rays from the projector, and through the front door."""
+"""The sensor models against closed forms, against casting rays from the projector, and through
+the front door.
+"""
 
 from dataclasses import replace
 
@@ -27,21 +29,29 @@ def rng(*seed: int) -> np.random.Generator:
 
 
 def plane(sensor: Sensor, distance: float, tilt: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """A plane that crosses the optical axis at a distance, turned about y by degrees; depth, angles of incidence."""
+    """A plane that crosses the optical axis at a distance, turned about y by degrees; depth,
+    angles of incidence.
+    """
     normal = np.array([np.sin(np.radians(tilt)), 0, np.cos(np.radians(tilt))])
     directions = rays(sensor.intrinsics, sensor.shape)
     along = directions @ normal
     depth = np.where(along > 0, distance * normal[2] / np.where(along > 0, along, 1), 0)
     depth[depth > 4 * distance] = 0
-    return depth.astype(np.float32), np.arccos(np.clip(along / np.linalg.norm(directions, axis=-1), -1, 1))
+    return depth.astype(np.float32), np.arccos(
+        np.clip(along / np.linalg.norm(directions, axis=-1), -1, 1)
+    )
 
 
 def nguyen(z: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Nguyen, Izadi, Lovell 2012."""
-    return 0.0012 + 0.0019 * (z - 0.4) ** 2 + 0.0001 / np.sqrt(z) * angle**2 / (np.pi / 2 - angle) ** 2
+    return (
+        0.0012 + 0.0019 * (z - 0.4) ** 2 + 0.0001 / np.sqrt(z) * angle**2 / (np.pi / 2 - angle) ** 2
+    )
 
 
-@pytest.mark.parametrize(("distance", "tilt"), [(0.6, 0), (1.0, 30), (2.0, 0), (3.0, 60), (1.0, 75)])
+@pytest.mark.parametrize(
+    ("distance", "tilt"), [(0.6, 0), (1.0, 30), (2.0, 0), (3.0, 60), (1.0, 75)]
+)
 @pytest.mark.parametrize("step", [0.0, 1 / 8])
 def test_axial_noise_of_a_kinect_is_the_published_one(distance, tilt, step):
     sensor = replace(SENSORS["none"], axial=1.0, step=step)
@@ -69,7 +79,9 @@ def test_neighbours_err_together_as_far_as_the_grain():
     error = sensor.measure(depth, rng(5))[0].astype(float) - depth
     for k in range(1, 7):
         for a, b in ((error[k:], error[:-k]), (error[:, k:], error[:, :-k])):
-            assert (a * b).mean() / error.var() == pytest.approx(np.exp(-(k**2) / (4 * 1.8**2)), abs=0.03)
+            assert (a * b).mean() / error.var() == pytest.approx(
+                np.exp(-(k**2) / (4 * 1.8**2)), abs=0.03
+            )
     assert error.std() == pytest.approx(0.001, rel=0.05)
 
 
@@ -86,11 +98,16 @@ def test_edges_move_by_the_published_pixels_and_planes_stay():
     middle, rows = sensor.width // 2, sensor.height
     assert np.abs(measured[:, :, None] - np.array([0.8, 1.2])).min(-1).max() < 1e-4
     for k in (1, 2, 3):
-        for share in ((measured[:, middle - k] > 1).mean(), (measured[:, middle + k - 1] < 1).mean()):
+        for share in (
+            (measured[:, middle - k] > 1).mean(),
+            (measured[:, middle + k - 1] < 1).mean(),
+        ):
             expected = norm.sf((k - 0.5) / 0.8)
             assert share == pytest.approx(expected, abs=4 * np.sqrt(expected / rows))
     tilted, _ = plane(sensor, 1.0, 50)
-    np.testing.assert_allclose(sensor.measure(tilted, rng(7))[0][4:-4, 4:-4], tilted[4:-4, 4:-4], rtol=1e-3)
+    np.testing.assert_allclose(
+        sensor.measure(tilted, rng(7))[0][4:-4, 4:-4], tilted[4:-4, 4:-4], rtol=1e-3
+    )
     assert (source != np.arange(source.size).reshape(source.shape)).mean() > 0.5
 
 
@@ -102,31 +119,47 @@ def test_grazing_pixels_are_lost(tilt, grain):
     some = depth > 0
     some[:, :1] = some[:, -1:] = False
     lost = (sensor.measure(depth, rng(9))[0] == 0)[some].mean()
-    assert lost == pytest.approx(np.maximum(0, 1 - np.cos(angle[some]) / 0.3).mean(), abs=0.01 if grain == 0 else 0.03)
+    assert lost == pytest.approx(
+        np.maximum(0, 1 - np.cos(angle[some]) / 0.3).mean(), abs=0.01 if grain == 0 else 0.03
+    )
 
 
 @pytest.mark.parametrize("baseline", [0.05, 0.075])
 def test_shadows_are_where_rays_from_the_projector_do_not_arrive(baseline):
     sensor = replace(SENSORS["none"], shadow=baseline)
-    things = [box((0.3, 0.06, 0.2), (0, 0, 0.2)), box((0.05, 0.05, 0.3), (-0.1, 0.15, 0.1)), box((2, 2, 0.02))]
+    things = [
+        box((0.3, 0.06, 0.2), (0, 0, 0.2)),
+        box((0.05, 0.05, 0.3), (-0.1, 0.15, 0.1)),
+        box((2, 2, 0.02)),
+    ]
     things.append(trimesh.creation.icosphere(4, 0.08).apply_translation((0.15, -0.2, 0.15)))
     pose = pose_at(35, 60, 1.0)
     depth, _ = cast(things, pose, sensor.intrinsics, sensor.shape)
     lost = sensor.measure(depth, rng(12))[0] == 0
     scene = trimesh.util.concatenate(things)
-    points = (rays(sensor.intrinsics, sensor.shape) * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
+    points = (rays(sensor.intrinsics, sensor.shape) * depth[..., None]) @ pose[:3, :3].T + pose[
+        :3, 3
+    ]
     projector = pose[:3, 3] + baseline * pose[:3, 0]
     towards = projector - points.reshape(-1, 3)
     length = np.linalg.norm(towards, axis=1)
     starts = points.reshape(-1, 3) + 0.004 * towards / length[:, None]
-    hidden = scene.ray.intersects_any(starts, towards / length[:, None]).reshape(depth.shape) & (depth > 0)
+    hidden = scene.ray.intersects_any(starts, towards / length[:, None]).reshape(depth.shape) & (
+        depth > 0
+    )
     lost &= depth > 0
     assert hidden.sum() > 1000
     differ = hidden != lost
     assert (differ & hidden).sum() < 0.1 * hidden.sum()
     assert (differ & lost).sum() < 0.1 * hidden.sum()
     # They differ at borders only: nothing is left of it after one pixel is taken off all around.
-    inner = differ[1:-1, 1:-1] & differ[:-2, 1:-1] & differ[2:, 1:-1] & differ[1:-1, :-2] & differ[1:-1, 2:]
+    inner = (
+        differ[1:-1, 1:-1]
+        & differ[:-2, 1:-1]
+        & differ[2:, 1:-1]
+        & differ[1:-1, :-2]
+        & differ[1:-1, 2:]
+    )
     assert inner.sum() < 0.005 * hidden.sum()
 
 
@@ -138,8 +171,13 @@ def test_no_strength_no_error_to_the_bit(name):
     measured, source = sensor.measure(depth, rng(14))
     np.testing.assert_array_equal(measured, depth)
     np.testing.assert_array_equal(source.ravel(), np.arange(depth.size))
-    ideal = replace(SENSORS["none"], **{n: getattr(sensor, n) for n in ("height", "width", "focal")})
-    views = [SensedCamera(sample_mesh("chair"), s, rng(15)).observe(SPHERE.poses[20]) for s in (sensor, ideal)]
+    ideal = replace(
+        SENSORS["none"], **{n: getattr(sensor, n) for n in ("height", "width", "focal")}
+    )
+    views = [
+        SensedCamera(sample_mesh("chair"), s, rng(15)).observe(SPHERE.poses[20])
+        for s in (sensor, ideal)
+    ]
     np.testing.assert_array_equal(views[0].depth, views[1].depth)
     np.testing.assert_array_equal(views[0].pose, views[1].pose)
 
@@ -178,7 +216,9 @@ def test_a_sensor_without_errors_sees_the_ball_and_not_the_table():
 
 def test_errors_of_the_object_frame_have_their_strength():
     sensor = replace(SENSORS["none"], centre=0.1, size=0.2, tilt=3.0)
-    frames = [SensedCamera(sample_mesh("table"), sensor, rng(18, i)).object_frame for i in range(400)]
+    frames = [
+        SensedCamera(sample_mesh("table"), sensor, rng(18, i)).object_frame for i in range(400)
+    ]
     assert np.std([f.centre / 0.12 for f in frames]) == pytest.approx(0.1, rel=0.12)
     assert np.std([np.log(f.radius / 0.12) for f in frames]) == pytest.approx(0.2, rel=0.15)
     lean = [np.arccos(f.axes[2, 2]) ** 2 for f in frames]  # of two axes
@@ -192,14 +232,17 @@ def test_the_camera_is_not_where_it_believes_to_be():
         frame = camera.frame(SPHERE.poses[view])
         points = frame.positions(*np.nonzero(frame.mask))
         a = np.c_[2 * points, np.ones(len(points))]
-        off.append(np.linalg.lstsq(a, (points**2).sum(1), rcond=None)[0][:3])  # centre of the ball as it is seen
+        # centre of the ball as it is seen
+        off.append(np.linalg.lstsq(a, (points**2).sum(1), rcond=None)[0][:3])
     assert np.std(off) == pytest.approx(0.01, rel=0.25)
 
 
 def test_part_of_the_table_is_left_in_and_part_of_the_object_cut_off():
     mesh = sample_mesh("table")
     exact = SensedCamera(mesh, "none", rng(20)).frame(SPHERE.poses[20])
-    around = SensedCamera(mesh, replace(SENSORS["none"], table=1.0), rng(20)).frame(SPHERE.poses[20])
+    around = SensedCamera(mesh, replace(SENSORS["none"], table=1.0), rng(20)).frame(
+        SPHERE.poses[20]
+    )
     left = SensedCamera(mesh, replace(SENSORS["none"], table=0.3), rng(20)).frame(SPHERE.poses[20])
     extra = [(frame.mask & ~exact.mask).sum() for frame in (around, left)]
     assert extra[1] == pytest.approx(0.3 * extra[0], rel=0.4)
@@ -230,7 +273,8 @@ def test_the_visible_share_of_a_ball_behind_a_wall():
     pose = SPHERE.poses[0]
     assert alone.visible_share(pose) == 1
 
-    # A wall before the half of the ball that is on the right of a camera in the horizontal plane, and all of it.
+    # A wall before the half of the ball that is on the right of a camera in the horizontal plane,
+    # and all of it.
     towards = pose[:3, 2]
     right = pose[:3, 0]
     for share, centre in ((0.5, right), (0.0, 0 * right), (1.0, 2.5 * right)):
@@ -238,8 +282,12 @@ def test_the_visible_share_of_a_ball_behind_a_wall():
         frame[:3, :3] = np.stack([right, np.cross(towards, right), towards], 1)
         frame[:3, 3] = -1.2 * towards + 1.0 * centre
         wall = trimesh.creation.box((2.0, 4.0, 0.01), frame)
-        around = replace(BALL, vertices=np.asarray(wall.vertices), faces=np.asarray(wall.faces, np.int32))
-        assert SensedCamera(BALL, ball, rng(3), around=around).visible_share(pose) == pytest.approx(share, abs=0.02)
+        around = replace(
+            BALL, vertices=np.asarray(wall.vertices), faces=np.asarray(wall.faces, np.int32)
+        )
+        assert SensedCamera(BALL, ball, rng(3), around=around).visible_share(pose) == pytest.approx(
+            share, abs=0.02
+        )
 
 
 def test_a_mix_is_another_sensor_for_every_object():
@@ -251,12 +299,17 @@ def test_a_mix_is_another_sensor_for_every_object():
     weak = [SensorMix(0.5).draw(rng(27, i)) for i in range(50)]
     strong = [SensorMix().draw(rng(27, i)) for i in range(50)]
     for error in ERRORS:
-        assert [getattr(s, error) for s in weak] == pytest.approx([getattr(s, error) / 2 for s in strong])
+        assert [getattr(s, error) for s in weak] == pytest.approx(
+            [getattr(s, error) / 2 for s in strong]
+        )
 
 
 def test_recognise_through_a_sensor_of_a_name_or_an_object():
     mesh, system = sample_mesh("chair"), nextview.load()
-    results = [system.recognise(mesh, 3, 5, sensor=sensor) for sensor in ("wrist:2", sensor_named("wrist:2"))]
+    results = [
+        system.recognise(mesh, 3, 5, sensor=sensor)
+        for sensor in ("wrist:2", sensor_named("wrist:2"))
+    ]
     assert results[0].confidence == results[1].confidence
     assert results[0].views[0].belief.max() != system.recognise(mesh, 3, 5).views[0].belief.max()
     with pytest.raises(UsageError, match="sensor is for meshes"):
@@ -264,7 +317,9 @@ def test_recognise_through_a_sensor_of_a_name_or_an_object():
 
 
 def rendered(furniture, store, sensor=None, workers=0):
-    return render(furniture, store, FEW, workers=workers, options=RenderOptions(split="test", sensor=sensor))
+    return render(
+        furniture, store, FEW, workers=workers, options=RenderOptions(split="test", sensor=sensor)
+    )
 
 
 def test_a_store_of_a_sensor_resumes_to_the_bit_and_with_no_other(furniture, tmp_path):
@@ -300,7 +355,9 @@ def test_a_mesh_of_known_unit_is_looked_at_in_its_true_size(name, radius):
     border = [frame.mask[0], frame.mask[-1], frame.mask[:, 0], frame.mask[:, -1]]
     assert not any(edge.any() for edge in border)
     nearest = frame.depth[frame.mask].min()
-    assert nearest == pytest.approx(camera.sensor.distance - radius, abs=0.03 * camera.sensor.distance)
+    assert nearest == pytest.approx(
+        camera.sensor.distance - radius, abs=0.03 * camera.sensor.distance
+    )
     assert camera.observe(SPHERE.poses[13]).radius == pytest.approx(radius)
 
 

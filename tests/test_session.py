@@ -45,7 +45,9 @@ def test_travel_and_belief_are_those_of_the_views(system, camera):
     result = Session(system.models, system.policy, system.sphere, 9, Stopping(1.0, 4)).run(camera)
     path = [view.index for view in result.views]
     assert len(set(path)) == 4
-    assert result.travel == pytest.approx(sum(system.sphere.travel[a, b] for a, b in itertools.pairwise(path)))
+    assert result.travel == pytest.approx(
+        sum(system.sphere.travel[a, b] for a, b in itertools.pairwise(path))
+    )
     for view in result.views:
         assert view.belief.sum() == pytest.approx(1)
     # The belief after the last view is that of all views at once, whatever their order.
@@ -54,7 +56,9 @@ def test_travel_and_belief_are_those_of_the_views(system, camera):
         e = system.models.evidence([view.observation])
         azimuth = system.sphere.azimuth[[view.index]]
         total = total + log_evidence_of(e.logits, e.azimuth_bins, azimuth).astype(np.float64)
-    np.testing.assert_allclose(calibration.belief(total, 4, len(system.classes))[0], result.views[-1].belief, atol=1e-9)
+    np.testing.assert_allclose(
+        calibration.belief(total, 4, len(system.classes))[0], result.views[-1].belief, atol=1e-9
+    )
 
 
 @dataclass(frozen=True)
@@ -79,23 +83,36 @@ def test_a_stopping_rule_of_ones_own(camera):
 
 
 def test_a_picture_that_is_handed_in_again_counts_once(system, camera):
-    """A camera that hangs, whatever pose is told with it: the belief stays what the first view made it."""
+    """A camera that hangs, whatever pose is told with it: the belief stays what the first view
+    made it.
+    """
     for move in (True, False):
         session = Session(system.models, system.policy, system.sphere, 20, Stopping(0.99, 5))
         first = camera.observe(session.pose)
         while not session.done:
-            session.update(replace(first, depth=first.depth.copy(), pose=session.pose if move else first.pose))
+            session.update(
+                replace(first, depth=first.depth.copy(), pose=session.pose if move else first.pose)
+            )
         beliefs = np.array([view.belief for view in session.views])
         assert len(beliefs) == 5
         np.testing.assert_array_equal(beliefs, beliefs[[0] * 5])
-        assert [[w.name for w in view.warnings] for view in session.views] == [[], *[["repeated"]] * 4]
+        assert [[w.name for w in view.warnings] for view in session.views] == [
+            [],
+            *[["repeated"]] * 4,
+        ]
         assert not session.result.confident
 
 
-@pytest.mark.parametrize(("first", "confident", "n_views"), [("chair", True, 5), ("table", False, 6)])
-def test_an_object_that_is_swapped_after_the_first_view_gets_no_confident_answer(first, confident, n_views):
+@pytest.mark.parametrize(
+    ("first", "confident", "n_views"), [("chair", True, 5), ("table", False, 6)]
+)
+def test_an_object_that_is_swapped_after_the_first_view_gets_no_confident_answer(
+    first, confident, n_views
+):
     cameras = [SimulatedCamera(sample_mesh(name)) for name in (first, *["chair"] * 5)]
-    session = nextview.load(stopping=lambda seen, _: seen.n_views >= 5, max_views=6).session(start=9)
+    session = nextview.load(stopping=lambda seen, _: seen.n_views >= 5, max_views=6).session(
+        start=9
+    )
     while not session.done:
         session.update(cameras[len(session.views)].observe(session.pose))
     assert not session.views[-1].warnings
@@ -129,17 +146,27 @@ def test_threads_that_share_a_session_wait_for_each_other(system, camera):
     seen = [camera.observe(pose) for pose in system.sphere.poses[8:24]]
     with ThreadPoolExecutor(4) as pool:
         ended = [done.exception() for done in [pool.submit(session.update, one) for one in seen]]
-    assert sorted(map(str, filter(None, ended))) == ["this session has ended; begin another one"] * (len(seen) - 5)
+    assert sorted(map(str, filter(None, ended))) == [
+        "this session has ended; begin another one"
+    ] * (len(seen) - 5)
     alone = Session(system.models, system.policy, system.sphere, 20, Stopping(1.0, 5))
     for view in session.views:
         alone.update(view.observation)
-    np.testing.assert_array_equal([v.belief for v in session.views], [v.belief for v in alone.views])
+    np.testing.assert_array_equal(
+        [v.belief for v in session.views], [v.belief for v in alone.views]
+    )
 
 
 def test_half_way_the_result_is_what_is_believed_so_far(system, camera):
     session = Session(system.models, system.policy, system.sphere, 20, Stopping(1.0, 3))
     before = session.result
-    assert (before.answer, before.beliefs, before.travel, before.radius, before.views) == (None, {}, 0, None, ())
+    assert (before.answer, before.beliefs, before.travel, before.radius, before.views) == (
+        None,
+        {},
+        0,
+        None,
+        (),
+    )
     assert repr(before) == "nothing is seen (0 views, 0.00 cells of travel)"
     view = session.update(camera.observe(session.pose))
     result = session.result

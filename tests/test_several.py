@@ -29,12 +29,16 @@ def memory_of(folder) -> VerifiedRecogniser:
 
 @pytest.fixture(scope="module")
 def several(known):  # noqa: F811
-    return SeveralRecognisers({"modelnet10": NetworkRecogniser(threads=1), "mine": memory_of(known)})
+    return SeveralRecognisers(
+        {"modelnet10": NetworkRecogniser(threads=1), "mine": memory_of(known)}
+    )
 
 
 @pytest.fixture(scope="module")
 def system(several):
-    return replace(nextview.load(threads=1, policy="spread", unknown=0.02), models=Models(several, {}))
+    return replace(
+        nextview.load(threads=1, policy="spread", unknown=0.02), models=Models(several, {})
+    )
 
 
 def test_memories_come_first_and_names_that_two_know_are_told_apart(several, known):  # noqa: F811
@@ -64,7 +68,9 @@ def test_a_class_is_named_where_no_thing_explains_what_is_seen(system, name, uni
     assert result.why_no_pose
     alone = nextview.load(threads=1, policy="spread").recognise(shown, start=12, seed=2)
     ours = result.views[0].belief[4:]
-    np.testing.assert_allclose(ours / ours.sum(), alone.views[0].belief, atol=0.02 if unit else 1e-6)
+    np.testing.assert_allclose(
+        ours / ours.sum(), alone.views[0].belief, atol=0.02 if unit else 1e-6
+    )
 
 
 def test_what_is_neither_is_unknown(system):
@@ -87,12 +93,16 @@ def test_a_session_of_several_can_be_pickled(system, meshes):  # noqa: F811
 
 def test_what_cannot_be_put_together_is_refused(known):  # noqa: F811
     network, memory = NetworkRecogniser(threads=1), memory_of(known)
-    with pytest.raises(ModelError, match="a, b: several collections are memories of things and at most one network"):
+    with pytest.raises(
+        ModelError, match="a, b: several collections are memories of things and at most one network"
+    ):
         SeveralRecognisers({"a": network, "b": network})
     with pytest.raises(ModelError, match="mine: knows no geometry of its things"):
         SeveralRecognisers({"a": network, "mine": TaughtRecogniser(known / "memory.json", 1)})
     memory.things.residuals = None
-    with pytest.raises(ModelError, match="mine: does not say how well its things are usually explained"):
+    with pytest.raises(
+        ModelError, match="mine: does not say how well its things are usually explained"
+    ):
         SeveralRecognisers({"a": network, "mine": memory})
 
 

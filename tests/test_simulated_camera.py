@@ -18,14 +18,26 @@ SPHERE = ViewSphere.named("40")
 
 
 BALL = meshed(trimesh.creation.icosphere(subdivisions=6))
-TABLE = meshed(box((4, 3, 0.2), (0, 0, 2)), *(box((0.2, 0.2, 2), (x, y, 1)) for x in (-1.8, 1.8) for y in (-1.3, 1.3)))
-CHAIR = meshed(box((1, 1, 0.1), (0, 0, 0.5)), box((0.1, 1, 1), (-0.45, 0, 1)), box((0.2, 0.2, 0.5), (0.3, 0.2, 0.25)))
+TABLE = meshed(
+    box((4, 3, 0.2), (0, 0, 2)),
+    *(box((0.2, 0.2, 2), (x, y, 1)) for x in (-1.8, 1.8) for y in (-1.3, 1.3)),
+)
+CHAIR = meshed(
+    box((1, 1, 0.1), (0, 0, 0.5)),
+    box((0.1, 1, 1), (-0.45, 0, 1)),
+    box((0.2, 0.2, 0.5), (0.3, 0.2, 0.25)),
+)
 
 
 def assert_as_every_ray(mesh: Mesh, pose: np.ndarray, size: int) -> None:
-    """Equal to casting every ray, except where rounding decides whether a ray just touches an edge."""
+    """Equal to casting every ray, except where rounding decides whether a ray just touches an
+    edge.
+    """
     camera = SimulatedCamera(mesh, size)
-    depth, (other, _) = camera.observe(pose).depth, cast([mesh], pose, camera.intrinsics, (size, size))
+    depth, (other, _) = (
+        camera.observe(pose).depth,
+        cast([mesh], pose, camera.intrinsics, (size, size)),
+    )
     assert (np.abs(depth - other) > 1e-4).mean() < 2e-3
     assert np.abs((depth > 0).sum(0) - (other > 0).sum(0)).max() <= 3
 
@@ -34,7 +46,9 @@ def assert_as_every_ray(mesh: Mesh, pose: np.ndarray, size: int) -> None:
 @pytest.mark.parametrize("view", [0, 13, 38])
 def test_depth_of_a_ball_is_that_of_the_equation(distance, view):
     elevation, azimuth = np.radians(SPHERE.angles(view))
-    observation = SimulatedCamera(BALL, 224, distance).observe(look_at_origin(elevation, azimuth, distance))
+    observation = SimulatedCamera(BALL, 224, distance).observe(
+        look_at_origin(elevation, azimuth, distance)
+    )
     expected = ball_depth(observation.pose, observation.intrinsics, 224)
     assert ((expected > 0) != (observation.depth > 0)).mean() < 0.002
     aside = rays(observation.intrinsics, (224, 224))[..., :2]
@@ -48,7 +62,9 @@ def test_a_ball_is_lit_by_a_headlight():
     depth = ball_depth(observation.pose, observation.intrinsics, 224)
     normal = d * depth[..., None] - (0, 0, 3)
     cosine = np.abs((normal * d).sum(-1)) / np.linalg.norm(d, axis=-1)
-    gap = np.abs(observation.image - 255 * (AMBIENT + (1 - AMBIENT) * cosine))[(depth > 0) & (observation.depth > 0)]
+    gap = np.abs(observation.image - 255 * (AMBIENT + (1 - AMBIENT) * cosine))[
+        (depth > 0) & (observation.depth > 0)
+    ]
     assert np.median(gap) < 2
     assert gap.max() < 30  # facets that are seen at a graze
     assert (observation.image[observation.depth == 0] == 0).all()
@@ -63,7 +79,8 @@ def test_casting_only_inside_the_bound_loses_nothing(mesh):
 
 @settings(deadline=None, max_examples=60)
 @given(
-    st.tuples(*[st.floats(-2.5, 2.5)] * 3), st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)
+    st.tuples(*[st.floats(-2.5, 2.5)] * 3),
+    st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1),
 )
 def test_any_pose_sees_what_casting_every_ray_sees(position, quaternion):
     pose = trimesh.transformations.quaternion_matrix(quaternion)
@@ -72,7 +89,8 @@ def test_any_pose_sees_what_casting_every_ray_sees(position, quaternion):
 
 
 def test_a_wall_that_runs_past_the_camera_is_seen_to_the_border():
-    # It begins a little to the left, ahead, and ends behind: where its ends project says nothing of where it is seen.
+    # It begins a little to the left, ahead, and ends behind: where its ends project says nothing of
+    # where it is seen.
     corners = np.array([[-0.1, -0.05, 1], [-0.1, 0.05, 1], [0.3, 0.05, -1], [0.3, -0.05, -1]])
     wall = make_mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
     pose = np.eye(4)
@@ -92,7 +110,8 @@ def test_a_wall_that_runs_past_the_camera_is_seen_to_the_border():
         (2, (1, 0, 0), 0, -1),
         (4, (0, 1, 0), 0, -1),
         (6, (1, 0, 0), 0, 1),
-        # From 72 degrees above +x, what lies towards the camera is low in the image, what lies beyond is high.
+        # From 72 degrees above +x, what lies towards the camera is low in the image, what lies
+        # beyond is high.
         (32, (1, 0, 0), 1, 0),
         (32, (-1, 0, 0), -1, 0),
     ],
@@ -101,11 +120,14 @@ def test_a_bump_appears_on_the_side_derived_by_hand(view, towards, row, column):
     stay = trimesh.creation.icosphere(radius=0.1)  # keeps the bounding box around the origin
     ends = [stay.copy().apply_translation(p) for p in np.vstack([np.eye(3), -np.eye(3)]) * 1.5]
     body = trimesh.creation.icosphere(subdivisions=3, radius=0.8)
-    bump = trimesh.creation.icosphere(subdivisions=3, radius=0.5).apply_translation(np.array(towards) * 0.8)
+    bump = trimesh.creation.icosphere(subdivisions=3, radius=0.5).apply_translation(
+        np.array(towards) * 0.8
+    )
     pose = SPHERE.poses[view]
     with_bump = SimulatedCamera(meshed(body, *ends, bump), 96).observe(pose).depth
     without = SimulatedCamera(meshed(body, *ends), 96).observe(pose).depth
-    found = np.mean(np.nonzero(np.abs(with_bump - without) > 1e-3), axis=1) / 96 - 0.5  # (row, column) from the middle
+    # (row, column) from the middle
+    found = np.mean(np.nonzero(np.abs(with_bump - without) > 1e-3), axis=1) / 96 - 0.5
     for place, expected in zip(found, (row, column), strict=True):
         assert np.sign(place) == expected if expected else abs(place) < 0.01
     assert np.hypot(*found) > 0.05
@@ -118,7 +140,9 @@ def test_points_lie_on_the_surface_and_are_visible(mesh, view):
     assert observation.points.shape == (1024, 3)
     assert observation.points.dtype == np.float32
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    _, distance, _ = trimesh.proximity.closest_point_naive(solid, observation.points[::16].astype(float))
+    _, distance, _ = trimesh.proximity.closest_point_naive(
+        solid, observation.points[::16].astype(float)
+    )
     np.testing.assert_allclose(distance, 0, atol=2e-5)
     in_camera = (observation.points - observation.pose[:3, 3]) @ observation.pose[:3, :3]
     projected = in_camera @ observation.intrinsics.T
@@ -126,7 +150,9 @@ def test_points_lie_on_the_surface_and_are_visible(mesh, view):
     np.testing.assert_allclose(observation.depth[row, column], in_camera[:, 2], atol=1e-4)
 
 
-@pytest.mark.skipif("NEXTVIEW_DATA" not in os.environ, reason="NEXTVIEW_DATA names no folder of real meshes")
+@pytest.mark.skipif(
+    "NEXTVIEW_DATA" not in os.environ, reason="NEXTVIEW_DATA names no folder of real meshes"
+)
 def test_real_meshes_seen_as_by_casting_every_ray():
     paths = sorted(Path(os.environ["NEXTVIEW_DATA"]).glob("ModelNet10/*/test/*_[0-9]*.off"))
     assert paths

@@ -28,7 +28,9 @@ CLASSES = ["big", "small"]
 
 @pytest.fixture(scope="module")
 def shop(tmp_path_factory):
-    """Balls of two classes that differ in nothing but their size, in centimetres, and a recogniser."""
+    """Balls of two classes that differ in nothing but their size, in centimetres, and a
+    recogniser.
+    """
     folder, rng = tmp_path_factory.mktemp("shop"), np.random.default_rng(0)
     for label, radius in (("big", 80), ("small", 20)):
         for i in range(8):
@@ -42,7 +44,9 @@ def shop(tmp_path_factory):
 
 def test_a_density_is_that_of_its_class_and_a_share_of_anything():
     rng = np.random.default_rng(0)
-    radii = np.exp(np.concatenate([rng.normal(np.log(0.1), 0.1, 500), rng.normal(np.log(2), 0.1, 500)]))
+    radii = np.exp(
+        np.concatenate([rng.normal(np.log(0.1), 0.1, 500), rng.normal(np.log(2), 0.1, 500)])
+    )
     found = densities(radii, np.repeat([0, 1], 500), 2)
     span = np.log(RADII[-1] / RADII[0])
     share = np.exp(found).mean(1) * span  # under the curve
@@ -66,27 +70,40 @@ def test_the_weight_is_the_most_likely_one():
     logs = rng.normal(np.log([0.3, 0.6])[labels], 0.5)
     density = norm.logpdf(np.log(RADII)[None], np.log([[0.3], [0.6]]), 0.5)
     shape = rng.normal(np.where(labels == 0, 1, -1), np.sqrt(2))  # log-odds of the first class
-    logits = np.stack([shape, np.zeros(n)], 1)[:, None].repeat(3, 1).astype(np.float32)  # three views, all alike
+    # three views, all alike
+    logits = np.stack([shape, np.zeros(n)], 1)[:, None].repeat(3, 1).astype(np.float32)
     data = train_predictions(logits, labels, ViewSphere((0.0,), 3), ("a", "b"))
     evidence, before, after = fit_weight(data, np.exp(logs), density)
     assert evidence.weight == pytest.approx(1, abs=0.15)
     alone = np.log1p(np.exp(np.where(labels == 0, -shape, shape)))
     assert before == pytest.approx(np.mean([alone[labels == c].mean() for c in (0, 1)]), rel=1e-4)
     assert after < before - 0.1
-    assert fit_weight(data, np.exp(rng.permutation(logs)), density)[0].weight == pytest.approx(0, abs=0.1)
+    assert fit_weight(data, np.exp(rng.permutation(logs)), density)[0].weight == pytest.approx(
+        0, abs=0.1
+    )
 
 
 def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
-    views, card, honest = str(shop / "views.zarr"), str(shop / "tiny.json"), str(tmp_path / "held-out.npz")
+    views, card, honest = (
+        str(shop / "views.zarr"),
+        str(shop / "tiny.json"),
+        str(tmp_path / "held-out.npz"),
+    )
     assert np.isnan(ViewStore.open(views).radii).all()
     main(["predict", views, honest, "--held-out", card, "--recogniser", card, "--maps"])
     assert "--unit" in refused(capsys, "fit", "size", views, honest, card)
     main(["render", str(shop / "meshes"), views, "--size", "32", "--unit", "cm"])
     radii = dict(zip(ViewStore.open(views).names, ViewStore.open(views).radii, strict=True))
-    assert radii["small_3"] == pytest.approx(load_mesh(shop / "meshes/small/train/small_3.off", unit="cm").metres)
+    assert radii["small_3"] == pytest.approx(
+        load_mesh(shop / "meshes/small/train/small_3.off", unit="cm").metres
+    )
     assert 0.15 < radii["small_3"] < 0.26
     with pytest.raises(DatasetError, match="measured in cm, not m"):
-        list(render(shop / "meshes", Path(views), SPHERE, 32, workers=1, options=RenderOptions(unit="m")))
+        list(
+            render(
+                shop / "meshes", Path(views), SPHERE, 32, workers=1, options=RenderOptions(unit="m")
+            )
+        )
 
     test = shop / "test.npz"
     list(predict(Path(views), test, read_card(Path(card)), {}, "test", workers=1))
@@ -98,18 +115,38 @@ def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
     known = Predictions.load(test)
     assert (known.logits.argmax(2) == known.labels[:, None]).all()
     np.testing.assert_allclose(known.by_shape().logits, by_shape.logits, atol=1e-5)
-    list(predict(Path(views), test, read_card(Path(card)), {}, "test", size=False, workers=1, overwrite=True))
+    list(
+        predict(
+            Path(views),
+            test,
+            read_card(Path(card)),
+            {},
+            "test",
+            size=False,
+            workers=1,
+            overwrite=True,
+        )
+    )
     np.testing.assert_allclose(Predictions.load(test).logits, by_shape.logits, atol=1e-5)
     list(predict(Path(views), tmp_path / "new.npz", read_card(Path(card)), {}, "test", workers=1))
-    np.testing.assert_allclose(Predictions.load(tmp_path / "new.npz").logits, known.logits, atol=1e-5)
+    np.testing.assert_allclose(
+        Predictions.load(tmp_path / "new.npz").logits, known.logits, atol=1e-5
+    )
 
     recogniser = NetworkRecogniser(card)
     path = shop / "meshes/small/test/small_7.off"
-    n_views = [SimulatedCamera(load_mesh(path, unit=unit), 32).observe(SPHERE.poses[9]) for unit in ("cm", None)]
-    assert [observation.radius for observation in n_views] == [pytest.approx(radii["small_7"]), None]
+    n_views = [
+        SimulatedCamera(load_mesh(path, unit=unit), 32).observe(SPHERE.poses[9])
+        for unit in ("cm", None)
+    ]
+    assert [observation.radius for observation in n_views] == [
+        pytest.approx(radii["small_7"]),
+        None,
+    ]
     row = known.names.index("small_7")
     found = recogniser(n_views).logits
-    np.testing.assert_allclose(found, [known.logits[row, 9], by_shape.logits[row, 9]], atol=2e-3)  # depth is rounded
+    # depth is rounded
+    np.testing.assert_allclose(found, [known.logits[row, 9], by_shape.logits[row, 9]], atol=2e-3)
     strange = tmp_path / "strange.npz"
     replace(Predictions.load(honest), names=("a", "b", "c", "d")).save(strange)
     assert "holds 'a'" in refused(capsys, "fit", "size", views, strange, card)

@@ -8,10 +8,17 @@ from nextview.data import metrics
 
 def test_ratios_and_class_means_agree_with_plain_loops():
     rng = np.random.default_rng(0)
-    top, bottom, labels = rng.random((12, 2)), rng.integers(0, 3, (12, 2)).astype(float), rng.integers(0, 3, 12)
+    top, bottom, labels = (
+        rng.random((12, 2)),
+        rng.integers(0, 3, (12, 2)).astype(float),
+        rng.integers(0, 3, 12),
+    )
     draws = rng.integers(12, size=(5, 12))
     weights = np.stack([np.bincount(draw, minlength=12) for draw in draws]).astype(float)
-    ratio, mean = metrics.ratio(top, bottom, weights), metrics.class_mean(top, bottom, labels, weights)
+    ratio, mean = (
+        metrics.ratio(top, bottom, weights),
+        metrics.class_mean(top, bottom, labels, weights),
+    )
     for s, draw in enumerate(draws):
         for m in range(2):
             assert ratio[s, m] == pytest.approx(top[draw, m].sum() / bottom[draw, m].sum())
@@ -37,13 +44,20 @@ def test_mcnemar_does_not_count_ten_runs_of_an_object_as_ten_objects():
 def test_mcnemar_rejects_a_true_null_hypothesis_as_often_as_it_says():
     rng = np.random.default_rng(0)
     hard = rng.random((600, 1, 200))  # objects differ, policies do not
-    p = np.array([st.mcnemar(a > h, b > h) for h, a, b in zip(hard, *rng.random((2, 600, 5, 200)), strict=True)])
+    p = np.array(
+        [
+            st.mcnemar(a > h, b > h)
+            for h, a, b in zip(hard, *rng.random((2, 600, 5, 200)), strict=True)
+        ]
+    )
     assert stats.binomtest(int((p < 0.05).sum()), 600, 0.05).pvalue > 0.001
 
 
 def test_holm_gives_the_textbook_values():
     # R: p.adjust(c(0.01, 0.04, 0.03, 0.005), "holm")
-    np.testing.assert_allclose(st.holm(np.array([0.01, 0.04, 0.03, 0.005])), [0.03, 0.06, 0.06, 0.02])
+    np.testing.assert_allclose(
+        st.holm(np.array([0.01, 0.04, 0.03, 0.005])), [0.03, 0.06, 0.06, 0.02]
+    )
     np.testing.assert_allclose(st.holm(np.array([0.6, np.nan, 0.9])), [1, np.nan, 1])
 
 
@@ -60,6 +74,8 @@ def test_calibration_error_is_the_gap_between_confidence_and_accuracy():
     rng = np.random.default_rng(0)
     confidence = rng.uniform(0.1, 1, 200_000)
     assert metrics.calibration_error(confidence, rng.random(200_000) < confidence) < 0.01
-    sure, accuracy, count = metrics.reliability(np.array([0.0, 1.0]), np.array([False, True]), bins=4)
+    sure, accuracy, count = metrics.reliability(
+        np.array([0.0, 1.0]), np.array([False, True]), bins=4
+    )
     np.testing.assert_array_equal(count, [1, 0, 0, 1])
     np.testing.assert_array_equal([sure[3], accuracy[3]], [1, 1])

@@ -55,7 +55,9 @@ def test_damage_is_named_by_every_read_and_by_check(store, name, how):
         "radius": lambda: views.radii,
     }
     for read in (reads[name], lambda: views.rows(name)):
-        with pytest.raises(DatasetError, match=rf"{name} of chair_1 {wrong}.*remove the store and render"):
+        with pytest.raises(
+            DatasetError, match=rf"{name} of chair_1 {wrong}.*remove the store and render"
+        ):
             read()
     assert list(found(store)) == ["chair_1"]
 
@@ -101,7 +103,11 @@ def test_other_settings_and_meshes_are_refused_or_replace_the_store(store, furni
         file.write("\n")
     with pytest.raises(DatasetError, match="begun with other sha256"):
         list(render(changed, store, SPHERE, 32))
-    for options in ({"options": RenderOptions(seed=1)}, {"size": 16}, {"options": RenderOptions(split="train")}):
+    for options in (
+        {"options": RenderOptions(seed=1)},
+        {"size": 16},
+        {"options": RenderOptions(split="train")},
+    ):
         with pytest.raises(DatasetError, match=r"was begun with other .*--overwrite"):
             list(render(furniture, store, SPHERE, **{"size": 32, "workers": 0} | options))
     list(measure(store, ["depth_entropy"], workers=0))

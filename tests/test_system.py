@@ -25,13 +25,19 @@ def test_sample_files_are_the_sample_meshes(name):
 
 @pytest.mark.parametrize("options", [{}, {"risk": 0.1}])
 def test_python_and_command_line_stop_alike(options, capsys):
-    system, given = nextview.load(**options), [word for name in options for word in (f"--{name}", str(options[name]))]
+    system, given = (
+        nextview.load(**options),
+        [word for name in options for word in (f"--{name}", str(options[name]))],
+    )
     for start in range(0, 40, 7):
         main(["recognise", str(SAMPLE.with_stem("table")), "--start", str(start), "--json", *given])
         printed = json.loads(capsys.readouterr().out)
         result = system.recognise(SAMPLE.with_stem("table"), start=start)
         assert [view["view"] for view in printed["views"]] == [view.index for view in result.views]
-        assert (printed["answer"], printed["threshold_reached"]) == (result.answer, result.confident)
+        assert (printed["answer"], printed["threshold_reached"]) == (
+            result.answer,
+            result.confident,
+        )
 
 
 def test_a_folder_of_ones_own_models(tmp_path, capsys):
@@ -41,7 +47,9 @@ def test_a_folder_of_ones_own_models(tmp_path, capsys):
     assert system.policy_name == "spread"  # no gain policy was learned for these classes
     assert system.recognise(SAMPLE).answer in system.classes
     make_map_network(tmp_path)
-    assert nextview.load(tmp_path, policy="lem-peak").models.maps["lem"].card.path.parent == tmp_path
+    assert (
+        nextview.load(tmp_path, policy="lem-peak").models.maps["lem"].card.path.parent == tmp_path
+    )
     main(["recognise", str(SAMPLE), "--models", str(tmp_path), "--json"])
     assert json.loads(capsys.readouterr().out)["answer"] in system.classes
 
@@ -62,17 +70,26 @@ def test_a_map_policy_values_its_window_alone():
 
 
 def test_importing_and_a_robot_need_no_ray_caster():
-    code = "import sys; sys.modules['embreex'] = None; import nextview; print(nextview.load().session().pose.shape)"
+    code = (
+        "import sys; sys.modules['embreex'] = None; import nextview;"
+        " print(nextview.load().session().pose.shape)"
+    )
     assert run_python(code, check=True).stdout.strip() == "(4, 4)"
 
 
-@pytest.mark.skipif(not os.environ.get("NEXTVIEW_DATA"), reason="NEXTVIEW_DATA names no folder with ModelNet10")
+@pytest.mark.skipif(
+    not os.environ.get("NEXTVIEW_DATA"), reason="NEXTVIEW_DATA names no folder with ModelNet10"
+)
 @pytest.mark.filterwarnings("ignore:.*is it a table")  # asked of a monitor on a wide plate
 def test_the_bundled_models_keep_their_accuracy():
-    """The card says that 0.907 of single views are right; of 30 objects fewer than 0.8 are so by chance in 1 of 40."""
+    """The card says that 0.907 of single views are right; of 30 objects fewer than 0.8 are so by
+    chance in 1 of 40.
+    """
     meshes = sorted(Path(os.environ["NEXTVIEW_DATA"], "ModelNet10").glob("*/test/*.off"))[:30]
     system = nextview.load(unknown=0)
-    right = [system.recognise(path, seed=k).answer == path.parts[-3] for k, path in enumerate(meshes)]
+    right = [
+        system.recognise(path, seed=k).answer == path.parts[-3] for k, path in enumerate(meshes)
+    ]
     assert len(right) >= 10
     assert np.mean(right) >= 0.8
 
@@ -81,4 +98,6 @@ def test_the_sample_meshes_are_told_apart_from_any_view():
     """Falls where the bundled models do."""
     system = nextview.load()
     both = itertools.product(SAMPLES, range(0, 40, 3))
-    assert np.mean([system.recognise(SAMPLE.with_stem(n), start=k).answer == n for n, k in both]) > 0.9
+    assert (
+        np.mean([system.recognise(SAMPLE.with_stem(n), start=k).answer == n for n, k in both]) > 0.9
+    )

@@ -24,7 +24,9 @@ THINGS = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "things.p
 def ceiling(draws, specs):
     p, n = specs.predictions, len(draws[0])
     evidence = p.log_evidence.reshape(len(draws), n, 40, -1)
-    policy = THINGS["FairCeiling"](p.sphere, evidence, p.labels[:n], specs.objects, 3, p.calibration)
+    policy = THINGS["FairCeiling"](
+        p.sphere, evidence, p.labels[:n], specs.objects, 3, p.calibration
+    )
     return replay_policy("ceiling", policy, specs, Stopping(1.0, 3), np.random.default_rng(0)).views
 
 
@@ -37,7 +39,9 @@ def noisy(*seeds: int) -> list[Predictions]:
 def test_where_the_noise_is_the_same_again_the_fair_ceiling_is_foresight():
     draws = noisy(3, 3)
     specs = make_specs(THINGS["together"](draws), 4, 0)
-    np.testing.assert_array_equal(ceiling(draws, specs), replay("oracle-gain-all", specs, 3, 0).views)
+    np.testing.assert_array_equal(
+        ceiling(draws, specs), replay("oracle-gain-all", specs, 3, 0).views
+    )
 
 
 def test_the_fair_ceiling_goes_by_the_mean_of_the_other_draws():
@@ -47,17 +51,25 @@ def test_the_fair_ceiling_goes_by_the_mean_of_the_other_draws():
         draw, thing = divmod(episode, 6)
         others = [k for k in range(3) if k != draw]
         seen = draws[draw].logits[thing, first].astype(float)
-        worth = sum(log_softmax(seen + draws[k].logits[thing], axis=1)[:, thing % 3] for k in others)
+        worth = sum(
+            log_softmax(seen + draws[k].logits[thing], axis=1)[:, thing % 3] for k in others
+        )
         worth[first] = -np.inf
         assert second == worth.argmax()
 
 
-def test_things_are_compared_from_meshes_on_under_the_same_azimuth_and_other_noise(tmp_path, scans, taught, capsys):
+def test_things_are_compared_from_meshes_on_under_the_same_azimuth_and_other_noise(
+    tmp_path, scans, taught, capsys
+):
     tables = [tmp_path / f"{k}.npz" for k in range(2)]
     for k, more in enumerate(([], ["--noise-seed", "1"])):
         store = str(tmp_path / f"{k}.zarr")
-        main(["render", str(scans), store, "--sensor", "wrist", "--rotated", "--workers", "0", *more])
-        main(["predict", store, str(tables[k]), "--models", str(taught), "--maps", "--workers", "0"])
+        main(
+            ["render", str(scans), store, "--sensor", "wrist", "--rotated", "--workers", "0", *more]
+        )
+        main(
+            ["predict", store, str(tables[k]), "--models", str(taught), "--maps", "--workers", "0"]
+        )
     first, again = (ViewStore.open(tmp_path / f"{k}.zarr") for k in range(2))
     np.testing.assert_array_equal(rotations(first), rotations(again))
     assert not np.array_equal(first.depth(0), again.depth(0))

@@ -1,4 +1,6 @@
-"""Training: what batches hold, runs that stop and resume to the bit, and the way from views to models with cards."""
+"""Training: what batches hold, runs that stop and resume to the bit, and the way from views to
+models with cards.
+"""
 
 import multiprocessing
 import os
@@ -25,7 +27,13 @@ from nextview.learning.export import export_map, export_recogniser, run_network
 from nextview.learning.fitting_set import hold_out
 from nextview.learning.inputs import load_inputs
 from nextview.learning.map_training import Windows, train_map
-from nextview.learning.recipes import THESIS_MAP, THESIS_RECOGNISER, Hardware, MapRecipe, RecogniserRecipe
+from nextview.learning.recipes import (
+    THESIS_MAP,
+    THESIS_RECOGNISER,
+    Hardware,
+    MapRecipe,
+    RecogniserRecipe,
+)
 from nextview.learning.recogniser_training import Source, Views, train_recogniser
 from nextview.learning.runs import fit, load_run, read_run, start_from
 from nextview.recognition.inference import MapNetwork, NetworkRecogniser
@@ -37,9 +45,11 @@ from research.training_curves import read_log
 V = 5
 SPHERE = ViewSphere((0.0, 30.0), 8, 3.0)
 RECIPE = RecogniserRecipe(size=32, epochs=3, views_per_object=4, batch=8)
-# Of 16 pixels the last step of a ResNet is a strided convolution of one pixel, whose bfloat16 gradient on a CPU is not
-# always finite (torch 2.13).
-SMALL = RecogniserRecipe(size=32, epochs=1, views_per_object=2, batch=4, validation_share=0.25, azimuth_bins_weight=0.3)
+# Of 16 pixels the last step of a ResNet is a strided convolution of one pixel, whose bfloat16
+# gradient on a CPU is not always finite (torch 2.13).
+SMALL = RecogniserRecipe(
+    size=32, epochs=1, views_per_object=2, batch=4, validation_share=0.25, azimuth_bins_weight=0.3
+)
 EXACT = Hardware(precision="32-true")
 SMALL_MAP = MapRecipe(size=32, epochs=1, views_per_object=2, batch=4, validation_share=0.25)
 
@@ -71,7 +81,9 @@ def test_balanced_draws_even_out_the_classes():
     views = Views([Source(inputs, np.arange(100))], np.arange(100), labels, recipe)
     seen = np.concatenate([label for _, label in views])
     share = 10**0.5 / (10**0.5 + 90**0.5)  # a class of n objects is drawn with weight n / sqrt(n)
-    assert (seen == 1).mean() == pytest.approx(share, abs=4 * (share * (1 - share) / len(seen)) ** 0.5)
+    assert (seen == 1).mean() == pytest.approx(
+        share, abs=4 * (share * (1 - share) / len(seen)) ** 0.5
+    )
 
 
 def test_objects_without_a_deformed_twin_are_seen_as_they_are():
@@ -111,7 +123,14 @@ def test_map_batches_hold_each_view_with_its_own_map():
     values = rng.random((7, 40)).astype(np.float32)
     seen = np.zeros((7, 40, 4, 2, 2), np.uint8)  # object and view, in the left half of the image
     seen[..., 0, 0, 0], seen[..., 1, 0, 0] = np.arange(7)[:, None] + 1, np.arange(40) + 1
-    windows = Windows(seen, values, sphere, np.array([1, 2, 5]), MapRecipe(views_per_object=6, batch=4), training=True)
+    windows = Windows(
+        seen,
+        values,
+        sphere,
+        np.array([1, 2, 5]),
+        MapRecipe(views_per_object=6, batch=4),
+        training=True,
+    )
     drawn, flips = [], []
     for images, targets in windows:
         assert len(images) == 4
@@ -142,7 +161,8 @@ def test_the_mirror_plane_is_the_one_that_maps_the_views_into_each_other(tmp_pat
     azimuth = np.arange(8)
     labels = np.repeat([0, 1, 2], 5)
     values = []
-    for plane in labels:  # class k is its own mirror image in the plane at k steps: values depend on the distance to it
+    # class k is its own mirror image in the plane at k steps: values depend on the distance to it
+    for plane in labels:
         profile = rng.random((2, 5))
         distance = np.minimum((azimuth - plane) % 8, (plane - azimuth) % 8)
         values.append(profile[:, distance].ravel())
@@ -170,8 +190,15 @@ def test_the_side_between_two_steps_counts_by_nearness():
     torch.manual_seed(0)
     likely = torch.randn(3, 4, 8).log_softmax(2)
     label, side = torch.tensor([0, 3, 1]), torch.tensor([2.0, 5.25, 7.5])
-    between = 0.75 * likely[1, 3, 5] + 0.25 * likely[1, 3, 6] + 0.5 * likely[2, 1, 7] + 0.5 * likely[2, 1, 0]
-    assert training.side_loss(likely, label, side) == pytest.approx(-float(likely[0, 0, 2] + between) / 3, rel=1e-5)
+    between = (
+        0.75 * likely[1, 3, 5]
+        + 0.25 * likely[1, 3, 6]
+        + 0.5 * likely[2, 1, 7]
+        + 0.5 * likely[2, 1, 0]
+    )
+    assert training.side_loss(likely, label, side) == pytest.approx(
+        -float(likely[0, 0, 2] + between) / 3, rel=1e-5
+    )
 
 
 # Runs
@@ -181,16 +208,26 @@ def data(classes=3, objects=12, views=5, size=32):
     """Inputs that tell the classes apart a little, and their labels."""
     rng = np.random.default_rng(0)
     labels = np.arange(objects) % classes
-    inputs = rng.integers(1, 200, (objects, views, 4, size, size)) + 20 * labels[:, None, None, None, None]
+    inputs = (
+        rng.integers(1, 200, (objects, views, 4, size, size))
+        + 20 * labels[:, None, None, None, None]
+    )
     return [Source(inputs.astype(np.uint8), np.arange(objects))], labels
 
 
 class SmallNet(torch.nn.Module):
-    """In place of a ResNet, whose checkpoints are 130 MB: convolution, batch norm and what is needed around them."""
+    """In place of a ResNet, whose checkpoints are 130 MB: convolution, batch norm and what is
+    needed around them.
+    """
 
     def __init__(self, recipe, classes, azimuths):
         super().__init__()
-        layers = torch.nn.Conv2d(4, 8, 5, 4), torch.nn.BatchNorm2d(8), torch.nn.ReLU(), torch.nn.AdaptiveAvgPool2d(1)
+        layers = (
+            torch.nn.Conv2d(4, 8, 5, 4),
+            torch.nn.BatchNorm2d(8),
+            torch.nn.ReLU(),
+            torch.nn.AdaptiveAvgPool2d(1),
+        )
         self.features = torch.nn.Sequential(*layers)
         self.fc = torch.nn.Linear(8, classes)
 
@@ -212,7 +249,9 @@ def train(out, recipe=RECIPE, hardware=Hardware(), stop=None):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "recogniser_network", SmallNet)
         patch.setattr(training.RecogniserModule, "training_step", fatal)
-        return training.fit_recogniser(sources, labels, (objects[:9], objects[9:]), recipe, out, None, hardware)
+        return training.fit_recogniser(
+            sources, labels, (objects[:9], objects[9:]), recipe, out, None, hardware
+        )
 
 
 def same(a, b):
@@ -228,7 +267,9 @@ def uninterrupted(tmp_path_factory):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 @pytest.mark.parametrize("stop", [(1, 2), (0, 1)], ids=["middle", "first"])
-def test_a_run_that_was_killed_in_mid_epoch_and_moved_resumes_the_same_to_the_bit(tmp_path, uninterrupted, stop):
+def test_a_run_that_was_killed_in_mid_epoch_and_moved_resumes_the_same_to_the_bit(
+    tmp_path, uninterrupted, stop
+):
     whole, folder = uninterrupted
     (tmp_path / "a").mkdir()
     arguments = tmp_path / "a", RECIPE, Hardware(), stop
@@ -303,7 +344,9 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
 
 @pytest.fixture(scope="module")
 def trained(shared, views):
-    """Both networks after one epoch, and their models: runs/recogniser, runs/lem, models/tiny.json, tiny-lem.json."""
+    """Both networks after one epoch, and their models: runs/recogniser, runs/lem,
+    models/tiny.json, tiny-lem.json.
+    """
 
     def make(folder: Path) -> None:
         train_recogniser(views, folder / "runs/recogniser", recipe=SMALL)
@@ -317,14 +360,21 @@ def trained(shared, views):
 def test_trained_models_have_cards_and_run(trained, views):
     card, run = read_card(trained / "models/tiny.json"), read_run(trained / "runs/recogniser")
     assert card.classes == ("chair", "monitor", "table")
-    assert [part.split()[0] for part in card.scores] == ["validation"]  # training leaves the test split alone
+    # training leaves the test split alone
+    assert [part.split()[0] for part in card.scores] == ["validation"]
     assert card.held_out == tuple(sorted(run.held_out))
     store = ViewStore.open(views)
-    assert set(card.held_out) < {n for n, split in zip(store.names, store.splits, strict=True) if split == "train"}
-    evidence = NetworkRecogniser(trained / "models/tiny.json").from_inputs(np.zeros((3, 4, 32, 32), np.uint8))
+    assert set(card.held_out) < {
+        n for n, split in zip(store.names, store.splits, strict=True) if split == "train"
+    }
+    evidence = NetworkRecogniser(trained / "models/tiny.json").from_inputs(
+        np.zeros((3, 4, 32, 32), np.uint8)
+    )
     assert evidence.logits.shape == (3, 3)
     assert np.exp(evidence.azimuth_bins).sum(2) == pytest.approx(np.ones((3, 3)), abs=1e-4)
-    lem = MapNetwork(trained / "models/tiny-lem.json").from_inputs(np.zeros((2, 4, 32, 32), np.uint8))
+    lem = MapNetwork(trained / "models/tiny-lem.json").from_inputs(
+        np.zeros((2, 4, 32, 32), np.uint8)
+    )
     assert (lem["lem"] == lem["lem-sphere"][:, :, [-1, 0, 1]]).all()
     assert lem["lem-sphere"].shape == (2, 5, 8)
     before = (trained / "models/tiny.onnx").read_bytes()
@@ -340,11 +390,15 @@ def test_several_runs_are_averaged(trained, views, tmp_path):
     train_recogniser(views, tmp_path / "on", weights=run, recipe=replace(SMALL, ensemble_seed=1))
     export_recogniser(run, views, tmp_path, ensemble=(tmp_path / "on",), name="both")
     x = load_inputs(views, 32)[0, :3]
-    networks = [run_network(folder, SMALL, ViewStore.open(views)) for folder in (run, tmp_path / "on")]
+    networks = [
+        run_network(folder, SMALL, ViewStore.open(views)) for folder in (run, tmp_path / "on")
+    ]
     with torch.no_grad():
         outputs = [network(torch.from_numpy(x).float() / 255) for network in networks]
     both = NetworkRecogniser(tmp_path / "both.json")
-    assert both.from_inputs(x).logits == pytest.approx(sum(o[0] for o in outputs).numpy() / 2, abs=2e-2)
+    assert both.from_inputs(x).logits == pytest.approx(
+        sum(o[0] for o in outputs).numpy() / 2, abs=2e-2
+    )
     assert both.card.network == "ResNet-18 + ResNet-18"
     assert [recipe["ensemble_seed"] for recipe in both.card.training.recipes] == [0, 1]
 
@@ -362,11 +416,16 @@ def test_a_network_goes_on_from_a_run(trained, views, tmp_path):
     assert torch.equal(maps.resnet.fc.weight, head)
     start_from(maps.resnet, trained / "runs/lem")
     assert not torch.equal(maps.resnet.fc.weight, head)
-    train_map(views, tmp_path / "lem", weights=trained / "runs/lem", recipe=replace(SMALL_MAP, lr=0.0))
+    train_map(
+        views, tmp_path / "lem", weights=trained / "runs/lem", recipe=replace(SMALL_MAP, lr=0.0)
+    )
     last = torch.load(tmp_path / "lem/network.pt", weights_only=True)["resnet.fc.weight"]
-    assert torch.equal(last, maps.resnet.fc.weight)  # a rate of 0 leaves the weights that it was given
+    # a rate of 0 leaves the weights that it was given
+    assert torch.equal(last, maps.resnet.fc.weight)
     with pytest.raises(ModelError, match=r"was trained on .* objects that this network must not"):
-        train_recogniser(views, tmp_path / "seen", weights=run, recipe=replace(SMALL, validation_share=0.5))
+        train_recogniser(
+            views, tmp_path / "seen", weights=run, recipe=replace(SMALL, validation_share=0.5)
+        )
     with pytest.raises(ModelError, match="other first weights"):
         train_map(views, tmp_path / "lem", recipe=replace(SMALL_MAP, lr=0.0))
     with pytest.raises(ModelError, match=r"another recipe \(epochs was 1, not 2\)"):
@@ -378,17 +437,32 @@ def test_a_network_goes_on_from_a_run(trained, views, tmp_path):
 
 
 def test_the_published_networks_train_on_images_and_clouds(views, tmp_path):
-    image = replace(THESIS_RECOGNISER, layers=18, epochs=1, size=32, views_per_object=1, batch=4, validation_share=0.25)
+    image = replace(
+        THESIS_RECOGNISER,
+        layers=18,
+        epochs=1,
+        size=32,
+        views_per_object=1,
+        batch=4,
+        validation_share=0.25,
+    )
     assert train_recogniser(views, tmp_path / "image", recipe=image) == [tmp_path / "image"]
     run = read_run(tmp_path / "image")
     assert run.recipe == asdict(image)
     assert set(run.validation) == set(run.held_out)
-    assert torch.load(tmp_path / "image/network.pt", weights_only=True)["conv1.weight"].shape == (64, 1, 7, 7)
+    assert torch.load(tmp_path / "image/network.pt", weights_only=True)["conv1.weight"].shape == (
+        64,
+        1,
+        7,
+        7,
+    )
     cloud = replace(THESIS_MAP, epochs=1, views_per_object=1, points=64, validation_share=0.25)
     train_map(views, tmp_path / "cloud", recipe=cloud)
     made = export_map(tmp_path / "cloud", views, tmp_path, name="published")
     seen = from_store(InputSpec("cloud"), ViewStore.open(views), 0)[:2]
-    assert {k: v.shape for k, v in MapNetwork(made.card).from_inputs(seen).items()} == {"lem": (2, 5, 3)}
+    assert {k: v.shape for k, v in MapNetwork(made.card).from_inputs(seen).items()} == {
+        "lem": (2, 5, 3)
+    }
 
 
 def test_what_is_no_finished_run_is_not_exported(trained, views, tmp_path):

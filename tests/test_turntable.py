@@ -1,4 +1,6 @@
-"""Frames from a turntable: the axis against the true one, what does not fit is noticed, and a thing is taught."""
+"""Frames from a turntable: the axis against the true one, what does not fit is noticed, and a
+thing is taught.
+"""
 
 import shutil
 
@@ -22,16 +24,23 @@ POSE[2, 3] += 0.4 * RADIUS
 
 
 def write_frames(folder, angles):
-    """Frames of the sample chair, which stands beside the axis, the world's z, and turns by some angles."""
+    """Frames of the sample chair, which stands beside the axis, the world's z, and turns by some
+    angles.
+    """
     folder.mkdir(parents=True)
     np.savetxt(folder / "camera-intrinsics.txt", K)
     mesh = sample_mesh("chair")
     vertices = RADIUS * (mesh.vertices + np.array([0.2, -0.1, -mesh.vertices[:, 2].min()]))
-    rays = pixel_rays(K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), SHAPE).reshape(-1, 3) @ POSE[:3, :3].T
+    rays = (
+        pixel_rays(K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), SHAPE).reshape(-1, 3)
+        @ POSE[:3, :3].T
+    )
     for i, angle in enumerate(angles):
         c, s = np.cos(angle), np.sin(angle)
         turned = vertices @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
-        depth, which = RayCaster([(turned, mesh.faces), square(3 * RADIUS, 0.0)]).cast(POSE[:3, 3], rays)
+        depth, which = RayCaster([(turned, mesh.faces), square(3 * RADIUS, 0.0)]).cast(
+            POSE[:3, 3], rays
+        )
         millimetres = np.rint(1000 * np.where(which < 0, 0, depth)).astype(np.uint16).reshape(SHAPE)
         Image.fromarray(millimetres).save(folder / f"{i:02d}.png")
     return folder
@@ -39,7 +48,9 @@ def write_frames(folder, angles):
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory):
-    return write_frames(tmp_path_factory.mktemp("turntable") / "chair", 2 * np.pi * np.arange(N) / N)
+    return write_frames(
+        tmp_path_factory.mktemp("turntable") / "chair", 2 * np.pi * np.arange(N) / N
+    )
 
 
 def test_the_poses_are_those_of_the_camera_around_the_axis(frames):
@@ -52,7 +63,9 @@ def test_the_poses_are_those_of_the_camera_around_the_axis(frames):
         assert np.linalg.norm(foot - true) < 0.03 * RADIUS
         np.testing.assert_allclose(frame.pose[2, :3], POSE[2, :3], atol=0.01)
         c, s = np.cos(2 * np.pi * i / N), np.sin(2 * np.pi * i / N)
-        np.testing.assert_allclose(first[:3, :3], [[c, -s, 0], [s, c, 0], [0, 0, 1]] @ frame.pose[:3, :3], atol=1e-9)
+        np.testing.assert_allclose(
+            first[:3, :3], [[c, -s, 0], [s, c, 0], [0, 0, 1]] @ frame.pose[:3, :3], atol=1e-9
+        )
 
 
 def test_what_does_not_fit_is_noticed(frames, tmp_path):
@@ -63,12 +76,16 @@ def test_what_does_not_fit_is_noticed(frames, tmp_path):
         read_turntable(half, "ccw")
     steps = np.random.default_rng(0).uniform(0.3, 1.7, N)
     with pytest.raises(DatasetError, match="equal steps through a full circle"):
-        read_turntable(write_frames(tmp_path / "uneven", 2 * np.pi * np.cumsum(steps) / steps.sum()), "ccw")
+        read_turntable(
+            write_frames(tmp_path / "uneven", 2 * np.pi * np.cumsum(steps) / steps.sum()), "ccw"
+        )
 
 
 def test_a_thing_from_a_turntable_is_recognised_by_its_mesh(frames, scans, tmp_path):
     shutil.copytree(frames, tmp_path / "things/chair")
-    with pytest.raises(DatasetError, match=r"chair: its frames have no poses; --turntable ccw or cw says"):
+    with pytest.raises(
+        DatasetError, match=r"chair: its frames have no poses; --turntable ccw or cw says"
+    ):
         learn(tmp_path / "things", tmp_path / "mine", workers=0)
     for name in ("monitor", "table"):
         shutil.copy(scans / f"{name}.off", tmp_path / "things")
@@ -76,4 +93,6 @@ def test_a_thing_from_a_turntable_is_recognised_by_its_mesh(frames, scans, tmp_p
     assert (found.things, found.left_out) == (3, ())
     system = nextview.load(models=tmp_path / "mine", unknown=0)
     for name in ("chair", "monitor", "table"):
-        assert system.recognise(scans / f"{name}.off", start=17, sensor="wrist", seed=1).answer == name
+        assert (
+            system.recognise(scans / f"{name}.off", start=17, sensor="wrist", seed=1).answer == name
+        )

@@ -1,4 +1,6 @@
-"""Objects of no class that the recogniser knows: the novelty score, how it is fitted, and what a session answers."""
+"""Objects of no class that the recogniser knows: the novelty score, how it is fitted, and what a
+session answers.
+"""
 
 import hashlib
 import json
@@ -21,7 +23,14 @@ from nextview.files import sha256_of
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.observation import SceneView
 from nextview.learning.unknown import quantiles
-from nextview.recognition.novelty import NEIGHBOUR, Novelty, Quantiles, as_stored, hidden_share, read_novelty
+from nextview.recognition.novelty import (
+    NEIGHBOUR,
+    Novelty,
+    Quantiles,
+    as_stored,
+    hidden_share,
+    read_novelty,
+)
 from nextview.sensing import Frame, ObservedObject
 
 
@@ -45,15 +54,20 @@ def units(rng, n, f):
 def test_the_score_is_what_brute_force_gives():
     rng = np.random.default_rng(0)
     score, views = some_score(rng), units(rng, 20, 7)
-    # Between unit vectors the squared distance is 2 less twice their product; the rows are units up to rounding.
+    # Between unit vectors the squared distance is 2 less twice their product; the rows are units up
+    # to rounding.
     products = (1 + (score.neighbours**2).sum(1) - cdist(views, score.neighbours) ** 2) / 2
     tenth = np.sort(products, 1)[:, -NEIGHBOUR]
     np.testing.assert_allclose(score.scores(views), (-tenth + 0.8) / 0.2, atol=1e-4)
-    np.testing.assert_allclose(score.scores(views, np.arange(20) > 9)[10:], (-tenth[10:] + 0.9) / 0.1, atol=1e-4)
+    np.testing.assert_allclose(
+        score.scores(views, np.arange(20) > 9)[10:], (-tenth[10:] + 0.9) / 0.1, atol=1e-4
+    )
 
 
 def test_p_values_of_objects_like_the_held_out_ones_are_uniform():
-    """Of 4,000 objects, each with a mean of its own around which its views scatter, at 400 held-out ones."""
+    """Of 4,000 objects, each with a mean of its own around which its views scatter, at 400
+    held-out ones.
+    """
     rng = np.random.default_rng(2)
 
     def scores(n):
@@ -64,7 +78,8 @@ def test_p_values_of_objects_like_the_held_out_ones_are_uniform():
     novelty = replace(some_score(rng), quantiles=table, objects=np.array([400]))
     for n in range(1, 6):
         p = novelty.p_value(scores(4000)[:, :n].mean(1), n)
-        assert kstest(p, "uniform").statistic < 0.09  # 1.36 / sqrt(400) of the held-out ones, more as classes differ
+        # 1.36 / sqrt(400) of the held-out ones, more as classes differ
+        assert kstest(p, "uniform").statistic < 0.09
         assert (p < 0.05).mean() == pytest.approx(0.05, abs=0.035)
 
 
@@ -85,14 +100,18 @@ def test_a_score_beyond_all_of_few_known_views_is_as_rare_as_a_normal_distributi
     assert score.p_value(far, 1) < 1 / 49
 
 
-def test_a_score_is_read_as_it_was_written_and_what_is_missing_damaged_or_another_is_refused(tmp_path):
+def test_a_score_is_read_as_it_was_written_and_what_is_missing_damaged_or_another_is_refused(
+    tmp_path,
+):
     score, path = some_score(np.random.default_rng(6)), tmp_path / "a.novelty.safetensors"
     sha256 = score.save(path)
     again = read_novelty(path, sha256)
     for name, values in vars(score).items():
         np.testing.assert_array_equal(getattr(again, name), values)
     in_halves(path)
-    np.testing.assert_allclose(read_novelty(path, sha256_of(path)).neighbours, score.neighbours, atol=1e-3)
+    np.testing.assert_allclose(
+        read_novelty(path, sha256_of(path)).neighbours, score.neighbours, atol=1e-3
+    )
     with pytest.raises(ModelError, match="other features; run nextview fit unknown"):
         again.scores(np.zeros((1, 8)))
     with pytest.raises(ModelError, match="no such file"):
@@ -117,7 +136,9 @@ MUTATIONS = {
     "one dimension less": lambda values: values[0],
     "one dimension more": lambda values: values[None],
     "empty": lambda values: values[:0],
-    "of another type": lambda values: values.astype(np.int32 if values.dtype.kind == "f" else np.float32),
+    "of another type": lambda values: values.astype(
+        np.int32 if values.dtype.kind == "f" else np.float32
+    ),
     "complex": lambda values: values.astype(np.complex64),
     "NaN": lambda values: with_value(values, np.nan),
     "infinite": lambda values: with_value(values, np.inf),
@@ -125,7 +146,9 @@ MUTATIONS = {
 }
 OF_ONE = {
     ("quantiles", "descending"): lambda values: values[:, ::-1],
-    ("quantiles", "a pair out of order"): lambda values: values[:, [1, 0, *range(2, values.shape[1])]],
+    ("quantiles", "a pair out of order"): lambda values: values[
+        :, [1, 0, *range(2, values.shape[1])]
+    ],
     ("quantiles", "a single one"): lambda values: values[:, :1],
     ("objects", "none"): lambda values: values * 0,
     ("objects", "negative"): lambda values: -values,
@@ -138,8 +161,18 @@ OF_ONE = {
     ("standard", "three"): lambda values: np.vstack([values, values[:1]]),
 }
 FLOATS = ("quantiles", "neighbours", "standard")
-OF_BYTES = ("gone", "0-d", "one dimension less", "one dimension more", "empty", "too few", "a zero vector")
-"""What is tried of known views in eight bits a number, too; the rest in half precision, as earlier versions wrote."""
+OF_BYTES = (
+    "gone",
+    "0-d",
+    "one dimension less",
+    "one dimension more",
+    "empty",
+    "too few",
+    "a zero vector",
+)
+"""What is tried of known views in eight bits a number, too; the rest in half precision, as
+earlier versions wrote.
+"""
 
 
 def mutations():
@@ -160,8 +193,12 @@ def in_halves(path):
 
 
 @pytest.mark.parametrize("halves", [False, True], ids=["eight bits", "half precision"])
-@pytest.mark.parametrize(("name", "how", "change"), [pytest.param(*m, id="-".join(m[:2])) for m in mutations()])
-def test_every_value_of_a_novelty_file_is_checked_though_its_hash_is_right(tmp_path, name, how, change, halves):
+@pytest.mark.parametrize(
+    ("name", "how", "change"), [pytest.param(*m, id="-".join(m[:2])) for m in mutations()]
+)
+def test_every_value_of_a_novelty_file_is_checked_though_its_hash_is_right(
+    tmp_path, name, how, change, halves
+):
     if name == "neighbours" and not halves and how not in OF_BYTES:
         pytest.skip("bytes have no such values")
     path = tmp_path / "a.novelty.safetensors"
@@ -175,7 +212,9 @@ def test_every_value_of_a_novelty_file_is_checked_though_its_hash_is_right(tmp_p
     if changed is not None:
         arrays[name] = changed
     save_file({key: np.array(values, order="C") for key, values in arrays.items()}, path)
-    with pytest.raises(ModelError, match=r"^\S+/a\.novelty\.safetensors: not a novelty score \(it\S* .*\)$"):
+    with pytest.raises(
+        ModelError, match=r"^\S+/a\.novelty\.safetensors: not a novelty score \(it\S* .*\)$"
+    ):
         read_novelty(path, sha256_of(path))
 
 
@@ -185,7 +224,9 @@ def test_the_share_of_an_outline_that_is_hidden_is_that_beside_something_nearer(
     target[20:40, 20:40] = True  # with 76 pixels of outline: 20 to each side, and 4 near a corner
     depth[20:40, 40:] = beside
     depth[20:40, 42:] = 5.0
-    assert hidden_share(SceneView(depth, target, np.eye(4), np.eye(3))) == pytest.approx(share, abs=1e-9)
+    assert hidden_share(SceneView(depth, target, np.eye(4), np.eye(3))) == pytest.approx(
+        share, abs=1e-9
+    )
 
 
 # Sessions
@@ -208,7 +249,9 @@ def recognised(p, unknown, camera=None):
     recogniser = system.models.recogniser
     before, recogniser.novelty = recogniser.novelty, FixedNovelty(p)
     try:
-        session = nextview.Session(system.models, system.policy, system.sphere, 3, Stopping(0.9, 2), unknown=unknown)
+        session = nextview.Session(
+            system.models, system.policy, system.sphere, 3, Stopping(0.9, 2), unknown=unknown
+        )
         return session.run(camera or SimulatedCamera(sample_mesh("chair")))
     finally:
         recogniser.novelty = before
@@ -226,7 +269,12 @@ def test_an_object_more_novel_than_the_rate_allows_has_no_answer(capsys):
     assert repr(novel).startswith(told)
     assert "\n" not in repr(novel)
     told = json.loads(episode_as_json(novel, "chair"))
-    assert (told["answer"], told["unknown"], told["novelty"], told["most_like"]) == (None, True, 0.03, "chair")
+    assert (told["answer"], told["unknown"], told["novelty"], told["most_like"]) == (
+        None,
+        True,
+        0.03,
+        "chair",
+    )
     np.testing.assert_array_equal(usual.views[0].belief, novel.views[0].belief)
 
 
@@ -239,7 +287,9 @@ def scrambled(seed):
     """A chair whose triangles lie anywhere."""
     mesh, rng = sample_mesh("chair"), np.random.default_rng(seed)
     corners = mesh.vertices[mesh.faces]
-    corners = corners - corners.mean(1, keepdims=True) + rng.uniform(-0.6, 0.6, (len(corners), 1, 3))
+    corners = (
+        corners - corners.mean(1, keepdims=True) + rng.uniform(-0.6, 0.6, (len(corners), 1, 3))
+    )
     return make_mesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 
 
@@ -281,12 +331,19 @@ def test_a_suspicious_object_gets_no_confident_answer_and_is_looked_at_longer():
 
 
 def test_what_a_later_frame_shows_in_another_light_is_not_held_against_the_object(monkeypatch):
-    """From the front a long box is half as long: novel. The frame from the side corrects that, also of the first."""
+    """From the front a long box is half as long: novel.
+
+    The frame from the side corrects that, also of the first.
+    """
     scores = []
-    monkeypatch.setattr(Novelty, "scores", lambda self, embeddings, exact: np.full(len(embeddings), scores[-1]))
+    monkeypatch.setattr(
+        Novelty, "scores", lambda self, embeddings, exact: np.full(len(embeddings), scores[-1])
+    )
     monkeypatch.setattr(Novelty, "of_views", lambda self, scores: float(np.mean(scores) < 1))
     session = nextview.load(threshold=0.1).session(object=ObservedObject(life_size=False))
-    for k, pose in enumerate((pose_at(4, 0, 0.8, (0, 0, 0.06)), pose_at(45, 90, 0.8, (0, 0, 0.06)))):
+    for k, pose in enumerate(
+        (pose_at(4, 0, 0.8, (0, 0, 0.06)), pose_at(45, 90, 0.8, (0, 0, 0.06)))
+    ):
         assert not session.done
         scores.append((9.0, 0.0)[k])
         depth = cast([TABLE, box((0.4, 0.12, 0.12), (0, 0, 0.06))], pose)[0]
@@ -297,12 +354,20 @@ def test_what_a_later_frame_shows_in_another_light_is_not_held_against_the_objec
     assert not session.result.stranded
 
 
-@pytest.mark.parametrize(("score", "joins", "asked"), [(9.0, ["never"], 1), (9.0, [], 0), (0.0, ["never"], 0)])
+@pytest.mark.parametrize(
+    ("score", "joins", "asked"), [(9.0, ["never"], 1), (9.0, [], 0), (0.0, ["never"], 0)]
+)
 def test_only_a_novel_object_that_touches_another_is_reconsidered(monkeypatch, score, joins, asked):
     calls, pose = [], pose_at(40, 20, 0.8, (0, 0, 0.06))
-    monkeypatch.setattr(Novelty, "scores", lambda self, embeddings, exact: np.full(len(embeddings), score))
+    monkeypatch.setattr(
+        Novelty, "scores", lambda self, embeddings, exact: np.full(len(embeddings), score)
+    )
     monkeypatch.setattr(ObservedObject, "other_joins", lambda self: joins)
-    monkeypatch.setattr(ObservedObject, "reconsider", lambda self, novelty: calls.append(novelty(self.observations)))
+    monkeypatch.setattr(
+        ObservedObject, "reconsider", lambda self, novelty: calls.append(novelty(self.observations))
+    )
     depth = cast([TABLE, box((0.4, 0.12, 0.12), (0, 0, 0.06))], pose)[0]
-    nextview.load().session(object=ObservedObject()).update(Frame(depth, INTRINSICS, pose, pixel_centre=0.5))
+    nextview.load().session(object=ObservedObject()).update(
+        Frame(depth, INTRINSICS, pose, pixel_centre=0.5)
+    )
     assert calls == [score] * asked

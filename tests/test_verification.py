@@ -71,7 +71,10 @@ def cup(handle: bool) -> Mesh:
 def views_of(mesh: Mesh, yaw: float = 0.0, directions=VIEWS) -> list[Observation]:
     """Exact views of a mesh turned about the vertical."""
     camera = SimulatedCamera(rotated(mesh, rotation_about_z(np.array([yaw]))[0]))
-    return [camera.observe(look_at_origin(np.radians(up), np.radians(around))) for up, around in directions]
+    return [
+        camera.observe(look_at_origin(np.radians(up), np.radians(around)))
+        for up, around in directions
+    ]
 
 
 def true_pose(mesh: Mesh, yaw: float) -> np.ndarray:
@@ -139,7 +142,9 @@ def test_a_tilt_of_the_vertical_is_found_too():
     lean = Rotation.from_rotvec([0.03, -0.02, 0.4]).as_matrix()
     shown = rotated(mesh, lean)
     camera = SimulatedCamera(shown)
-    observations = [camera.observe(look_at_origin(np.radians(up), np.radians(around))) for up, around in VIEWS]
+    observations = [
+        camera.observe(look_at_origin(np.radians(up), np.radians(around))) for up, around in VIEWS
+    ]
     _, poses, _ = aligned(mesh, observations, np.array([0.35]))
     true = np.eye(4)
     true[:3, :3] = lean
@@ -174,7 +179,9 @@ def test_errors_of_the_cameras_places_are_told_from_the_pose():
 
 
 def test_a_missing_handle_lowers_the_likelihood():
-    caster = SurfaceCaster([Surface.from_mesh(cup(handle), str(handle)) for handle in (True, False)])
+    caster = SurfaceCaster(
+        [Surface.from_mesh(cup(handle), str(handle)) for handle in (True, False)]
+    )
     for handle in (True, False):
         observation = views_of(cup(handle), directions=((30.0, 60.0),))[0]
         view = depth_view(observation, SIDE)
@@ -226,7 +233,9 @@ def test_the_ground_tells_the_vertical_and_the_noise():
 
 def test_a_thing_is_found_upright_on_a_table_that_leans():
     mesh = cup(True)
-    lean = Rotation.from_rotvec([0.06, -0.05, 0.0]).as_matrix() @ rotation_about_z(np.array([0.7]))[0]
+    lean = (
+        Rotation.from_rotvec([0.06, -0.05, 0.0]).as_matrix() @ rotation_about_z(np.array([0.7]))[0]
+    )
     observation = standing_view(mesh, lean, noise=0.003)
     found = verifier_of(mesh, l_block())([observation], even_belief(2))
     true = np.eye(4)
@@ -353,7 +362,8 @@ def test_rays_cast_at_many_surfaces_are_those_cast_at_each_alone():
         alone = embree_scene([(surfaces[thing].vertices, surfaces[thing].faces)])
         hits = alone.run(np.tile(origins[row], (200, 1)), np.ascontiguousarray(rays[row]), output=1)
         met = hits["primID"] >= 0
-        assert np.mean(met != np.isfinite(depth[row])) < 0.02  # rays along an edge may go either way
+        # rays along an edge may go either way
+        assert np.mean(met != np.isfinite(depth[row])) < 0.02
         both = met & np.isfinite(depth[row])
         assert both.sum() > 20
         np.testing.assert_allclose(depth[row, both], hits["tfar"][both], atol=1e-4)
@@ -370,7 +380,9 @@ def test_a_surface_keeps_the_frame_of_its_scan_and_loses_what_no_camera_sees():
     assert surface.diameter == pytest.approx(0.1, rel=1e-3)
     few = surface.simplified()
     assert len(few.faces) < len(surface.faces) / 4
-    off = np.linalg.norm(few.sample(500, np.random.default_rng(0)) - (2.0, -1.0, 0.5), axis=1) - 0.05
+    off = (
+        np.linalg.norm(few.sample(500, np.random.default_rng(0)) - (2.0, -1.0, 0.5), axis=1) - 0.05
+    )
     assert np.abs(off).max() < 0.001
     block = Surface.from_mesh(l_block(), "block")
     assert block.simplified() is block  # it has no triangle too many
@@ -381,8 +393,14 @@ def test_a_surface_keeps_the_frame_of_its_scan_and_loses_what_no_camera_sees():
 @pytest.mark.parametrize(
     ("body", "part"),
     [
-        (trimesh.creation.icosphere(subdivisions=5, radius=0.04), trimesh.creation.box((0.02, 0.012, 0.012))),
-        (trimesh.creation.box((0.1, 0.07, 0.08)), trimesh.creation.icosphere(subdivisions=5, radius=0.01)),
+        (
+            trimesh.creation.icosphere(subdivisions=5, radius=0.04),
+            trimesh.creation.box((0.02, 0.012, 0.012)),
+        ),
+        (
+            trimesh.creation.box((0.1, 0.07, 0.08)),
+            trimesh.creation.icosphere(subdivisions=5, radius=0.01),
+        ),
     ],
     ids=["few triangles on a fine body", "a fine knob on a body of few triangles"],
 )
@@ -468,11 +486,14 @@ def residual_of(verifier: Verifier, mesh: Mesh) -> Verified:
 
 
 def test_what_no_hypothesis_explains_has_a_small_p_value():
-    known = KnownResiduals.fit(np.array([0, 0, 1, 1]), np.array([0.1, 0.2, 0.15, 0.25]), np.array([2, 2, 2, 2]), 2)
+    known = KnownResiduals.fit(
+        np.array([0, 0, 1, 1]), np.array([0.1, 0.2, 0.15, 0.25]), np.array([2, 2, 2, 2]), 2
+    )
     verifier = verifier_of(cup(True), l_block())
     stranger = mesh_of(((0.12, 0.12, 0.02), (0, 0, 0)), ((0.02, 0.02, 0.12), (0, 0, 0.05)))
     taught, strange = residual_of(verifier, l_block()), residual_of(verifier, stranger)
-    assert known.p_value(strange.residual, int(strange.things[0]), 2) == pytest.approx(0.2)  # the least of 1 in 5
+    # the least of 1 in 5
+    assert known.p_value(strange.residual, int(strange.things[0]), 2) == pytest.approx(0.2)
     assert known.p_value(taught.residual, int(taught.things[0]), 2) > 0.5
 
 
@@ -486,7 +507,8 @@ def test_what_is_always_explained_badly_is_not_unknown_for_that():
     assert known.p_value(0.6, 0, 1) > 0.2
     assert known.p_value(0.6, 1, 1) < 0.01
     assert known.p_value(0.0, 1, 1) == 1
-    assert known.p_value(0.6, 0, 7) == known.p_value(0.6, 0, 1)  # of more views nothing else is known
+    # of more views nothing else is known
+    assert known.p_value(0.6, 0, 7) == known.p_value(0.6, 0, 1)
 
 
 def episode(geometry: float, features: float, truth: int = 0, views: int = 1) -> JudgedEpisode:
@@ -509,7 +531,9 @@ def test_the_belief_follows_from_the_sum_of_what_is_weighed():
     np.testing.assert_allclose(episode(0.3, -1.0, views=2).belief(doubting)[0], mixed)
 
 
-@pytest.mark.parametrize(("trusted", "geometry", "features"), [("geometry", 0.1, -1.0), ("features", -0.1, 1.0)])
+@pytest.mark.parametrize(
+    ("trusted", "geometry", "features"), [("geometry", 0.1, -1.0), ("features", -0.1, 1.0)]
+)
 def test_what_misleads_is_given_the_least_weight(trusted, geometry, features):
     fitted = fit_weights([episode(geometry, features), episode(-geometry, -features, truth=1)])
     assert fitted.geometry == (60 if trusted == "geometry" else 5)
@@ -518,7 +542,11 @@ def test_what_misleads_is_given_the_least_weight(trusted, geometry, features):
 
 def test_views_that_err_together_are_not_trusted_as_many():
     # Four views are wrong as often as one: a quarter of the cases.
-    both = [episode(0.1, 0.0, truth=int(case == 0), views=views) for views in (1, 4) for case in range(4)]
+    both = [
+        episode(0.1, 0.0, truth=int(case == 0), views=views)
+        for views in (1, 4)
+        for case in range(4)
+    ]
     fitted = fit_weights(both)
     assert fitted.correlation == max(CORRELATIONS)
     assert fitted.geometry == 10  # log-odds of 3 to 1 are 1.1
@@ -529,7 +557,9 @@ def test_views_that_err_together_are_not_trusted_as_many():
 def test_a_memory_and_scans_name_a_thing_and_tell_its_pose(taught, scans):
     recogniser = TaughtRecogniser(taught / "memory.json", threads=1)
     meshes = {name: load_mesh(scans / f"{name}.off", unit="m") for name in ("chair", "table")}
-    things = TaughtThings(recogniser, [Surface.from_mesh(mesh, name) for name, mesh in meshes.items()])
+    things = TaughtThings(
+        recogniser, [Surface.from_mesh(mesh, name) for name, mesh in meshes.items()]
+    )
     for number, (name, mesh) in enumerate(meshes.items()):
         found = things(views_of(mesh, 1.1)[:2])
         assert things.names[found.belief.argmax()] == name
@@ -550,7 +580,9 @@ def turned_about(mesh_vertices, faces, seed, name="thing"):
     """A surface with its axes and its origin anywhere."""
     rotation = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
     return rotation, Surface(
-        name, (mesh_vertices @ rotation.T + (0.4, -0.2, 0.1)).astype(np.float32), faces.astype(np.int32)
+        name,
+        (mesh_vertices @ rotation.T + (0.4, -0.2, 0.1)).astype(np.float32),
+        faces.astype(np.int32),
     )
 
 
@@ -608,7 +640,9 @@ def test_a_sheet_has_the_symmetries_of_its_outline(thickness):
     sheet = trimesh.creation.box((0.1, 0.2, thickness or 1e-9))
     found = find_symmetries(turned_about(sheet.vertices, sheet.faces, 4)[1])
     assert {one.order for one in found} == {2}
-    irregular = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [-0.1, 0.2, 0]], [[0, 1, 2]], process=False)
+    irregular = trimesh.Trimesh(
+        [[0, 0, 0], [0.1, 0, 0], [-0.1, 0.2, 0]], [[0, 1, 2]], process=False
+    )
     assert find_symmetries(turned_about(irregular.vertices, irregular.faces, 5)[1]) == ()
 
 
@@ -634,13 +668,16 @@ def test_a_surface_from_frames_lies_on_the_thing_and_covers_what_was_seen(captur
     def observe(pose):
         frame = clean(pose)
         depth = frame.depth + (noise * rng.normal(size=frame.shape)).astype(np.float32)
-        return replace(frame, depth=np.where(frame.depth > 0, depth, 0).astype(np.float32), pixel_centre=0.5)
+        return replace(
+            frame, depth=np.where(frame.depth > 0, depth, 0).astype(np.float32), pixel_centre=0.5
+        )
 
     camera.observe = observe
     camera.take_all(look_at_origin(0.3, 0.0))
     surface = fuse(camera.object.sightings, camera.object.object_frame.radius, "block")
 
-    height = -mesh.metres * mesh.vertices[:, 2].min()  # the world's origin is below the middle of the mesh
+    # the world's origin is below the middle of the mesh
+    height = -mesh.metres * mesh.vertices[:, 2].min()
     true = Surface.from_mesh(mesh, "block")
     truth = true.sample(100_000, rng) - true.centre + (0, 0, height)
     off = cKDTree(truth).query(surface.sample(2000, rng))[0]

@@ -1,4 +1,6 @@
-"""What learn fits to the surfaces of things: weights, usual residuals, and the accuracy that it prints."""
+"""What learn fits to the surfaces of things: weights, usual residuals, and the accuracy that it
+prints.
+"""
 
 from dataclasses import replace
 
@@ -26,7 +28,9 @@ DEFAULTS = EvidenceWeights()
 
 
 def shown(thing, views, rng, things, gap=0.3, lie=0.0):
-    """An episode in which the truth is explained better by a gap, but for a share of lies, and features say nothing."""
+    """An episode in which the truth is explained better by a gap, but for a share of lies, and
+    features say nothing.
+    """
     mean = -0.1 - gap * (np.arange(things) != thing)[:, None] + rng.normal(0, 0.02, (things, views))
     if rng.random() < lie:
         mean = np.roll(mean, 1, 0)
@@ -39,7 +43,12 @@ def shown(thing, views, rng, things, gap=0.3, lie=0.0):
 
 def episodes(things, draws=4, **how):
     rng = np.random.default_rng(5)
-    return [shown(t, v, rng, things, **how) for t in range(things) for _ in range(draws) for v in (1, 2, 3)]
+    return [
+        shown(t, v, rng, things, **how)
+        for t in range(things)
+        for _ in range(draws)
+        for v in (1, 2, 3)
+    ]
 
 
 def weights_of(fit):
@@ -55,10 +64,14 @@ def test_few_things_that_are_told_apart_leave_the_weights_as_they_were(things):
 
 
 def test_many_confused_things_lower_the_weight_of_geometry_and_few_do_so_less():
-    lies = {things: weights_of(fit_verification(episodes(things, lie=0.4), np.arange(things))) for things in (3, 12)}
+    lies = {
+        things: weights_of(fit_verification(episodes(things, lie=0.4), np.arange(things)))
+        for things in (3, 12)
+    }
     assert lies[12].geometry < lies[3].geometry < DEFAULTS.geometry
     share = 12 / (12 + DEFAULT_THINGS)
-    assert lies[12].geometry >= DEFAULTS.geometry ** (1 - share) * 5.0**share * 0.999  # 5 is the least that is tried
+    # 5 is the least that is tried
+    assert lies[12].geometry >= DEFAULTS.geometry ** (1 - share) * 5.0**share * 0.999
 
 
 def test_the_accuracy_is_that_of_weights_that_were_fitted_to_other_things():
@@ -116,7 +129,9 @@ def test_of_very_many_residuals_quantiles_are_kept():
 
 def test_added_things_leave_weights_and_what_was_known_and_get_residuals_of_their_own():
     before = as_stored(
-        replace(DEFAULTS, geometry=22.0), KnownResiduals(np.array([0.3, 0.1]), (np.array([-0.1, 0.1]),) * 3), 2
+        replace(DEFAULTS, geometry=22.0),
+        KnownResiduals(np.array([0.3, 0.1]), (np.array([-0.1, 0.1]),) * 3),
+        2,
     )
     rng = np.random.default_rng(2)
     new = [shown(1, views, rng, 3) for views in (1, 2, 3)]
@@ -127,7 +142,9 @@ def test_added_things_leave_weights_and_what_was_known_and_get_residuals_of_thei
     assert [len(row) for row in after.excess] == [3, 3, 3]
 
 
-@pytest.mark.parametrize(("things", "of", "each"), [(1, 1, 16), (3, 3, 5), (1, 78, 2), (78, 78, 2), (1000, 1000, 2)])
+@pytest.mark.parametrize(
+    ("things", "of", "each"), [(1, 1, 16), (3, 3, 5), (1, 78, 2), (78, 78, 2), (1000, 1000, 2)]
+)
 def test_a_bounded_number_of_episodes_is_shown(things, of, each):
     items = to_be_shown(range(things), of, np.random.default_rng(0))
     assert len(items) == min(things, 150) * each
@@ -136,7 +153,9 @@ def test_a_bounded_number_of_episodes_is_shown(things, of, each):
 
 @pytest.fixture(scope="module")
 def blocks(tmp_path_factory):
-    """Two blocks that differ in the third dimension alone, and a class of two balls, millimetres, and their memory."""
+    """Two blocks that differ in the third dimension alone, and a class of two balls,
+    millimetres, and their memory.
+    """
     folder = tmp_path_factory.mktemp("blocks")
     scans = folder / "scans"
     for name, mesh in {
@@ -160,8 +179,15 @@ def test_learn_says_how_often_things_are_named_right_by_their_geometry(blocks):
     card = read_card(folder / "mine/memory.json")
     assert card.scores["verified by geometry"]["3"] == pytest.approx(learned.accuracy[2], abs=1e-4)
     assert len(card.memory.verification.usual) == 4
-    symmetries = {thing.name: [one.order for one in thing.symmetries] for thing in card.memory.things}
-    assert symmetries == {"small": [0, 0, 0], "large": [0, 0, 0], "high": [4, 2, 2], "low": [2, 2, 2]}
+    symmetries = {
+        thing.name: [one.order for one in thing.symmetries] for thing in card.memory.things
+    }
+    assert symmetries == {
+        "small": [0, 0, 0],
+        "large": [0, 0, 0],
+        "high": [4, 2, 2],
+        "low": [2, 2, 2],
+    }
 
 
 def test_geometry_is_carried_over_and_only_new_things_are_shown(blocks, tmp_path):

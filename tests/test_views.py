@@ -1,4 +1,6 @@
-"""The comparison at fixed numbers of views against the benchmark itself, one number of views at a time."""
+"""The comparison at fixed numbers of views against the benchmark itself, one number of views at
+a time.
+"""
 
 import runpy
 from pathlib import Path
@@ -26,22 +28,45 @@ def made(tmp_path_factory):
 def test_the_numbers_are_those_of_a_benchmark_with_so_many_views(made, n_views):
     names = ("random", "random-all", "lem", "furthest", "spread", "oracle-gain")
     out = made / f"benchmark{n_views}"
-    settings = {"policies": names, "thresholds": (1.0,), "runs": 3, "max_views": n_views, "samples": 200}
+    settings = {
+        "policies": names,
+        "thresholds": (1.0,),
+        "runs": 3,
+        "max_views": n_views,
+        "samples": 200,
+    }
     tables = benchmark(made / "p.npz", out, **settings).tables
-    found = pd.read_csv(made / "out" / "views.csv").set_index(["policy", "n_views", "measure"]).sort_index()
+    found = (
+        pd.read_csv(made / "out" / "views.csv")
+        .set_index(["policy", "n_views", "measure"])
+        .sort_index()
+    )
     for ours, theirs in (("accuracy", "accuracy"), ("travel", "travel_all")):
         summary = tables.summary[tables.summary["measure"] == theirs].set_index("policy")
         for name in names:
             for column in ("value", "low", "high"):
-                assert found.loc[name, n_views, ours][column] == pytest.approx(summary.loc[name, column], abs=1e-9)
+                assert found.loc[name, n_views, ours][column] == pytest.approx(
+                    summary.loc[name, column], abs=1e-9
+                )
     tests = tables.tests.query("measure == 'accuracy'").set_index("policy")
     for name in names[1:]:
-        for ours, theirs in (("value", "difference"), ("low", "low"), ("high", "high"), ("p", "mcnemar")):
-            assert found.loc[name, n_views, "to_random"][ours] == pytest.approx(tests.loc[name, theirs], abs=1e-9)
+        for ours, theirs in (
+            ("value", "difference"),
+            ("low", "low"),
+            ("high", "high"),
+            ("p", "mcnemar"),
+        ):
+            assert found.loc[name, n_views, "to_random"][ours] == pytest.approx(
+                tests.loc[name, theirs], abs=1e-9
+            )
 
 
 def test_the_gap_is_that_between_random_and_one_step_of_foresight(made):
-    found = pd.read_csv(made / "out" / "views.csv").set_index(["measure", "n_views", "policy"])["value"].sort_index()
+    found = (
+        pd.read_csv(made / "out" / "views.csv")
+        .set_index(["measure", "n_views", "policy"])["value"]
+        .sort_index()
+    )
     for n_views in (2, 4):
         accuracy, share = found["accuracy", n_views], found["share_of_gap", n_views]
         assert (share["random"], share["oracle-gain"]) == (0, pytest.approx(1))
@@ -50,13 +75,35 @@ def test_the_gap_is_that_between_random_and_one_step_of_foresight(made):
 
 
 def test_the_command_writes_the_same_table_beside_its_own(made, capsys):
-    """``nextview benchmark --views``, from the same first views; then figures and tables for papers."""
+    """``nextview benchmark --views``, from the same first views; then figures and tables for
+    papers.
+    """
     out = made / "command"
-    main(["benchmark", str(made / "p.npz"), str(out), "--policies", "lem", "spread", "oracle-gain", "--views", "4", "2",
-          "--runs", "3", "--samples", "200", "--thresholds", "0.9"])  # fmt: skip
+    main(
+        [
+            "benchmark",
+            str(made / "p.npz"),
+            str(out),
+            "--policies",
+            "lem",
+            "spread",
+            "oracle-gain",
+            "--views",
+            "4",
+            "2",
+            "--runs",
+            "3",
+            "--samples",
+            "200",
+            "--thresholds",
+            "0.9",
+        ]
+    )
     assert "| policy | 2 views | 4 views |" in capsys.readouterr().out
     keys = ["policy", "n_views", "measure"]
-    ours, script = (pd.read_csv(f / "views.csv").set_index(keys).sort_index() for f in (out, made / "out"))
+    ours, script = (
+        pd.read_csv(f / "views.csv").set_index(keys).sort_index() for f in (out, made / "out")
+    )
     shared = ours.index[ours.index.get_level_values("policy") != "random-all"]
     for column in ("value", "low", "high", "p"):
         np.testing.assert_allclose(ours.loc[shared, column], script.loc[shared, column], atol=1e-9)

@@ -1,4 +1,6 @@
-"""View geometry against hand-written layouts, haversine arcs and the definition of a view-at pose."""
+"""View geometry against hand-written layouts, haversine arcs and the definition of a view-at
+pose.
+"""
 
 import numpy as np
 import pytest
@@ -18,7 +20,10 @@ spheres = st.builds(
 def haversine(sphere: ViewSphere, a: int, b: int) -> float:
     """Great-circle angle from latitudes and longitudes (Sinnott 1984)."""
     (lat1, lon1), (lat2, lon2) = (np.radians(sphere.angles(v)) for v in (a, b))
-    h = np.sin((lat2 - lat1) / 2) ** 2 + np.cos(lat1) * np.cos(lat2) * np.sin((lon2 - lon1) / 2) ** 2
+    h = (
+        np.sin((lat2 - lat1) / 2) ** 2
+        + np.cos(lat1) * np.cos(lat2) * np.sin((lon2 - lon1) / 2) ** 2
+    )
     return 2 * np.arcsin(np.sqrt(min(h, 1)))
 
 
@@ -76,7 +81,8 @@ def test_poses_look_at_the_origin_with_a_level_horizon(elevation, azimuth, dista
     np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1)
     np.testing.assert_array_equal(pose[3], [0, 0, 0, 1])
-    np.testing.assert_allclose(position + distance * rotation[:, 2], 0, atol=1e-12 * distance)  # z is forward
+    # z is forward
+    np.testing.assert_allclose(position + distance * rotation[:, 2], 0, atol=1e-12 * distance)
     assert np.linalg.norm(position) == pytest.approx(distance)
     assert rotation[2, 0] == 0  # x has no vertical part: the horizon is level
     assert rotation[2, 1] <= 1e-12  # y is down

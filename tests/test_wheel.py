@@ -1,7 +1,8 @@
 """The wheel: built, installed into an empty environment, and run with nothing but what it asks for.
 
-Always: what the wheel asks for is linked from the environment of the tests, so that nothing else can be imported.
-With NEXTVIEW_WHEELS=all, pip installs the wheel and each extra from an index, as a user would.
+Always: what the wheel asks for is linked from the environment of the tests, so that nothing else
+can be imported. With NEXTVIEW_WHEELS=all, pip installs the wheel and each extra from an index, as a
+user would.
 """
 
 import os
@@ -22,8 +23,13 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parent.parent
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 EXAMPLES = {
-    "": "import nextview; assert nextview.recognise('samples/chair.off', start=3).answer == 'chair'",
-    "benchmark": "from nextview.benchmark.run import run_benchmark; from nextview.benchmark.report import report",
+    "": (
+        "import nextview; assert nextview.recognise('samples/chair.off', start=3).answer == 'chair'"
+    ),
+    "benchmark": (
+        "from nextview.benchmark.run import run_benchmark; from nextview.benchmark.report import"
+        " report"
+    ),
     "cluster": "from distributed import LocalCluster; import nextview.data.pool",
     "train": "import lightning, torch; from nextview.learning import export, runs",
     "workflow": "import snakemake",
@@ -31,19 +37,30 @@ EXAMPLES = {
     "browser": "import playwright",
     "large": "import faiss",
     "record": "import rerun; from nextview.viewers.recording import Recorder",
-    "envs": "import gymnasium, nextview.benchmark.environments; gymnasium.spec('nextview/Recognise-v0')",
+    "envs": (
+        "import gymnasium, nextview.benchmark.environments; gymnasium.spec('nextview/Recognise-v0')"
+    ),
     "docs": "import material, mkdocs, mkdocs_jupyter, mkdocstrings_handlers.python",
     "dev": "import hypothesis, mypy, pytest, ruff, skimage",
 }
 """One line for each extra, and for none."""
 QUICK = ("", "benchmark", "cluster", "envs", "record")
 """Those that are tried always: the others import for seconds."""
-EMPTY_ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PIP_TARGET"))}
+EMPTY_ENVIRONMENT = {
+    name: value
+    for name, value in os.environ.items()
+    if not name.startswith(("PYTHON", "PIP_TARGET"))
+}
 
 
 def run(*command, cwd=ROOT, timeout=600):
     done = subprocess.run(
-        list(map(str, command)), cwd=cwd, env=EMPTY_ENVIRONMENT, capture_output=True, text=True, timeout=timeout
+        list(map(str, command)),
+        cwd=cwd,
+        env=EMPTY_ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
     )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
     return done.stdout
@@ -51,14 +68,28 @@ def run(*command, cwd=ROOT, timeout=600):
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    """Built from a copy, which setuptools may fill with what it makes; by the environment's own setuptools."""
+    """Built from a copy, which setuptools may fill with what it makes; by the environment's own
+    setuptools.
+    """
     folder = tmp_path_factory.mktemp("wheel")
     for name in ("src", "samples"):
-        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("*.egg-info", "__pycache__"))
+        shutil.copytree(
+            ROOT / name, folder / name, ignore=shutil.ignore_patterns("*.egg-info", "__pycache__")
+        )
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, folder)
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check")
-    run(*pip, "wheel", "--quiet", "--no-deps", "--no-index", "--no-build-isolation", "-w", folder / "dist", folder)
+    run(
+        *pip,
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--no-index",
+        "--no-build-isolation",
+        "-w",
+        folder / "dist",
+        folder,
+    )
     (built,) = (folder / "dist").glob("*.whl")
     return built
 
@@ -100,10 +131,14 @@ def test_no_version_with_a_known_hole_is_asked_for(project):
 def test_the_constraints_are_within_what_is_asked_for():
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pinned = {
-        canonicalize_name(name): version for name, _, version in (line.partition("==") for line in lines) if version
+        canonicalize_name(name): version
+        for name, _, version in (line.partition("==") for line in lines)
+        if version
     }
     table = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    for needed in map(Requirement, table["dependencies"] + [each for extra in EXTRAS.values() for each in extra]):
+    for needed in map(
+        Requirement, table["dependencies"] + [each for extra in EXTRAS.values() for each in extra]
+    ):
         assert needed.specifier.contains(pinned[canonicalize_name(needed.name)]), needed
 
 
@@ -123,24 +158,46 @@ def test_it_runs_with_what_it_asks_for(wheel, extra, tmp_path):
     for installed in found.values():
         link(installed, packages)
     run(python, "-c", EXAMPLES[extra], cwd=wheel.parents[1])
-    assert f"{packages}" in run(python, "-c", "import nextview; print(nextview.__file__)", cwd=tmp_path)
+    assert f"{packages}" in run(
+        python, "-c", "import nextview; print(nextview.__file__)", cwd=tmp_path
+    )
 
 
 def test_it_holds_the_package_and_nothing_else(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     tops = {name.split("/")[0] for name in names}
-    assert {re.sub(r"-.*\.dist-info", "", top) for top in tops} == {"nextview", "nextview_command.py"}
+    assert {re.sub(r"-.*\.dist-info", "", top) for top in tops} == {
+        "nextview",
+        "nextview_command.py",
+    }
     source = ROOT / "src/nextview"
-    data = [path for path in source.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc", ".toml")]
+    data = [
+        path
+        for path in source.rglob("*")
+        if path.is_file() and path.suffix not in (".py", ".pyc", ".toml")
+    ]
     assert {f"nextview/{path.relative_to(source).as_posix()}" for path in data} <= set(names)
 
 
-@pytest.mark.skipif(os.environ.get("NEXTVIEW_WHEELS") != "all", reason="NEXTVIEW_WHEELS=all installs from an index")
+@pytest.mark.skipif(
+    os.environ.get("NEXTVIEW_WHEELS") != "all", reason="NEXTVIEW_WHEELS=all installs from an index"
+)
 @pytest.mark.parametrize("extra", EXAMPLES)
 def test_pip_installs_it(wheel, extra, tmp_path):
     run(sys.executable, "-m", "venv", tmp_path / "venv")
     python = tmp_path / "venv/bin/python"
     wanted = f"nextview[{extra}] @ {wheel.as_uri()}" if extra else wheel
-    run(python, "-m", "pip", "install", "--quiet", "--no-compile", "-c", ROOT / "constraints.txt", wanted, timeout=3000)
+    run(
+        python,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-compile",
+        "-c",
+        ROOT / "constraints.txt",
+        wanted,
+        timeout=3000,
+    )
     run(python, "-c", EXAMPLES[extra], cwd=wheel.parents[1])
     assert "nextview 0" in run(tmp_path / "venv/bin/nextview", "--version")

@@ -1,4 +1,6 @@
-"""The workflow from the meshes to every table: its graph, how a stage resumes, and a small run of it."""
+"""The workflow from the meshes to every table: its graph, how a stage resumes, and a small run
+of it.
+"""
 
 import hashlib
 import json
@@ -19,7 +21,9 @@ def stage(folder, *arguments):
 
 def needed(folder, name, content):
     """The .done file of an earlier stage."""
-    (folder / f"{name}.done").write_text(json.dumps({"sha256": hashlib.sha256(content.encode()).hexdigest()}))
+    (folder / f"{name}.done").write_text(
+        json.dumps({"sha256": hashlib.sha256(content.encode()).hexdigest()})
+    )
     return f"{name}.done"
 
 
@@ -39,7 +43,9 @@ def test_a_stage_that_was_cut_off_goes_on_with_what_it_left(tmp_path):
 @pytest.mark.parametrize("change", ["input", "command", "state"])
 def test_a_stage_begins_anew_when_what_it_is_made_from_has_changed(tmp_path, change):
     needs, state, command = needed(tmp_path, "meshes", "a"), "1", GROW
-    assert stage(tmp_path, "out", "--needs", needs, f"--state={state}", "--commands", command).returncode
+    assert stage(
+        tmp_path, "out", "--needs", needs, f"--state={state}", "--commands", command
+    ).returncode
     (tmp_path / "enough").touch()
     if change == "input":
         needed(tmp_path, "meshes", "b")
@@ -47,7 +53,12 @@ def test_a_stage_begins_anew_when_what_it_is_made_from_has_changed(tmp_path, cha
         command += " -o 1 = 1"
     else:
         state = "2"
-    assert stage(tmp_path, "out", "--needs", needs, f"--state={state}", "--commands", command).returncode == 0
+    assert (
+        stage(
+            tmp_path, "out", "--needs", needs, f"--state={state}", "--commands", command
+        ).returncode
+        == 0
+    )
     assert (tmp_path / "out/lines").read_text() == "line\n"
 
 
@@ -69,7 +80,17 @@ def test_a_stage_is_made_by_one_process_at_a_time(tmp_path):
 
 def snakemake(folder, *arguments, config=()):
     pytest.importorskip("snakemake", reason="the workflow extra is not installed")
-    command = [sys.executable, "-m", "snakemake", "-s", WORKFLOW / "Snakefile", "--directory", folder, "--cores", "2"]
+    command = [
+        sys.executable,
+        "-m",
+        "snakemake",
+        "-s",
+        WORKFLOW / "Snakefile",
+        "--directory",
+        folder,
+        "--cores",
+        "2",
+    ]
     command += ["--nolock", *arguments, "--config", *config]
     return subprocess.run(command, capture_output=True, text=True, timeout=900)
 
@@ -81,18 +102,32 @@ def test_the_whole_graph_makes_every_bundled_model_and_table(tmp_path):
     planned = result.stdout + result.stderr
     for card in (BUNDLED / "recognition/bundled").glob("*-modelnet10.json"):
         assert f"--name {card.stem}" in planned or f"{card.stem.partition('-')[0]} runs/" in planned
-    for command in ("render ModelNet10 sensed-held-out.zarr --sensor mix", "fit calibration", "fit size", "fit valleys",
-                    "train gain", "evaluate", "benchmark", "report"):  # fmt: skip
+    for command in (
+        "render ModelNet10 sensed-held-out.zarr --sensor mix",
+        "fit calibration",
+        "fit size",
+        "fit valleys",
+        "train gain",
+        "evaluate",
+        "benchmark",
+        "report",
+    ):
         assert f"nextview {command} " in planned
-    for script in ("fit_policies validation.npz policies", "measure_study views.zarr measures --meshes",
-                   "train_agent ppo validation.npz", "plan views.zarr volumetric coverage"):  # fmt: skip
+    for script in (
+        "fit_policies validation.npz policies",
+        "measure_study views.zarr measures --meshes",
+        "train_agent ppo validation.npz",
+        "plan views.zarr volumetric coverage",
+    ):
         assert f"python -m research.{script}" in planned
     assert "docs/results.md" in planned
 
 
 @pytest.mark.long
 def test_a_small_run_of_the_whole_graph(tmp_path):
-    """From the meshes of box furniture to the page of results, by networks that learn next to nothing."""
+    """From the meshes of box furniture to the page of results, by networks that learn next to
+    nothing.
+    """
     for package in ("torch", "onnx", "pandas", "jinja2"):
         pytest.importorskip(package)
     small = ("--configfile", WORKFLOW / "small.yaml")

@@ -1,15 +1,17 @@
-"""Run every command that the pages show, on small inputs made here: a command that no machine runs is wrong some day.
+"""Run every command that the pages show, on small inputs made here: a command that no machine runs
+is wrong some day.
 
     python workflow/documented_commands.py [PAGE ...] [--only-list]
 
-Takes README.md, docs/*.md, research/README.md and what stands above the code of examples/*.py apart into commands and
-Python blocks, and runs them page by page, in the order of the page, each page in a folder of its own with what its
-commands need: a few box meshes under the names of ModelNet10, a store of their views and predictions. ``SMALL`` makes a
-command quick; ``NOT_RUN`` says what is not run, and why. What fails is printed with the end of its output, and the exit
-status is 1.
+Takes README.md, docs/*.md, research/README.md and what stands above the code of examples/*.py apart
+into commands and Python blocks, and runs them page by page, in the order of the page, each page in
+a folder of its own with what its commands need: a few box meshes under the names of ModelNet10, a
+store of their views and predictions. ``SMALL`` makes a command quick; ``NOT_RUN`` says what is not
+run, and why. What fails is printed with the end of its output, and the exit status is 1.
 
-Each command runs where nothing is installed but what a reader of the page has: the base installation, and the extras
-that ``NEEDS`` names for it, which the page has to name, too. Such an environment is linked from that of this script.
+Each command runs where nothing is installed but what a reader of the page has: the base
+installation, and the extras that ``NEEDS`` names for it, which the page has to name, too. Such an
+environment is linked from that of this script.
 """
 
 from __future__ import annotations
@@ -61,20 +63,32 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"^make demo": "installs; .ci/base_installation runs nextview demo, twice",
     r"^make ": "the workflow is run by tests/test_workflow.py",
     r"^(pip|python3 -m pip) ": "installs; tests/test_wheel.py installs the wheel with each extra",
-    r"^nextview download": "473 MB from a server of others; tests/test_download.py has a server of its own",
-    r"^nextview explore": "serves until it is stopped; tests/test_explore_page.py clicks through the page",
+    r"^nextview download": (
+        "473 MB from a server of others; tests/test_download.py has a server of its own"
+    ),
+    r"^nextview explore": (
+        "serves until it is stopped; tests/test_explore_page.py clicks through the page"
+    ),
     r"^rerun ": "opens a window",
     r"^dask ": "serves until it is stopped; tests/test_render.py has a cluster of its own",
     r"--scheduler": "needs the scheduler of the line before",
-    r"^(ros2|rosdep|colcon|cp -r ros2|cd |source )": "needs ROS 2; tests/test_ros2.py tries the node with stand-ins",
+    r"^(ros2|rosdep|colcon|cp -r ros2|cd |source )": (
+        "needs ROS 2; tests/test_ros2.py tries the node with stand-ins"
+    ),
     r"-m zipfile|efficientnet|resnet34-b627a593": "weights of others, which are fetched first",
-    r"research\.(film|real_things|touching_things|growth)|verified_things": "needs the YCB scans, and minutes",
+    r"research\.(film|real_things|touching_things|growth)|verified_things": (
+        "needs the YCB scans, and minutes"
+    ),
     r"research\.(train_grid|thing_features)": "trains for hours",
     r"research\.simulated_arm": "takes an hour; research/tests/test_arm.py has episodes of it",
     r"benchmarks/(render|replay|latency|session_latency)\.py": "measures time, on a quiet machine",
     r"research/tests": "they are in make test",
-    r"benchmarks/scenes\.py judge": "needs 200 scenes of each level; tests/test_scene_policies.py judges few",
-    r"SceneLayout\.load": "names one of the drawn scenes; tests/test_scenes.py looks into one of its own",
+    r"benchmarks/scenes\.py judge": (
+        "needs 200 scenes of each level; tests/test_scene_policies.py judges few"
+    ),
+    r"SceneLayout\.load": (
+        "names one of the drawn scenes; tests/test_scenes.py looks into one of its own"
+    ),
     r"nextview_ros": "takes messages of ROS 2; tests/test_ros2.py has recorded ones",
     r"--ensemble runs/second": "needs the run of the line before",
     r"agents/(ppo|mvselect)\.json .*agents/": "needs two agents of a million steps each",
@@ -82,7 +96,9 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
 NEEDS = {  # what a command or a Python block needs besides the base installation, by what is in it
     r"nextview (train|export) ": "nextview[train]",
     r"nextview (benchmark|evaluate|report) ": "nextview[benchmark]",
-    r"benchmarks/(ablations|things|views)\.py|research\.(measure_study|example_maps)": "nextview[benchmark]",
+    r"benchmarks/(ablations|things|views)\.py|research\.(measure_study|example_maps)": (
+        "nextview[benchmark]"
+    ),
     r"benchmarks/ablations\.py": "nextview[train]",
     r"--record|viewers\.recording": "nextview[record]",
     r"(?<![.:])\b(volumetric|coverage)\b": "research",  # by their short names
@@ -115,7 +131,8 @@ FEWER = {  # what a page says of the published runs, and how many it is here
     r"--batch \d+": "--batch 8",
 }
 BEFORE = {  # what Python blocks of a page take for granted
-    "docs/your_camera.md": """
+    "docs/your_camera.md": (
+        """
 import nextview
 from nextview.sensing import Frame
 from stand_ins import arm, intrinsics
@@ -123,9 +140,11 @@ from stand_ins import arm, intrinsics
 system = nextview.load()
 session = system.session(distance=0.6)
 depth, pose = arm.look()
-""",
+"""
+    ),
     "docs/see_it.md": "import nextview",
-    "docs/your_objects.md": """
+    "docs/your_objects.md": (
+        """
 from pathlib import Path
 
 import nextview
@@ -139,7 +158,8 @@ if Path("mine").exists():  # what the first block has made
     depth, pose = arm.look()
     session.update(Frame(depth, intrinsics, pose))
     poses = session.poses
-""",
+"""
+    ),
 }
 
 
@@ -167,7 +187,9 @@ class Step:
     @property
     def why_not(self) -> str | None:
         """Why it is not run; None if it is."""
-        return next((why for pattern, why in NOT_RUN.items() if re.search(pattern, self.text)), None)
+        return next(
+            (why for pattern, why in NOT_RUN.items() if re.search(pattern, self.text)), None
+        )
 
     @property
     def command(self) -> str:
@@ -191,11 +213,16 @@ def needs_of(text: str) -> frozenset[str]:
 
 
 def steps_of(page: str) -> Iterator[Step]:
-    """The commands and Python blocks of a page, in order; blocks of doctest are run by the tests."""
+    """The commands and Python blocks of a page, in order.
+
+    Blocks of doctest are run by the tests.
+    """
     text = (ROOT / page).read_text(encoding="utf-8")
     if page.endswith(".py"):
         # What may be given or not stands in brackets there.
-        about = re.sub(r"\[(--[^\]]+)\]", r"\1", ast.get_docstring(ast.parse(text), clean=False) or "")
+        about = re.sub(
+            r"\[(--[^\]]+)\]", r"\1", ast.get_docstring(ast.parse(text), clean=False) or ""
+        )
         lines = about.splitlines()
         for number in range(1, 1 + len(lines)):
             yield from _commands(page, number, lines)
@@ -203,13 +230,15 @@ def steps_of(page: str) -> Iterator[Step]:
 
     lines = text.splitlines()
     block: list[str] = []
-    begun, kind = 0, None
+    begun = 0
+    kind = None
     for number, line in enumerate(lines, 1):
         if line.startswith("```"):
             if kind == "python" and not block[0].startswith(">>>"):
                 yield Step(page, begun + 1, "\n".join(block), python=True)
             kind = None if kind is not None else line.removeprefix("```").strip() or "sh"
-            begun, block = number, []
+            begun = number
+            block = []
         elif kind == "python":
             block.append(line)
         elif kind is not None or line.startswith("    "):
@@ -244,7 +273,9 @@ def make_inputs(folder: Path) -> None:
     from nextview.recognition.model_card import find_card
 
     for name in ("samples", "benchmarks", "research", "examples", "docs", "workflow"):
-        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "tests"))
+        shutil.copytree(
+            ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "tests")
+        )
     held_out = find_card("recogniser-modelnet10").held_out
     rng = np.random.default_rng(0)
     test = {"chair": ("chair_0890", "chair_0917"), "table": ("table_0399", "table_0400")}
@@ -254,7 +285,10 @@ def make_inputs(folder: Path) -> None:
         names += [(name, "test") for name in test.get(label, (f"{label}_0470", f"{label}_0471"))]
         for name, split in names:
             scale = rng.uniform(0.8, 1.25, 3)
-            boxes = [tuple(tuple(np.multiply(corner, scale)) for corner in box) for box in SAMPLES[label]()]
+            boxes = [
+                tuple(tuple(np.multiply(corner, scale)) for corner in box)
+                for box in SAMPLES[label]()
+            ]
             mesh = boxes_mesh(boxes, label)
             inches = trimesh.Trimesh(rng.uniform(15, 30) * mesh.vertices, mesh.faces, process=False)
             path = folder / "data/ModelNet10" / label / split / f"{name}.off"
@@ -263,10 +297,15 @@ def make_inputs(folder: Path) -> None:
     for copy in ("ModelNet10", "DATASET/ModelNet10"):
         shutil.copytree(folder / "data/ModelNet10", folder / copy)
     for label in SAMPLES:  # of classes that no recogniser knows
-        shutil.copytree(folder / "data/ModelNet10" / label / "test", folder / "PSB" / f"strange_{label}")
+        shutil.copytree(
+            folder / "data/ModelNet10" / label / "test", folder / "PSB" / f"strange_{label}"
+        )
     shutil.copytree(folder / "data/ModelNet10/chair/test", folder / "chairs")
     shutil.copy(folder / "samples/chair.off", folder)
-    for name, mesh in (("mug", trimesh.creation.cylinder(0.04, 0.1)), ("box", trimesh.creation.box((0.1, 0.2, 0.06)))):
+    for name, mesh in (
+        ("mug", trimesh.creation.cylinder(0.04, 0.1)),
+        ("box", trimesh.creation.box((0.1, 0.2, 0.06))),
+    ):
         (folder / "scans").mkdir(exist_ok=True)
         mesh.export(folder / f"scans/{name}.ply")
     shutil.copy(folder / "scans/mug.ply", folder)
@@ -274,16 +313,20 @@ def make_inputs(folder: Path) -> None:
         (folder / name).write_text(content)
 
 
-FILES = {  # modules that pages name as a reader's own, and what their Python blocks take for granted
-    "mine.py": """
+# modules that pages name as a reader's own, and what their Python blocks take for granted
+FILES = {
+    "mine.py": (
+        """
 from nextview.data.measures import Measure
 
 def clutter(view):
     return float(view.seen.mean())
 
 uprightness = Measure(lambda view: float(len(view.pixels[0])), needs="mesh", good="peak")
-""",
-    "spread.py": """
+"""
+    ),
+    "spread.py": (
+        """
 import numpy as np
 
 class Spread:
@@ -295,12 +338,16 @@ class Spread:
     def next_views(self, state, rng):
         far = np.where(state.visited[:, None, :], self.sphere.arc[None], np.inf).min(2)
         return np.where(state.free, far, -1.0).argmax(1)
-""",
-    "stops.py": """
+"""
+    ),
+    "stops.py": (
+        """
 def clear_lead(seen, threshold):
     return (seen.margin >= threshold) & (seen.n_views >= 2)
-""",
-    "own_recogniser.py": """
+"""
+    ),
+    "own_recogniser.py": (
+        """
 import shutil
 import sys
 from pathlib import Path
@@ -309,8 +356,10 @@ from nextview.recognition.model_card import BUNDLED
 
 for path in BUNDLED.glob("recogniser-modelnet10*"):
     shutil.copy(path, Path(f"{sys.argv[1]}{path.name.removeprefix('recogniser-modelnet10')}"))
-""",
-    "stand_ins.py": """
+"""
+    ),
+    "stand_ins.py": (
+        """
 import sys
 
 import numpy as np
@@ -322,22 +371,27 @@ from simulated_sensor import INTRINSICS as intrinsics
 import nextview
 
 arm = Arm(nextview.load_mesh("samples/chair.off"), np.random.default_rng(0))
-""",
+"""
+    ),
 }
 PREPARED = {  # what a page takes as made before, by commands or pages that it names
     "docs/add_a_measure.md": "mkdir models; python own_recogniser.py models/recogniser",
     "docs/add_a_policy.md": "cp -r views.zarr modelnet10.zarr",
-    "docs/add_a_recogniser.md": "cp test.npz mine.npz; mkdir models; python own_recogniser.py models/linear",
+    "docs/add_a_recogniser.md": (
+        "cp test.npz mine.npz; mkdir models; python own_recogniser.py models/linear"
+    ),
     "docs/scenes.md": "python own_recogniser.py recogniser",
     "docs/training.md": "cp -r views.zarr mine.zarr",
     # Predictions name their store: those that are planned for have to be of the one in this folder.
     "research/README.md": (
-        "nextview predict views.zarr test.npz --split test --workers 1 --overwrite; "
-        "nextview train map views.zarr runs/lem --epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4"
+        "nextview predict views.zarr test.npz --split test --workers 1 --overwrite; nextview train"
+        " map views.zarr runs/lem --epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4"
     ),
 }
-ALONE = ("docs/your_camera.md", "docs/your_objects.md")  # pages of which each Python block runs by itself
-BESIDE = ("docs/your_objects.md",)  # pages whose Python blocks do again what their commands did: in a folder of its own
+# pages of which each Python block runs by itself
+ALONE = ("docs/your_camera.md", "docs/your_objects.md")
+# pages whose Python blocks do again what their commands did: in a folder of its own
+BESIDE = ("docs/your_objects.md",)
 STORES = (  # made once, for all pages
     "nextview render data/ModelNet10 views.zarr --workers 1",
     "nextview predict views.zarr validation.npz --held-out recogniser-modelnet10 --workers 1",
@@ -351,8 +405,8 @@ class Environments:
 
     Attributes:
         folder: in which they lie.
-        base: the folder of the programs of a base installation that is there already, to be used instead; if it is
-            given, there are no others.
+        base: the folder of the programs of a base installation that is there already, to be used
+            instead; if it is given, there are no others.
     """
 
     folder: Path
@@ -363,37 +417,50 @@ class Environments:
         """The folder of the programs of one of them: Python, nextview.
 
         Args:
-            needs: what is installed besides the base installation, as pip is told: "nextview[train]", "research".
+            needs: what is installed besides the base installation, as pip is told:
+                "nextview[train]", "research".
         """
         if self.base is not None:
             return self.base
         from linked_environment import installation
 
         if needs not in self._made:
-            extras = {text.partition("[")[2].rstrip("]") for text in needs if text.startswith("nextview[")}
-            research = [text.partition("[")[2].rstrip("]") for text in needs if text.startswith("research")]
+            extras = {
+                text.partition("[")[2].rstrip("]") for text in needs if text.startswith("nextview[")
+            }
+            research = [
+                text.partition("[")[2].rstrip("]") for text in needs if text.startswith("research")
+            ]
             wanted = set(filter(None, research)) if research else None
             try:
                 python = installation(self.folder / str(len(self._made)), extras, wanted)
             except PackageNotFoundError as missing:
-                raise SystemExit(f"{', '.join(sorted(needs))}: not installed here, {missing.name} is missing") from None
+                raise SystemExit(
+                    f"{', '.join(sorted(needs))}: not installed here, {missing.name} is missing"
+                ) from None
             self._made[needs] = python.parent
         return self._made[needs]
 
-    def run(self, command: str, folder: Path, needs: frozenset[str] = frozenset()) -> tuple[int, str, float]:
+    def run(
+        self, command: str, folder: Path, needs: frozenset[str] = frozenset()
+    ) -> tuple[int, str, float]:
         """Exit status, output and seconds of a command of a shell in a folder."""
         begun = time.monotonic()
         setting = f"export PATH={shlex.quote(str(self.programs(needs)))}:$PATH; set -e; "
         surroundings = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
         shell = ["bash", "-c", setting + command]
         try:
-            done = subprocess.run(shell, cwd=folder, env=surroundings, capture_output=True, text=True, timeout=LIMIT)
+            done = subprocess.run(
+                shell, cwd=folder, env=surroundings, capture_output=True, text=True, timeout=LIMIT
+            )
         except subprocess.TimeoutExpired:
             return 124, f"took longer than {LIMIT} s", time.monotonic() - begun
         return done.returncode, done.stdout + done.stderr, time.monotonic() - begun
 
 
-def run_page(page: str, environments: Environments, folder: Path, beside: Path | None = None) -> list[str]:
+def run_page(
+    page: str, environments: Environments, folder: Path, beside: Path | None = None
+) -> list[str]:
     """Run what a page shows; returns what failed, a line each.
 
     Args:
@@ -439,12 +506,17 @@ def run_page(page: str, environments: Environments, folder: Path, beside: Path |
     return failed
 
 
-def main(pages: tyro.conf.Positional[tuple[str, ...]] = (), base: Path | None = None, only_list: bool = False) -> None:
+def main(
+    pages: tyro.conf.Positional[tuple[str, ...]] = (),
+    base: Path | None = None,
+    only_list: bool = False,
+) -> None:
     """Run the commands of pages.
 
     Args:
         pages: of the repository; all that have commands by default.
-        base: the folder of the programs of a base installation: all that needs no more is run there, and nothing else.
+        base: the folder of the programs of a base installation: all that needs no more is run
+            there, and nothing else.
         only_list: only show what would be run, and what not and why.
     """
     chosen = pages or PAGES

@@ -2,8 +2,8 @@
 
     python workflow/results.py docs/results.md --stages evaluation benchmark ...
 
-Runs in the folder of the workflow. A section is written for each of the stages that is given; all numbers are read from
-what the stages wrote.
+Runs in the folder of the workflow. A section is written for each of the stages that is given; all
+numbers are read from what the stages wrote.
 """
 
 from __future__ import annotations
@@ -66,7 +66,9 @@ def shown(cell: Cell | None, digits: int = 3, interval: bool = True) -> str:
     if cell is None or not isfinite(cell[0]):
         return ""
     value, low, high, _ = cell
-    return f"{value:.{digits}f}" + (f" ({low:.{digits}f}-{high:.{digits}f})" if interval and high > low else "")
+    return f"{value:.{digits}f}" + (
+        f" ({low:.{digits}f}-{high:.{digits}f})" if interval and high > low else ""
+    )
 
 
 def published(cell: Cell | None, digits: int = 3) -> str:
@@ -91,13 +93,19 @@ def called(policy: str) -> str:
 
 def recogniser(stage: Path) -> Iterator[str]:
     """Accuracy of single views and of all of them."""
-    tables = {split: pd.read_csv(stage / split / "accuracy.csv", keep_default_na=False) for split in SPLITS}
+    tables = {
+        split: pd.read_csv(stage / split / "accuracy.csv", keep_default_na=False)
+        for split in SPLITS
+    }
     for table in tables.values():
         for column in ("value", "low", "high", "published"):
             table[column] = pd.to_numeric(table[column])
     found = {split: cells(table, "n_views", "label", "measure") for split, table in tables.items()}
     all_views = int(tables["test"]["n_views"].max())
-    objects = {split: int(table.loc[table["label"] == "", "objects"].max()) for split, table in tables.items()}
+    objects = {
+        split: int(table.loc[table["label"] == "", "objects"].max())
+        for split, table in tables.items()
+    }
     yield "Share of right answers. Of all views the logits are summed. `accuracy.csv`."
     yield ""
     measures = {
@@ -111,7 +119,9 @@ def recogniser(stage: Path) -> Iterator[str]:
         for measure, what in measures.items():
             row = [found[split].get((views, "", measure)) for split in SPLITS]
             name = f"{'one view' if views == 1 else f'all {views} views'}, {what}"
-            rows.append([name, *map(shown, row), published(found["test"].get((views, "", measure)))])
+            rows.append(
+                [name, *map(shown, row), published(found["test"].get((views, "", measure)))]
+            )
     head = [f"{what} ({objects[split]} objects)" for split, what in SPLITS.items()]
     yield from markdown(["", *head, "published, test"], rows)
     yield "Each class of the test split, one view and all:"
@@ -119,33 +129,53 @@ def recogniser(stage: Path) -> Iterator[str]:
     test = found["test"], found["test-size"]
     labels = [label for label in tables["test"]["label"].unique() if label]
     rows = [
-        [label.replace("_", " "), *(shown(of.get((v, label, "accuracy"))) for of in test for v in (1, all_views))]
+        [
+            label.replace("_", " "),
+            *(shown(of.get((v, label, "accuracy"))) for of in test for v in (1, all_views)),
+        ]
         for label in labels
     ]
-    yield from markdown(["class", "one view", "all", "one view, size known", "all, size known"], rows)
+    yield from markdown(
+        ["class", "one view", "all", "one view, size known", "all, size known"], rows
+    )
 
 
 def calibration(stage: Path) -> Iterator[str]:
     """What the belief is worth after several views."""
-    yield "Views of the test split in random order, fused as the recogniser's card says. `fusion.csv`."
+    yield (
+        "Views of the test split in random order, fused as the recogniser's card says."
+        " `fusion.csv`."
+    )
     yield ""
     table = pd.read_csv(stage / "test" / "fusion.csv")
     table = table[table["n_views"].isin((1, 2, 3, 5, 8, 15, table["n_views"].max()))]
     rows = [
-        [f"{r.n_views}", f"{r.accuracy:.3f} ({r.low:.3f}-{r.high:.3f})", f"{r.class_accuracy:.3f}",
-         f"{r.confidence:.3f}", f"{r.calibration_error:.3f}"]
+        [
+            f"{r.n_views}",
+            f"{r.accuracy:.3f} ({r.low:.3f}-{r.high:.3f})",
+            f"{r.class_accuracy:.3f}",
+            f"{r.confidence:.3f}",
+            f"{r.calibration_error:.3f}",
+        ]
         for r in table.itertuples()
-    ]  # fmt: skip
-    yield from markdown(["views", "accuracy", "mean of classes", "mean confidence", "calibration error"], rows)
+    ]
+    yield from markdown(
+        ["views", "accuracy", "mean of classes", "mean confidence", "calibration error"], rows
+    )
 
 
 def maps(stage: Path) -> Iterator[str]:
     """Scores of the map networks."""
-    measures = {"mse": "squared error", "d0": "peak exact", "d_le_1": "within one cell", "d_lt_2": "d < 2",
-                "regret": "regret"}  # fmt: skip
+    measures = {
+        "mse": "squared error",
+        "d0": "peak exact",
+        "d_le_1": "within one cell",
+        "d_lt_2": "d < 2",
+        "regret": "regret",
+    }
     yield from wrap(
-        "Published: squared error over objects, peaks over classes (table 4). The mean maps come from the true maps of "
-        "these very objects: too good. `maps.csv`.",
+        "Published: squared error over objects, peaks over classes (table 4). The mean maps come"
+        " from the true maps of these very objects: too good. `maps.csv`.",
         WIDTH,
     )
     yield ""
@@ -159,51 +189,86 @@ def maps(stage: Path) -> Iterator[str]:
             for by in table.loc[table["map"] == name, "by"].unique():
                 for over, what in {"": "objects", "class_": "classes"}.items():
                     if (split == "validation") + (by != "network") + (over != "") > 1:
-                        continue  # the page keeps what differs in one respect from the network on test objects
+                        # the page keeps what differs in one respect from the network on test
+                        # objects
+                        continue
                     row = [found.get((name, by, over + measure)) for measure in measures]
                     if any(cell is not None for cell in row):
                         digits = [4 if measure == "mse" else 3 for measure in measures]
-                        values = [shown(c, d, by == "network") for c, d in zip(row, digits, strict=True)]
+                        values = [
+                            shown(c, d, by == "network") for c, d in zip(row, digits, strict=True)
+                        ]
                         rows.append([f"{name.upper()}, {by}", split, what, *values])
             if split == "test":
-                row = [found.get((name, "network", m if m == "mse" else f"class_{m}")) for m in measures]
+                row = [
+                    found.get((name, "network", m if m == "mse" else f"class_{m}"))
+                    for m in measures
+                ]
                 if any(published(cell) for cell in row):
-                    rows.append([f"{name.upper()}, published", split, "see above", *(published(c, 4) for c in row)])
+                    rows.append(
+                        [
+                            f"{name.upper()}, published",
+                            split,
+                            "see above",
+                            *(published(c, 4) for c in row),
+                        ]
+                    )
     yield from markdown(["map", "split", "mean of", *measures.values()], rows)
 
 
 def comparison(stage: Path) -> Iterator[str]:
     """All policies at one threshold."""
     settings = json.loads((stage / "benchmark.json").read_text())
-    summary, tests = pd.read_csv(stage / "summary.csv"), pd.read_csv(stage / "tests.csv")
+    summary = pd.read_csv(stage / "summary.csv")
+    tests = pd.read_csv(stage / "tests.csv")
     decay = settings["threshold_decay"]
     yield from wrap(
-        f"{settings['runs']} first views an object, the same for every policy. The threshold is {THRESHOLD} at the "
-        f"first view and comes down with the views (decay {decay:g}); at most {settings['max_views']} views. Travel is "
-        "the mean over all episodes, those that never moved included. p: bootstrap test of the accuracy against "
-        f"`{settings['reference']}`, with Holm's correction over all policies and thresholds. `summary.csv`, "
-        "`tests.csv`.",
+        f"{settings['runs']} first views an object, the same for every policy. The threshold is"
+        f" {THRESHOLD} at the first view and comes down with the views (decay {decay:g}); at most"
+        f" {settings['max_views']} views. Travel is the mean over all episodes, those that never"
+        f" moved included. p: bootstrap test of the accuracy against `{settings['reference']}`,"
+        " with Holm's correction over all policies and thresholds. `summary.csv`, `tests.csv`.",
         WIDTH,
     )
     yield ""
     found = cells(summary[summary["threshold"] == THRESHOLD], "policy", "measure")
-    at = tests[(tests["threshold"] == THRESHOLD) & (tests["measure"] == "accuracy")].set_index("policy")
+    at = tests[(tests["threshold"] == THRESHOLD) & (tests["measure"] == "accuracy")].set_index(
+        "policy"
+    )
     rows = []
     for policy in dict.fromkeys(policy for policy, _ in found):
-        numbers = [("accuracy", 3), ("class_accuracy", 3), ("n_views", 2), ("travel_all", 2), ("arc_all", 2)]
+        numbers = [
+            ("accuracy", 3),
+            ("class_accuracy", 3),
+            ("n_views", 2),
+            ("travel_all", 2),
+            ("arc_all", 2),
+        ]
         row = [shown(found.get((policy, m)), d, m != "class_accuracy") for m, d in numbers]
         test = at.loc[policy] if policy in at.index else None
         difference = "" if test is None else f"{round(100 * test['difference'], 1) + 0.0:+.1f}"
-        rows.append([called(policy), *row, difference, "" if test is None else p_value(test["p_holm"])])
+        rows.append(
+            [called(policy), *row, difference, "" if test is None else p_value(test["p_holm"])]
+        )
     yield from markdown(
-        ["policy", "accuracy", "mean of classes", "views", "travel, cells", "travel, radians",
-         f"points over {settings['reference']}", "p"], rows)  # fmt: skip
+        [
+            "policy",
+            "accuracy",
+            "mean of classes",
+            "views",
+            "travel, cells",
+            "travel, radians",
+            f"points over {settings['reference']}",
+            "p",
+        ],
+        rows,
+    )
     robot = tests["policy"].map(lambda policy: not is_oracle(called(policy)))
     if not (tests["p_holm"][robot & (tests["measure"] == "accuracy")] < SIGNIFICANT).any():
         yield from wrap(
-            f"**No policy that a robot could follow differs significantly from {settings['reference']} in accuracy** "
-            f"at any threshold: every p after the correction is {SIGNIFICANT} or more. Policies called oracle or true "
-            "know what a robot cannot.",
+            "**No policy that a robot could follow differs significantly from"
+            f" {settings['reference']} in accuracy** at any threshold: every p after the correction"
+            f" is {SIGNIFICANT} or more. Policies called oracle or true know what a robot cannot.",
             WIDTH,
         )
         yield ""
@@ -214,7 +279,10 @@ def fixed_views(stage: Path) -> Iterator[str]:
     (page,) = stage.glob("*.md")
     yield page.read_text()
     yield ""
-    yield "![Accuracy against travel, the gain policy at several travel weights and its rivals](images/front.png)"
+    yield (
+        "![Accuracy against travel, the gain policy at several travel weights and its"
+        " rivals](images/front.png)"
+    )
     yield ""
 
 
@@ -224,7 +292,10 @@ def measures(stage: Path) -> Iterator[str]:
     yield ""
     yield (stage / "measures.md").read_text().rstrip()
     yield ""
-    yield "![Correlation of every measure with recognition, and what its policy gains](images/measures.png)"
+    yield (
+        "![Correlation of every measure with recognition, and what its policy"
+        " gains](images/measures.png)"
+    )
     yield ""
 
 
@@ -233,8 +304,8 @@ def risk(stage: Path) -> Iterator[str]:
     settings = json.loads((stage / "benchmark.json").read_text())
     found = cells(pd.read_csv(stage / "summary.csv"), "policy", "threshold", "measure")
     yield from wrap(
-        "With `--risk` an episode stops at the lowest threshold at which, by the validation objects, at most that "
-        "share of the early stops is wrong. Test split:",
+        "With `--risk` an episode stops at the lowest threshold at which, by the validation"
+        " objects, at most that share of the early stops is wrong. Test split:",
         WIDTH,
     )
     yield ""
@@ -242,14 +313,33 @@ def risk(stage: Path) -> Iterator[str]:
     for policy in [name for name in settings["policies"] if called(name) in ("random", "gain")]:
         for promised, threshold in settings["risks"].items():
             near = next(t for _, t, _ in found if abs(t - threshold) < 1e-9)
-            right, early, views = (found[policy, near, m] for m in ("confident_accuracy", "confident", "n_views"))
+            right, early, views = (
+                found[policy, near, m] for m in ("confident_accuracy", "confident", "n_views")
+            )
             wrong = f"{1 - right[0]:.3f} ({1 - right[2]:.3f}-{1 - right[1]:.3f})"
             cell = shown(found[policy, near, "accuracy"])
             rows.append(
-                [called(policy), promised, f"{threshold:.4f}", f"{early[0]:.3f}", wrong, cell, f"{views[0]:.2f}"]
+                [
+                    called(policy),
+                    promised,
+                    f"{threshold:.4f}",
+                    f"{early[0]:.3f}",
+                    wrong,
+                    cell,
+                    f"{views[0]:.2f}",
+                ]
             )
     yield from markdown(
-        ["policy", "promised", "threshold", "stop early", "wrong among those", "accuracy of all", "views"], rows
+        [
+            "policy",
+            "promised",
+            "threshold",
+            "stop early",
+            "wrong among those",
+            "accuracy of all",
+            "views",
+        ],
+        rows,
     )
 
 
@@ -301,12 +391,13 @@ def page(stages: Iterable[str]) -> str:
         "# Results",
         "",
         *wrap(
-            "Measurements, each beside the commands that made it. `make reproduce` writes the page; nothing on it is "
-            f"typed in. Of ModelNet10's {OFFICIAL['test']:,} test meshes {objects('test.npz'):,} were there, and "
-            f"{training:,} of its {OFFICIAL['train']:,} training meshes. {objects('validation.npz'):,} of those, which "
-            "no network was trained on, validate: all choices are made on them, and the test split chooses nothing. In "
-            "brackets stand 95 % bootstrap intervals over objects. The networks' predictions, from which most of it "
-            "comes, are made by",
+            "Measurements, each beside the commands that made it. `make reproduce` writes the"
+            f" page; nothing on it is typed in. Of ModelNet10's {OFFICIAL['test']:,} test meshes"
+            f" {objects('test.npz'):,} were there, and {training:,} of its {OFFICIAL['train']:,}"
+            f" training meshes. {objects('validation.npz'):,} of those, which no network was"
+            " trained on, validate: all choices are made on them, and the test split chooses"
+            " nothing. In brackets stand 95 % bootstrap intervals over objects. The networks'"
+            " predictions, from which most of it comes, are made by",
             WIDTH,
         ),
         "",
@@ -329,9 +420,13 @@ def page(stages: Iterable[str]) -> str:
 
 def main() -> None:
     """Read the command line and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("out", type=Path)
-    parser.add_argument("--stages", nargs="+", required=True, choices=sorted({name for name, *_ in SECTIONS}))
+    parser.add_argument(
+        "--stages", nargs="+", required=True, choices=sorted({name for name, *_ in SECTIONS})
+    )
     given = parser.parse_args()
     given.out.parent.mkdir(parents=True, exist_ok=True)
     given.out.write_text(page(given.stages), encoding="utf-8")

@@ -1,9 +1,10 @@
-"""A small dataset folder for a quick run of the workflow: the first meshes of each class, or box furniture.
+"""A small dataset folder for a quick run of the workflow: the first meshes of each class, or box
+furniture.
 
     python workflow/sample.py OUT --objects 3 [--meshes path/to/ModelNet10]
 
-Writes OUT/CLASS/train|test/NAME.off, so many in each. Without a dataset, chairs, tables and monitors are built of boxes
-of random sizes.
+Writes OUT/CLASS/train|test/NAME.off, so many in each. Without a dataset, chairs, tables and
+monitors are built of boxes of random sizes.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ def write_off(path: Path, mesh: Mesh, radius: float) -> None:
 
 def main() -> None:
     """Read the command line and write the folder."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("out", type=Path)
     parser.add_argument("--objects", type=int, required=True)
     parser.add_argument("--meshes", type=Path)
@@ -54,7 +57,10 @@ def main() -> None:
             for k in range(given.objects):
                 number = f"{name}_{split}_{k:02}"
                 stretch = rng.uniform(0.7, 1.4, 3)
-                boxes = [(tuple(np.multiply(a, stretch)), tuple(np.multiply(b, stretch))) for a, b in build()]
+                boxes = [
+                    (tuple(np.multiply(a, stretch)), tuple(np.multiply(b, stretch)))
+                    for a, b in build()
+                ]
                 write_off(folder / f"{number}.off", boxes_mesh(boxes, number), rng.uniform(15, 45))
 
 

@@ -2,11 +2,12 @@
 
     python workflow/stage.py OUT [--needs DONE ...] [--state TEXT] --commands COMMAND ...
 
-Beside OUT, a file or a folder, there will be two small files. OUT.begun names what the stage is being made from: its
-commands, and the contents of what it needs. If an earlier run began with the same, what it left is kept, and the
-commands go on from there, as those of nextview do; otherwise it is removed first. OUT.done is written when all commands
-have succeeded. It holds the commands and a SHA-256 of what they made, so that a stage that makes the same as before
-does not set off those that come after it.
+Beside OUT, a file or a folder, there will be two small files. OUT.begun names what the stage is
+being made from: its commands, and the contents of what it needs. If an earlier run began with the
+same, what it left is kept, and the commands go on from there, as those of nextview do; otherwise it
+is removed first. OUT.done is written when all commands have succeeded. It holds the commands and a
+SHA-256 of what they made, so that a stage that makes the same as before does not set off those that
+come after it.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ def beside(path: Path, ending: str) -> Path:
 def content_hash(path: Path) -> str:
     """SHA-256 of what a stage made: of the file, or of what identifies a folder.
 
-    A view store is identified by its attributes, which hold the hash of every mesh and all settings; a training run by
-    its network; any other folder by all its files.
+    A view store is identified by its attributes, which hold the hash of every mesh and all
+    settings; a training run by its network; any other folder by all its files.
     """
     sha = hashlib.sha256()
     for file in _identifying(path):
@@ -65,7 +66,9 @@ def remove(path: Path) -> None:
 
 
 def runnable(command: str) -> str:
-    """A command as it is printed, made to run with this interpreter and this repository, wherever they are."""
+    """A command as it is printed, made to run with this interpreter and this repository,
+    wherever they are.
+    """
     python = shlex.quote(sys.executable)
     if command.startswith("nextview "):
         return f"{python} -m nextview.cli.main {command.removeprefix('nextview ')}"
@@ -93,20 +96,29 @@ def run(out: Path, commands: list[str], needs: list[Path], state: str) -> None:
         for path in (out, beside(out, "part")):
             remove(path)
         note.write_text(json.dumps(begun, indent=1) + "\n")
-    here = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])}
+    here = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    }
     for command in commands:
         print(f"$ {command}", flush=True)
-        status = subprocess.run(["bash", "-o", "pipefail", "-c", runnable(command)], env=here).returncode
+        status = subprocess.run(
+            ["bash", "-o", "pipefail", "-c", runnable(command)], env=here
+        ).returncode
         if status:
             sys.exit(status if status > 0 else 128 - status)
-    done, part = beside(out, "done"), beside(out, "done.part")
-    part.write_text(json.dumps({"commands": commands, "sha256": content_hash(out)}, indent=1) + "\n")
+    done = beside(out, "done")
+    part = beside(out, "done.part")
+    part.write_text(
+        json.dumps({"commands": commands, "sha256": content_hash(out)}, indent=1) + "\n"
+    )
     os.replace(part, done)
 
 
 def main() -> None:
     """Read the command line and run the stage."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("out", type=Path)
     parser.add_argument("--needs", type=Path, nargs="*", default=[])
     parser.add_argument("--state", default="")

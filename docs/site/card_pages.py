@@ -10,21 +10,36 @@ from nextview.policies.policy_card import PolicyCard, bundled_policies, read_pol
 from nextview.recognition.model_card import ModelCard, bundled_cards
 
 USE = {
-    "recogniser": "Names the object in the depth image of a view; the evidence of several is fused into a belief.",
-    "features": "Turns a view into 256 numbers that alike views share; taught things are remembered by them.",
-    "lem": "Predicts the depth entropy of the views around the current one (local-depth-entropy map).",
-    "lcm": "Predicts the recogniser's confidence in the views around the current one (local confidence map).",
-    "gain": "Values every candidate view by what it is expected to add to the belief, less its weighted travel.",
+    "recogniser": (
+        "Names the object in the depth image of a view; the evidence of several is fused into a"
+        " belief."
+    ),
+    "features": (
+        "Turns a view into 256 numbers that alike views share; taught things are remembered by"
+        " them."
+    ),
+    "lem": (
+        "Predicts the depth entropy of the views around the current one (local-depth-entropy map)."
+    ),
+    "lcm": (
+        "Predicts the recogniser's confidence in the views around the current one (local confidence"
+        " map)."
+    ),
+    "gain": (
+        "Values every candidate view by what it is expected to add to the belief, less its weighted"
+        " travel."
+    ),
     "fixed-sequence": "Makes the same moves whatever is seen.",
     "fixed-ring": "Goes round one ring of views.",
     "class-table": "Values views by a table, by the class that is believed.",
 }
 """What a model or policy of each kind is for."""
 LIMITS = (
-    "It was trained on clean renders of ModelNet10's upright objects, one object a picture, seen from 40 places, from"
-    " the horizon to 72 degrees above it. An object of another class is given one of the ten names unless `--unknown`"
-    " is used. What noise, missing depth and views from elsewhere cost is measured in [the results](../results.md) and"
-    " in [your camera](../your_camera.md)."
+    "It was trained on clean renders of ModelNet10's upright objects, one object a picture, seen"
+    " from 40 places, from the horizon to 72 degrees above it. An object of another class is given"
+    " one of the ten names unless `--unknown` is used. What noise, missing depth and views from"
+    " elsewhere cost is measured in [the results](../results.md) and in [your"
+    " camera](../your_camera.md)."
 )
 
 
@@ -49,7 +64,9 @@ def _model_page(card: ModelCard) -> str:
     facts = {
         "network": card.network,
         "input": f"{card.input.kind}, {card.input.size} x {card.input.size} pixels",
-        "weights": f"{card.path.name}, {card.path.stat().st_size / 1e6:.1f} MB, SHA-256 `{card.sha256}`",
+        "weights": (
+            f"{card.path.name}, {card.path.stat().st_size / 1e6:.1f} MB, SHA-256 `{card.sha256}`"
+        ),
         "learned from": card.training.data,
         "held out for validation": f"{len(card.held_out)} objects of the training split",
         **{f"{name} fitted to": value for name, value in card.fitted_to.items()},
@@ -92,7 +109,12 @@ def _policy_page(name: str, card: PolicyCard) -> str:
 
 def _scores(scores: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     for objects, measured in scores.items():
-        yield objects, "<br>".join(f"{key.replace('_', ' ')}: {_value(value)}" for key, value in measured.items())
+        yield (
+            objects,
+            "<br>".join(
+                f"{key.replace('_', ' ')}: {_value(value)}" for key, value in measured.items()
+            ),
+        )
 
 
 def _value(value: Any) -> str:
@@ -102,7 +124,9 @@ def _value(value: Any) -> str:
 
 
 def _table(rows: Mapping[str, Any], heads: tuple[str, str] = ("", "")) -> str:
-    lines = [f"| {key} | {_value(value)} |" for key, value in rows.items() if value not in ("", None)]
+    lines = [
+        f"| {key} | {_value(value)} |" for key, value in rows.items() if value not in ("", None)
+    ]
     return "\n".join([f"| {heads[0]} | {heads[1]} |", "|---|---|", *lines])
 
 

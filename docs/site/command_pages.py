@@ -27,9 +27,15 @@ def command_pages() -> dict[str, str]:
     for words, command in COMMANDS.items():
         uri = f"commands/{words.replace(' ', '-')}.md"
         rows.append(f"| [`nextview {words}`](../{uri}) | {command.line} |")
-        pages[uri] = f"# nextview {words}\n\n```text\n{help_of(words)}```\n\n{_used(examples.get(words, {}))}"
+        pages[uri] = (
+            "# nextview"
+            f" {words}\n\n```text\n{help_of(words)}```\n\n{_used(examples.get(words, {}))}"
+        )
     table = "\n".join(["| command | |", "|---|---|", *rows])
-    top = f"# Commands\n\nEach page is the command's own help. `nextview COMMAND --help` prints it.\n\n{table}\n"
+    top = (
+        "# Commands\n\nEach page is the command's own help. `nextview COMMAND --help` prints"
+        f" it.\n\n{table}\n"
+    )
     return {"commands/index.md": top} | pages
 
 
@@ -47,8 +53,12 @@ def _examples() -> dict[str, dict[str, str]]:
     names = sorted(COMMANDS, key=len, reverse=True)
     found: dict[str, dict[str, str]] = {}
     for source in SOURCES:
-        for line in re.findall(r"^ {0,4}(nextview [a-z].*?)\s*(?:  #.*)?$", (ROOT / source).read_text(), re.M):
-            words = next((name for name in names if f"{line} ".startswith(f"nextview {name} ")), None)
+        for line in re.findall(
+            r"^ {0,4}(nextview [a-z].*?)\s*(?:  #.*)?$", (ROOT / source).read_text(), re.M
+        ):
+            words = next(
+                (name for name in names if f"{line} ".startswith(f"nextview {name} ")), None
+            )
             if words:
                 found.setdefault(words, {}).setdefault(line, source)
     return found
@@ -63,5 +73,6 @@ def _used(lines: dict[str, str]) -> str:
     parts = ["## In use\n"]
     for source, each in by_page.items():
         commands = "\n".join(each)
-        parts.append(f"In [{Path(source).stem.replace('_', ' ')}](../../{source}):\n\n```sh\n{commands}\n```\n")
+        title = Path(source).stem.replace("_", " ")
+        parts.append(f"In [{title}](../../{source}):\n\n```sh\n{commands}\n```\n")
     return "\n".join(parts)

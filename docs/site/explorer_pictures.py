@@ -16,8 +16,13 @@ from nextview.viewers.exploration import Exploration, shown_objects
 from nextview.viewers.page import Page
 
 IMAGES = Path(__file__).parents[1] / "images"
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
-         "--disable-background-networking"]  # fmt: skip
+FLAGS = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--disable-background-networking",
+]
 """It draws without a graphics card."""
 SETTLES = 4000
 """Milliseconds from the last change until all of it is drawn."""
@@ -32,7 +37,8 @@ def shoot(browser: Browser, page: Page, views: int, path: Path) -> None:
         tab.get_by_text("Take the next view").click()
         while len(page.exploration.walks[-1].views) <= step:
             tab.wait_for_timeout(100)
-    tab.locator(".mantine-Notification-closeButton").first.click()  # it draws in software: that is meant so
+    # it draws in software: that is meant so
+    tab.locator(".mantine-Notification-closeButton").first.click()
     tab.mouse.move(660, 800)  # away from the button
     page._draw()
     tab.wait_for_timeout(SETTLES)

@@ -1,7 +1,8 @@
 """MkDocs hook: makes the pages that would drift if they were written, and mends links for the site.
 
-Start, Contributing, Security, Changelog and the examples are files of the repository; commands, models and the API
-describe themselves. Links in all of them are written for the repository, where docs/ is a folder among others.
+Start, Contributing, Security, Changelog and the examples are files of the repository; commands,
+models and the API describe themselves. Links in all of them are written for the repository, where
+docs/ is a folder among others.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ REPOSITORY_PAGES = {
     "CONTRIBUTING.md": "contributing.md",
     "SECURITY.md": "security.md",
     "CHANGELOG.md": "changelog.md",
-} | {f"examples/{path.name}": f"examples/{path.stem}.md" for path in sorted(ROOT.glob("examples/*.py"))}
+} | {
+    f"examples/{path.name}": f"examples/{path.stem}.md"
+    for path in sorted(ROOT.glob("examples/*.py"))
+}
 """Files of the repository outside docs/, and the pages that show them."""
 
 LINK = re.compile(r"(\[[^\[\]]*\])\((?![a-z]+:|/)([^)#\s]+)(#[^)\s]*)?\)")
@@ -38,28 +42,43 @@ def example_pages() -> dict[str, str]:
     for path in sorted(ROOT.glob("examples/*.py")):
         summary = _summary(path)
         top += f"- [{path.name}](../../examples/{path.name}): {summary}\n"
-        pages[f"examples/{path.stem}.md"] = f"# {path.name}\n\n{summary}\n\n```python\n{path.read_text()}```\n"
+        pages[f"examples/{path.stem}.md"] = (
+            f"# {path.name}\n\n{summary}\n\n```python\n{path.read_text()}```\n"
+        )
     return {"examples/index.md": top} | pages
 
 
-MADE = {"Examples": example_pages, "Commands": command_pages, "Models": card_pages, "API": api_pages}
+MADE = {
+    "Examples": example_pages,
+    "Commands": command_pages,
+    "Models": card_pages,
+    "API": api_pages,
+}
 """What fills the sections of the navigation that mkdocs.yml leaves empty."""
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Fill the navigation: pages that are made, and pages of docs/ that mkdocs.yml does not name."""
+    """Fill the navigation: pages that are made, and pages of docs/ that mkdocs.yml does not
+    name.
+    """
     nav: Any = config.nav
     sections = {name: pages for entry in nav for name, pages in entry.items()}
     for name, pages in MADE.items():
         sections[name].extend(pages())
     named = set(_leaves(nav))
-    sections["Guides"].extend(p.name for p in sorted(Path(config.docs_dir).glob("*.md")) if p.name not in named)
+    sections["Guides"].extend(
+        p.name for p in sorted(Path(config.docs_dir).glob("*.md")) if p.name not in named
+    )
     return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are not files in docs/."""
-    made = {uri: (ROOT / name).read_text() for name, uri in REPOSITORY_PAGES.items() if name.endswith(".md")}
+    made = {
+        uri: (ROOT / name).read_text()
+        for name, uri in REPOSITORY_PAGES.items()
+        if name.endswith(".md")
+    }
     for pages in MADE.values():
         made |= pages()
     for uri, text in made.items():

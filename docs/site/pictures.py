@@ -52,7 +52,9 @@ def new(columns: int, height: float = 3.0, width: float = 9.6) -> tuple[Figure, 
 
 def grid(axes: Axes, values: np.ndarray, title: str, **options: object) -> None:
     """A map of the sphere: a row for each ring, the horizon below."""
-    axes.imshow(np.ma.masked_invalid(values.reshape(5, 8)), origin="lower", aspect="auto", **options)  # type: ignore[arg-type]
+    axes.imshow(
+        np.ma.masked_invalid(values.reshape(5, 8)), origin="lower", aspect="auto", **options
+    )  # type: ignore[arg-type]
     axes.set_facecolor("#eef1f4")
     axes.set_xticks(range(0, 8, 2), [f"{45 * k}°" for k in range(0, 8, 2)])
     axes.set_yticks(range(5), [f"{18 * k}°" for k in range(5)])
@@ -64,13 +66,24 @@ def grid(axes: Axes, values: np.ndarray, title: str, **options: object) -> None:
 def mark(axes: Axes, view: int, label: str, colour: str) -> None:
     """Frame a cell of a map."""
     ring, column = divmod(view, 8)
-    axes.add_patch(Rectangle((column - 0.46, ring - 0.46), 0.92, 0.92, fill=False, edgecolor=colour, linewidth=2.2))
-    axes.text(column, ring, label, ha="center", va="center", fontsize=7, color=colour, weight="bold")
+    axes.add_patch(
+        Rectangle(
+            (column - 0.46, ring - 0.46), 0.92, 0.92, fill=False, edgecolor=colour, linewidth=2.2
+        )
+    )
+    axes.text(
+        column, ring, label, ha="center", va="center", fontsize=7, color=colour, weight="bold"
+    )
 
 
 def picture(axes: Axes, view: int, mesh: nextview.Mesh, title: str) -> None:
     """What the camera sees from a view."""
-    axes.imshow(nextview.SimulatedCamera(mesh).observe(SPHERE.poses[view]).picture, cmap="gray", vmin=0, vmax=255)
+    axes.imshow(
+        nextview.SimulatedCamera(mesh).observe(SPHERE.poses[view]).picture,
+        cmap="gray",
+        vmin=0,
+        vmax=255,
+    )
     axes.set_title(title, fontsize=10, loc="left")
     axes.axis("off")
 
@@ -84,7 +97,9 @@ def viewpoints(here: int) -> Figure:
     colours[window], colours[here] = "#7fa6c9", ACCENT
     space.scatter(*SPHERE.directions.T, c=colours, s=34, depthshade=False)
     camera = nextview.SimulatedCamera(sample_mesh("chair"))
-    points = np.concatenate([camera.observe(SPHERE.poses[view]).points[::2] for view in (1, 3, 5, 7, 33, 37)])
+    points = np.concatenate(
+        [camera.observe(SPHERE.poses[view]).points[::2] for view in (1, 3, 5, 7, 33, 37)]
+    )
     space.scatter(*0.6 * points.T, s=0.6, color=INK)
     space.set_box_aspect((1, 1, 0.6), zoom=1.35)
     space.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-0.3, 0.9))
@@ -96,20 +111,27 @@ def viewpoints(here: int) -> Figure:
     grid(axes, shown, f"their numbers; view {here} and its window", cmap="Blues", vmin=0, vmax=1)
     for view in range(len(SPHERE)):
         if view != here:
-            axes.text(view % 8, view // 8, str(view), ha="center", va="center", fontsize=8, color=INK)
+            axes.text(
+                view % 8, view // 8, str(view), ha="center", va="center", fontsize=8, color=INK
+            )
     mark(axes, here, str(here), ACCENT)
     return figure
 
 
 def belief() -> Figure:
-    """Belief in the likeliest classes after each of five views, against the threshold, which comes down."""
+    """Belief in the likeliest classes after each of five views, against the threshold, which
+    comes down.
+    """
     system = nextview.load(threshold=1.0, max_views=5)
     result, usual = system.recognise(sample_mesh("table"), start=START), nextview.load().stopping
     steps = np.arange(1, len(result.views) + 1)
     beliefs = np.array([view.belief for view in result.views])
     alone = np.array([view.alone for view in result.views])
     figure, (left, right) = new(2, 3.2)
-    for axes, values, title in ((left, alone, "each view alone"), (right, beliefs, "fused over the views so far")):
+    for axes, values, title in (
+        (left, alone, "each view alone"),
+        (right, beliefs, "fused over the views so far"),
+    ):
         for c in np.argsort(-beliefs.max(0))[:3]:
             axes.plot(steps, values[:, c], marker="o", label=result.classes[c].replace("_", " "))
         axes.set_title(title, fontsize=10, loc="left")
@@ -120,7 +142,9 @@ def belief() -> Figure:
 
 
 def maps(here: int) -> Figure:
-    """True depth entropy of all views with its highest and lowest, and what the network predicts of the window."""
+    """True depth entropy of all views with its highest and lowest, and what the network predicts
+    of the window.
+    """
     mesh = sample_mesh("table")
     camera = nextview.SimulatedCamera(mesh)
     true = np.array([depth_entropy(camera.observe(pose).depth) for pose in SPHERE.poses])
@@ -162,13 +186,19 @@ def gain(view: View) -> Figure:
 
 
 def calibration() -> Figure:
-    """Mean belief in the answer and how often it is right, by views fused: the measurements of docs/results.md."""
+    """Mean belief in the answer and how often it is right, by views fused: the measurements of
+    docs/results.md.
+    """
     part = RESULTS.read_text().split("\n## Calibration\n")[1].split("\n## ")[0]
-    rows = re.findall(r"^\| (\d+) \| ([\d.]+) \(([\d.]+)-([\d.]+)\) \| [\d.]+ \| ([\d.]+) \|", part, re.M)
+    rows = re.findall(
+        r"^\| (\d+) \| ([\d.]+) \(([\d.]+)-([\d.]+)\) \| [\d.]+ \| ([\d.]+) \|", part, re.M
+    )
     n_views, accuracy, low, high, confidence = np.array(rows, float).T
     figure, (axes,) = new(1, 3.4, 5.6)
     axes.fill_between(n_views, low, high, color=BLUE, alpha=0.15, linewidth=0)
-    axes.plot(n_views, accuracy, marker="o", color=BLUE, label="how often it is right, 95 % interval")
+    axes.plot(
+        n_views, accuracy, marker="o", color=BLUE, label="how often it is right, 95 % interval"
+    )
     axes.plot(n_views, confidence, marker="o", color=ACCENT, label="mean belief in the answer")
     axes.set_xscale("log", base=2)
     axes.set_xticks(n_views, [f"{n:.0f}" for n in n_views])
@@ -185,7 +215,9 @@ def samples(views: tuple[int, ...]) -> Figure:
     for row, name in zip(axes, ("chair", "monitor", "table"), strict=True):
         for each, view in zip(row, views, strict=True):
             elevation, azimuth = SPHERE.angles(view)
-            picture(each, view, sample_mesh(name), f"{name}, {elevation:.0f}° up, {azimuth:.0f}° around")
+            picture(
+                each, view, sample_mesh(name), f"{name}, {elevation:.0f}° up, {azimuth:.0f}° around"
+            )
     return figure
 
 

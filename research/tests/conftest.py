@@ -1,4 +1,6 @@
-"""Fixtures of the tiny pipeline, and the names that an installed research package adds, as pip would write them."""
+"""Fixtures of the tiny pipeline, and the names that an installed research package adds, as pip
+would write them.
+"""
 
 import runpy
 import sys
@@ -23,7 +25,12 @@ def installed(tmp_path_factory):
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: nextview-research\nVersion: 0\n")
     with (info / "entry_points.txt").open("w") as file:
         for group, names in project["entry-points"].items():
-            print(f"[{group}]", *(f"{name} = {path}" for name, path in names.items()), sep="\n", file=file)
+            print(
+                f"[{group}]",
+                *(f"{name} = {path}" for name, path in names.items()),
+                sep="\n",
+                file=file,
+            )
     sys.path.append(str(folder))
     plugins.cache_clear()
     yield

@@ -1,4 +1,6 @@
-"""Agents of reinforcement learning: trained on the replay, written, and run without what trained them; ap_gym."""
+"""Agents of reinforcement learning: trained on the replay, written, and run without what trained
+them; ap_gym.
+"""
 
 import json
 import subprocess
@@ -24,40 +26,98 @@ from nextview.recognition.belief import Calibration
 from research import train_agent as module
 
 SMALL = ViewSphere((0.0, 30.0, 60.0), 4)
-QUICK = ["--steps", "64", "--envs", "8", "--rollout", "4", "--evaluations", "2", "--hidden", "8", "--batch", "8"]
+QUICK = [
+    "--steps",
+    "64",
+    "--envs",
+    "8",
+    "--rollout",
+    "4",
+    "--evaluations",
+    "2",
+    "--hidden",
+    "8",
+    "--batch",
+    "8",
+]
 PLAIN = ["--inputs", "belief", "place", "--frame", "camera"]
 
 
 def train(arguments):
-    tyro.extras.subcommand_cli_from_dict({"ppo": module.main, "mvselect": module.mvselect}, args=arguments)
+    tyro.extras.subcommand_cli_from_dict(
+        {"ppo": module.main, "mvselect": module.mvselect}, args=arguments
+    )
 
 
 def hinting(n, seed=0):
-    """Three classes, each told on one ring alone; every view hints at the class: labels, logits (n, 12, 3)."""
+    """Three classes, each told on one ring alone; every view hints at the class: labels, logits
+    (n, 12, 3).
+    """
     rng = np.random.default_rng(seed)
     labels = np.arange(n) % 3
-    right = np.where(SMALL.ring == labels[:, None], 4.0, 1.0)[..., None] * np.eye(3)[labels][:, None]
+    right = (
+        np.where(SMALL.ring == labels[:, None], 4.0, 1.0)[..., None] * np.eye(3)[labels][:, None]
+    )
     return labels, (right + 0.3 * rng.normal(size=(n, len(SMALL), 3))).astype(np.float32)
 
 
 def learnable(n, seed=0, split="train"):
-    return replace(some_predictions(n, seed), splits=np.array([split] * n), calibration=Calibration(1.5, 0.3))
+    return replace(
+        some_predictions(n, seed), splits=np.array([split] * n), calibration=Calibration(1.5, 0.3)
+    )
 
 
 @pytest.mark.parametrize("preset", ["ppo", "mvselect"])
 def test_an_agent_finds_the_ring_of_the_class_believed(tmp_path, preset):
     labels, logits = hinting(150)
-    names, entropy = tuple(map(str, range(150))), np.random.default_rng(0).random((150, 12)).astype(np.float32)
-    about = (("a", "b", "c"), np.array(["train"] * 150), np.zeros(150, bool), SMALL, {}, {}, Calibration(1.01))
+    names = tuple(map(str, range(150)))
+    entropy = np.random.default_rng(0).random((150, 12)).astype(np.float32)
+    about = (
+        ("a", "b", "c"),
+        np.array(["train"] * 150),
+        np.zeros(150, bool),
+        SMALL,
+        {},
+        {},
+        Calibration(1.01),
+    )
     Predictions(logits, {}, entropy, names, labels, *about).save(tmp_path / "p.npz")
-    learns = ["--steps", "24000", "--envs", "64", "--evaluations", "4", "--batch", "256", "--max-views", "2"]
-    train([preset, str(tmp_path / "p.npz"), str(tmp_path / "a.json"), *learns, "--objective", "log-belief", *PLAIN])
+    learns = [
+        "--steps",
+        "24000",
+        "--envs",
+        "64",
+        "--evaluations",
+        "4",
+        "--batch",
+        "256",
+        "--max-views",
+        "2",
+    ]
+    train(
+        [
+            preset,
+            str(tmp_path / "p.npz"),
+            str(tmp_path / "a.json"),
+            *learns,
+            "--objective",
+            "log-belief",
+            *PLAIN,
+        ]
+    )
     labels, logits = hinting(90, seed=1)
-    fresh = ReplayTable(train_predictions(logits, labels, SMALL, ("a", "b", "c"), calibration=Calibration(1.01)))
+    fresh = ReplayTable(
+        train_predictions(logits, labels, SMALL, ("a", "b", "c"), calibration=Calibration(1.01))
+    )
     agent = make_policy(str(tmp_path / "a.json"), SMALL)
-    first, second = (SMALL.ring[m.state.current] for m in rollout(fresh, agent, 2, np.random.default_rng(5)))
+    first, second = (
+        SMALL.ring[m.state.current] for m in rollout(fresh, agent, 2, np.random.default_rng(5))
+    )
     assert np.mean((second == labels)[first != labels]) > 0.7  # a third by chance
-    blind, ours = (judge(fresh, p, 2, "log-belief", np.random.default_rng(0)) for p in (RandomAll(SMALL), agent))
+    blind, ours = (
+        judge(fresh, p, 2, "log-belief", np.random.default_rng(0))
+        for p in (RandomAll(SMALL), agent)
+    )
     assert ours.mean[-1] > blind.mean[-1]
 
 
@@ -72,9 +132,25 @@ def trained(tmp_path_factory):
 
 def test_the_benchmark_takes_agents_beside_the_others(trained, tmp_path):
     learnable(9, 3, "test").save(tmp_path / "test.npz")
-    cards, out = [str(trained / "ppo.json"), str(trained / "mvselect.json")], tmp_path / "out"
-    main(["benchmark", str(tmp_path / "test.npz"), str(out), "--policies", "random", *cards, "--runs", "2"])
-    settings = next(json.loads(path.read_text()) for path in out.rglob("*.json") if "failures" in path.read_text())
+    cards = [str(trained / "ppo.json"), str(trained / "mvselect.json")]
+    out = tmp_path / "out"
+    main(
+        [
+            "benchmark",
+            str(tmp_path / "test.npz"),
+            str(out),
+            "--policies",
+            "random",
+            *cards,
+            "--runs",
+            "2",
+        ]
+    )
+    settings = next(
+        json.loads(path.read_text())
+        for path in out.rglob("*.json")
+        if "failures" in path.read_text()
+    )
     assert settings["failures"] == {}
     assert set(cards) < set(settings["policies"])
 
@@ -104,15 +180,28 @@ sphere = ViewSphere.named("40")
 visited = np.zeros((1, 40), bool)
 visited[0, 3] = True
 state = EpisodeState(np.array([3]), visited, np.full((1, 3), 1 / 3), Evidence(np.zeros((1, 3))), 1)
-print(*make_policy({str(trained / "ppo.json")!r}, sphere).next_views(state, np.random.default_rng(0)))
+policy = make_policy({str(trained / "ppo.json")!r}, sphere)
+print(*policy.next_views(state, np.random.default_rng(0)))
 """
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
     assert int(done.stdout) in set(range(40)) - {3}
 
 
 def test_the_same_seed_gives_the_same_agent(trained, tmp_path):
     for seed in ("0", "1"):
-        train(["ppo", str(trained / "p.npz"), str(tmp_path / f"{seed}.json"), *QUICK, *PLAIN, "--seed", seed])
+        train(
+            [
+                "ppo",
+                str(trained / "p.npz"),
+                str(tmp_path / f"{seed}.json"),
+                *QUICK,
+                *PLAIN,
+                "--seed",
+                seed,
+            ]
+        )
     paths = (trained / "ppo.onnx", tmp_path / "0.onnx", tmp_path / "1.onnx")
     first, again, other = (path.read_bytes() for path in paths)
     assert first == again
@@ -124,7 +213,8 @@ def test_ap_gym_takes_the_replay_for_one_of_its_own():
     ap_gym = pytest.importorskip("ap_gym")
     import gymnasium
 
-    name, p = "research.active_classification:nextview/ActiveRecognise-v0", learnable(12)
+    name = "research.active_classification:nextview/ActiveRecognise-v0"
+    p = learnable(12)
     env = gymnasium.make(name, predictions=p, travel_price=0.5).unwrapped
     assert ap_gym.ensure_active_perception_env(env) is env
     env.action_space.seed(0)

@@ -23,7 +23,9 @@ def views(tmp_path_factory):
         label = "box" if i < 3 else "ball"
         path = folder / "meshes" / label / ("train" if i % 2 else "test") / f"thing_{i}.off"
         path.parent.mkdir(parents=True, exist_ok=True)
-        (trimesh.creation.box([1, 2, 3 + i]) if i < 3 else trimesh.creation.icosphere(2)).export(path)
+        (trimesh.creation.box([1, 2, 3 + i]) if i < 3 else trimesh.creation.icosphere(2)).export(
+            path
+        )
     (folder / "meshes/box/train/broken.off").write_text("OFF\n")
     list(render(folder / "meshes", folder / "views.zarr", SPHERE, 32, workers=0))
     return folder / "views.zarr"
@@ -56,8 +58,12 @@ def test_an_object_is_drawn_with_the_horizon_lowest(views):
     mosaic = top.axes[0].images[0].get_array()
     np.testing.assert_array_equal(mosaic[-32:, 32:64], store.image(row)[1])  # ring 0, azimuth 1
     np.testing.assert_array_equal(mosaic[:32, -32:], store.image(row)[39])
-    np.testing.assert_array_equal(bottom.axes[0].images[0].get_array().ravel(), store.measure()[row])
-    assert len([axes for axes in bottom.axes if axes.get_title()]) == len(list(store.group["measures"]))
+    np.testing.assert_array_equal(
+        bottom.axes[0].images[0].get_array().ravel(), store.measure()[row]
+    )
+    assert len([axes for axes in bottom.axes if axes.get_title()]) == len(
+        list(store.group["measures"])
+    )
 
 
 def test_the_command_draws_or_says_why_not(views, tmp_path):
@@ -80,7 +86,11 @@ def test_names_are_shown_as_they_are(tmp_path):
     mesh = tmp_path / "meshes" / name / f"{name}.off"
     mesh.parent.mkdir(parents=True)
     trimesh.creation.box([1, 2, 3]).export(mesh)
-    list(render(tmp_path / "meshes", tmp_path / f"{name}.zarr", ViewSphere.named("12"), 16, workers=0))
+    list(
+        render(
+            tmp_path / "meshes", tmp_path / f"{name}.zarr", ViewSphere.named("12"), 16, workers=0
+        )
+    )
     store = ViewStore.open(tmp_path / f"{name}.zarr")
     with matplotlib.rc_context({"svg.fonttype": "none"}):
         assert f"{name}  ·  {name}" in to_svg(object_figure(store, 0))

@@ -1,4 +1,6 @@
-"""Measures of a depth image against closed forms and scikit-image, and the place of measures in the store."""
+"""Measures of a depth image against closed forms and scikit-image, and the place of measures in
+the store.
+"""
 
 import numpy as np
 import pytest
@@ -40,7 +42,8 @@ def test_a_ball_fills_the_circle_that_fits_the_image():
     depth = of_depth(ball())
     assert view_area(depth) == pytest.approx(np.pi / 4, rel=0.003)
     assert silhouette_length(depth) == pytest.approx(np.pi, rel=0.01)
-    assert max_depth(depth) == pytest.approx((3 - 1 / 3) - 2, abs=0.06)  # to the tangent circle, which pixels just miss
+    # to the tangent circle, which pixels just miss
+    assert max_depth(depth) == pytest.approx((3 - 1 / 3) - 2, abs=0.06)
 
 
 @pytest.mark.parametrize("degrees", [0, 10, 22.5, 30, 45, 60, 80])
@@ -66,10 +69,12 @@ def test_depth_distribution_of_planes():
     facing = np.full((100, 100), 2.505)
     facing[:10] = 0  # background does not count
     assert depth_distribution(of_depth(facing)) == 0
-    slanted = np.broadcast_to(2 + (np.arange(100) + 0.5) * BIN, (100, 100))  # one column in each of 100 bins
+    # one column in each of 100 bins
+    slanted = np.broadcast_to(2 + (np.arange(100) + 0.5) * BIN, (100, 100))
     assert depth_distribution(of_depth(slanted)) == pytest.approx(1 - 1 / 100, abs=1e-3)
     two = np.where(np.arange(100) < 30, 2.505, 3.505) * np.ones((100, 1))
-    assert depth_distribution(of_depth(two)) == pytest.approx(2 * 0.3 * 0.7)  # the chance that two pixels differ
+    # the chance that two pixels differ
+    assert depth_distribution(of_depth(two)) == pytest.approx(2 * 0.3 * 0.7)
 
 
 @pytest.mark.parametrize("name", DEPTH)
@@ -89,7 +94,10 @@ def test_what_a_sensor_gives_for_nothing_is_no_object(name, nothing):
 
 @pytest.fixture
 def views(tmp_path):
-    for name, mesh in {"ball": trimesh.creation.icosphere(4), "box": trimesh.creation.box([1, 2, 3])}.items():
+    for name, mesh in {
+        "ball": trimesh.creation.icosphere(4),
+        "box": trimesh.creation.box([1, 2, 3]),
+    }.items():
         (tmp_path / "meshes" / name).mkdir(parents=True)
         mesh.export(tmp_path / "meshes" / name / f"{name}.off")
     (tmp_path / "meshes/box/broken.off").write_text("OFF\n")
@@ -113,7 +121,16 @@ def test_all_measures_of_a_store_and_its_meshes(views):
 
 def test_a_deformed_store_is_measured_on_the_deformed_meshes(views):
     meshes = views.parent / "meshes"
-    list(render(meshes, views.parent / "new.zarr", SPHERE, 64, RenderOptions(3, Deform(0.8, True)), workers=0))
+    list(
+        render(
+            meshes,
+            views.parent / "new.zarr",
+            SPHERE,
+            64,
+            RenderOptions(3, Deform(0.8, True)),
+            workers=0,
+        )
+    )
     measure_with_meshes(views.parent / "new.zarr", meshes, ("visible_area_ratio",), workers=0)
     store = ViewStore.open(views.parent / "new.zarr")
     row = store.names.index("box")
@@ -122,16 +139,19 @@ def test_a_deformed_store_is_measured_on_the_deformed_meshes(views):
     np.testing.assert_allclose(store.depth(row), [view.depth for view in seen], atol=1e-4)
     own = [MEASURES["visible_area_ratio"](view) for view in seen]
     np.testing.assert_allclose(store.measure("visible_area_ratio")[row], own, atol=1e-3)
-    before = [MEASURES["visible_area_ratio"](view_of(load_mesh(meshes / "box/box.off"), p, 64)) for p in SPHERE.poses]
+    before = [
+        MEASURES["visible_area_ratio"](view_of(load_mesh(meshes / "box/box.off"), p, 64))
+        for p in SPHERE.poses
+    ]
     assert np.abs(np.subtract(own, before)).max() > 0.02
 
 
 def test_a_measure_of_ones_own_is_kept_by_its_import_path(views, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine_to_measure.py").write_text(
-        "def rows(view):\n    return view.near.shape[0]\ndef broken(view):\n    return view.nothing\n"
-        "def endless(view):\n    return float('inf')\nconstant = 3\ndef large(view):\n    return 1e300\n"
-        "def leave(view):\n    exit(0)\n"
+        "def rows(view):\n    return view.near.shape[0]\ndef broken(view):\n    return"
+        " view.nothing\ndef endless(view):\n    return float('inf')\nconstant = 3\ndef"
+        " large(view):\n    return 1e300\ndef leave(view):\n    exit(0)\n"
     )
     list(measure(views, ["mine_to_measure:rows"], workers=0))
     assert 40 < ViewStore.open(views).measure("mine_to_measure:rows")[0].min() <= 96
@@ -154,7 +174,9 @@ def test_measures_take_the_meshes_that_were_rendered_and_no_others(views):
     meshes = views.parent / "meshes"
     file = meshes / "box/box.off"
     file.write_text(file.read_text() + "\n")
-    with pytest.raises(DatasetError, match=r"box.off: is not the mesh that .*views.zarr was rendered from"):
+    with pytest.raises(
+        DatasetError, match=r"box.off: is not the mesh that .*views.zarr was rendered from"
+    ):
         measure_with_meshes(views, meshes, ("visible_area_ratio",), workers=0)
     file.unlink()
     with pytest.raises(DatasetError, match="holds no mesh called box"):

@@ -1,4 +1,6 @@
-"""The comparison of measures: what stands in its table is true of a made-up recogniser whose likings are known."""
+"""The comparison of measures: what stands in its table is true of a made-up recogniser whose
+likings are known.
+"""
 
 import shutil
 from dataclasses import replace
@@ -19,23 +21,40 @@ STUDY = vars(measure_study)
 
 @pytest.fixture(scope="module")
 def made(views, tmp_path_factory):
-    """The recogniser sees chairs and monitors best where most of them shows, and tables where least does."""
+    """The recogniser sees chairs and monitors best where most of them shows, and tables where
+    least does.
+    """
     folder = tmp_path_factory.mktemp("study")
     shutil.copytree(views, folder / "views.zarr")
     list(measure(folder / "views.zarr", ["view_area"], workers=0))
     store = ViewStore.open(folder / "views.zarr")
-    area, labels = store.measure("view_area"), store.labels
+    area = store.measure("view_area")
+    labels = store.labels
     scaled = (area - area.min(1, keepdims=True)) / np.ptp(area, axis=1, keepdims=True)
     logits = np.zeros((len(store), 40, 3), np.float32)
-    logits[np.arange(len(store)), :, labels] = np.where(labels[:, None] < 2, scaled, 1 - scaled) * 4 - 1
+    logits[np.arange(len(store)), :, labels] = (
+        np.where(labels[:, None] < 2, scaled, 1 - scaled) * 4 - 1
+    )
     p = replace(
-        some_predictions(len(store)), logits=logits, maps={}, depth_entropy=store.measure(), names=tuple(store.names),
-        labels=labels.astype(np.int64), classes=tuple(store.classes), valley_classes={}, models={},
+        some_predictions(len(store)),
+        logits=logits,
+        maps={},
+        depth_entropy=store.measure(),
+        names=tuple(store.names),
+        labels=labels.astype(np.int64),
+        classes=tuple(store.classes),
+        valley_classes={},
+        models={},
         store=str(folder / "views.zarr"),
-    )  # fmt: skip
+    )
     p.of_objects(np.arange(0, 18, 2)).save(folder / "test.npz")
     p.of_objects(np.arange(1, 18, 2)).save(folder / "validation.npz")
-    options = {"policies": ("unidirectional", "true-view_area-5"), "runs": 4, "samples": 50, "workers": 0}
+    options = {
+        "policies": ("unidirectional", "true-view_area-5"),
+        "runs": 4,
+        "samples": 50,
+        "workers": 0,
+    }
     options["measures"] = ("view_area", "above_preference", "confidence")
     predictions = {"test": folder / "test.npz", "validation": folder / "validation.npz"}
     STUDY["main"](folder / "views.zarr", folder / "out", **predictions, **options)
@@ -45,9 +64,10 @@ def made(views, tmp_path_factory):
 def found(made, measure, quantity, label=""):
     table = pd.read_csv(made / "out" / "measures.csv", keep_default_na=False, na_values=["nan"])
     (row,) = table[
-        (table["measure"] == measure) & (table["quantity"] == quantity)
+        (table["measure"] == measure)
+        & (table["quantity"] == quantity)
         & ((table["label"] == label) | (quantity == "valleys"))
-    ].itertuples()  # fmt: skip
+    ].itertuples()
     return row
 
 
@@ -62,17 +82,23 @@ def test_correlations_are_those_of_the_made_up_recogniser(made):
 
 def test_the_valley_is_chosen_for_the_class_that_wants_it(made):
     assert found(made, "view_area", "valleys").label == "table"
-    ours, chance = (float(found(made, name, "accuracy_2").value) for name in ("view_area", "random"))
+    ours, chance = (
+        float(found(made, name, "accuracy_2").value) for name in ("view_area", "random")
+    )
     over = found(made, "view_area", "over_random_2")
     assert float(over.value) == pytest.approx(ours - chance)
     assert float(over.p_holm) >= float(over.p)
 
 
 def test_policies_stand_beside_the_measures_under_one_correction(made):
-    """The best views by the true area are those of one class and the worst of the other, from the first one on."""
+    """The best views by the true area are those of one class and the worst of the other, from
+    the first one on.
+    """
     best = found(made, "true-view_area-5", "over_random_2")
     chance = float(found(made, "random", "accuracy_2").value)
-    assert float(best.value) == pytest.approx(float(found(made, "true-view_area-5", "accuracy_2").value) - chance)
+    assert float(best.value) == pytest.approx(
+        float(found(made, "true-view_area-5", "accuracy_2").value) - chance
+    )
     assert float(found(made, "unidirectional", "travel_3").value) == pytest.approx(2)
     table = pd.read_csv(made / "out" / "measures.csv")
     tested = table[table["p"].notna()]
@@ -82,7 +108,8 @@ def test_policies_stand_beside_the_measures_under_one_correction(made):
 
 def test_scipy_agrees_on_ranks():
     rng = np.random.default_rng(0)
-    a, b = rng.integers(0, 9, (5, 40)), rng.random((5, 40))
+    a = rng.integers(0, 9, (5, 40))
+    b = rng.random((5, 40))
     expected = [spearmanr(x, y).statistic for x, y in zip(a, b, strict=True)]
     np.testing.assert_allclose(STUDY["correlations"](a, b), expected)
     assert (STUDY["correlations"](np.ones((2, 40)), b[:2]) == 0).all()
@@ -90,7 +117,11 @@ def test_scipy_agrees_on_ranks():
 
 def test_the_table_and_the_figure_are_there_for_a_paper(made):
     there = {path.name for path in (made / "out").iterdir()}
-    assert there == {*(f"measures.{kind}" for kind in ("csv", "md", "png", "pdf", "svg")), "table.csv", "table.tex"}
+    assert there == {
+        *(f"measures.{kind}" for kind in ("csv", "md", "png", "pdf", "svg")),
+        "table.csv",
+        "table.tex",
+    }
     wide = pd.read_csv(made / "out" / "table.csv")
     assert set(wide["measure"]) >= {"random", "view area", "confidence", "unidirectional"}
     assert (made / "out" / "measures.pdf").read_bytes().startswith(b"%PDF")

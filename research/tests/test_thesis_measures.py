@@ -1,4 +1,6 @@
-"""Measures of a mesh against closed forms and trimesh; what they must not depend on; meshes as files have them."""
+"""Measures of a mesh against closed forms and trimesh; what they must not depend on; meshes as
+files have them.
+"""
 
 import os
 from pathlib import Path
@@ -69,11 +71,16 @@ def test_a_cube():
     view = view_of(CUBE, CORNER)
     assert MEASURES["visible_area_ratio"](view) == pytest.approx(0.5, rel=0.01)
     assert MEASURES["surface_visibility"](view) == pytest.approx(0.5)
-    # 12 edges that bend by a right angle, of which half the curvature lies on the three sides; 8 corners alike.
-    assert MEASURES["mean_curvature"](view) == pytest.approx(12 * SIDE * (np.pi / 2) / 2 / 2, rel=0.01)
+    # 12 edges that bend by a right angle, of which half the curvature lies on the three sides; 8
+    # corners alike.
+    assert MEASURES["mean_curvature"](view) == pytest.approx(
+        12 * SIDE * (np.pi / 2) / 2 / 2, rel=0.01
+    )
     assert MEASURES["gaussian_curvature"](view) == pytest.approx(8 * (np.pi / 2) / 2, rel=0.02)
-    assert MEASURES["viewpoint_entropy"](view) == pytest.approx(np.log2(6), abs=0.2)  # six triangles, unequal
-    assert MEASURES["gradient_entropy"](view) == pytest.approx(np.log2(3), abs=0.2)  # three directions, unequal
+    # six triangles, unequal
+    assert MEASURES["viewpoint_entropy"](view) == pytest.approx(np.log2(6), abs=0.2)
+    # three directions, unequal
+    assert MEASURES["gradient_entropy"](view) == pytest.approx(np.log2(3), abs=0.2)
 
 
 def test_one_side_of_a_cube():
@@ -87,7 +94,8 @@ def test_one_side_of_a_cube():
 
 
 def test_the_side_of_a_cylinder_bends_one_way_only():
-    sections, height = 64, 2.0
+    sections = 64
+    height = 2.0
     surface = surface_of(trimesh.creation.cylinder(1, height, sections=sections))
     side = np.abs(surface.normals[:, 2]) < 0.5
     # Mean curvature 1/(2r) on the side, half of the bend of the rims besides.
@@ -95,7 +103,8 @@ def test_the_side_of_a_cylinder_bends_one_way_only():
     along = sections * height * (2 * np.pi / sections) / 2
     assert surface.mean_of_faces[side].sum() == pytest.approx(along + rims, rel=1e-6)
     assert along == pytest.approx(2 * np.pi * height / 2)  # the integral of 1/2
-    assert surface.gaussian_of_faces.sum() == pytest.approx(4 * np.pi, rel=1e-6)  # all of it at the rims
+    # all of it at the rims
+    assert surface.gaussian_of_faces.sum() == pytest.approx(4 * np.pi, rel=1e-6)
 
 
 def test_a_flat_square_does_not_bend():
@@ -123,9 +132,14 @@ def test_views_from_above_and_of_the_base():
 def test_the_fused_descriptor_of_half_an_image():
     depth = np.zeros((10, 10))
     depth[:5] = 2.5
-    # All at the nearest point: 1 over half of the image. Of F4's products, each row loses one neighbour.
-    variance, entropy, vollath = 1.0, 1 / 8, (5 * 9 - 5 * 8) / 50
-    assert MEASURES["fused_descriptor"](of_depth(depth)) == pytest.approx((variance + entropy + vollath) / 3)
+    # All at the nearest point: 1 over half of the image. Of F4's products, each row loses one
+    # neighbour.
+    variance = 1.0
+    entropy = 1 / 8
+    vollath = (5 * 9 - 5 * 8) / 50
+    assert MEASURES["fused_descriptor"](of_depth(depth)) == pytest.approx(
+        (variance + entropy + vollath) / 3
+    )
 
 
 def test_entropy_of_shares():
@@ -137,7 +151,9 @@ def test_entropy_of_shares():
 
 
 def plane(slant, azimuth=0.0, size=224, depth=3.0, half=0.9):
-    """A square part of the image in which a plane is seen, turned away from the camera by an angle, degrees."""
+    """A square part of the image in which a plane is seen, turned away from the camera by an
+    angle, degrees.
+    """
     view = of_depth(np.zeros((size, size)))
     at = (np.arange(size) + 0.5 - size / 2) / view.intrinsics[0, 0]
     tilt = np.tan(np.radians(slant)) * np.array([np.cos(azimuth), np.sin(azimuth)])
@@ -158,7 +174,9 @@ def test_a_slanted_plane_tells_no_more_than_a_frontal_one(azimuth):
 
 
 def test_directions_of_a_ball():
-    """Seen from far away its pixels are its normals, and those are spread by the cosine: log2(pi sqrt(e)) bits."""
+    """Seen from far away its pixels are its normals, and those are spread by the cosine: log2(pi
+    sqrt(e)) bits.
+    """
     far = 20.0
     view = view_of(BALL, look_at_origin(0.3, 0.5, far), 448, far)
     own = np.log2(2 * np.pi * np.e * 0.1**2)  # of the blur
@@ -170,7 +188,11 @@ def test_directions_of_a_ball():
 
 @pytest.mark.parametrize(
     "solid",
-    [trimesh.creation.icosphere(2), trimesh.creation.box([1, 2, 3]), trimesh.creation.torus(1, 0.3)],
+    [
+        trimesh.creation.icosphere(2),
+        trimesh.creation.box([1, 2, 3]),
+        trimesh.creation.torus(1, 0.3),
+    ],
     ids=["ball", "box", "torus"],
 )
 def test_trimesh_agrees(solid):
@@ -183,8 +205,12 @@ def test_trimesh_agrees(solid):
     np.testing.assert_allclose(surface.deficits[place], solid.vertex_defects, atol=1e-6)
     # Trimesh's has the sign of the edge, convex or not.
     signed = np.where(solid.face_adjacency_convex, 1, -1) * solid.face_adjacency_angles
-    lengths = np.linalg.norm(np.diff(solid.vertices[solid.face_adjacency_edges], axis=1)[:, 0], axis=1)
-    assert surface.mean_of_faces.sum() == pytest.approx((np.abs(signed) * lengths).sum() / 2, rel=1e-4)
+    lengths = np.linalg.norm(
+        np.diff(solid.vertices[solid.face_adjacency_edges], axis=1)[:, 0], axis=1
+    )
+    assert surface.mean_of_faces.sum() == pytest.approx(
+        (np.abs(signed) * lengths).sum() / 2, rel=1e-4
+    )
     if solid.is_convex:
         assert surface.mean_of_faces.sum() == pytest.approx(solid.integral_mean_curvature, rel=1e-4)
 
@@ -197,7 +223,9 @@ def test_face_ids_are_those_of_rays_cast_by_trimesh_geometry():
     ids = view.face_ids[row, column]
     assert (ids >= 0).all()
     assert (view.face_ids[view.depth == 0] == -1).all()
-    rays = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], 1) @ np.linalg.inv(view.intrinsics).T
+    rays = (
+        np.stack([column + 0.5, row + 0.5, np.ones(len(row))], 1) @ np.linalg.inv(view.intrinsics).T
+    )
     points = (rays * view.depth[row, column, None]) @ CORNER[:3, :3].T + CORNER[:3, 3]
     barycentric = trimesh.triangles.points_to_barycentric(mesh.vertices[mesh.faces[ids]], points)
     assert barycentric.min() > -1e-3
@@ -206,7 +234,8 @@ def test_face_ids_are_those_of_rays_cast_by_trimesh_geometry():
 
 
 @pytest.mark.parametrize("gap", [0.001, 0.1])
-@pytest.mark.parametrize("aside", [0, 0.012, 0.024, 0.036])  # a pixel each: the wire stands in every column of four
+# a pixel each: the wire stands in every column of four
+@pytest.mark.parametrize("aside", [0, 0.012, 0.024, 0.036])
 def test_a_wire_before_a_wall_is_seen_in_each_pixel_that_it_fills(gap, aside):
     """As wide as one pixel, so that the pixels on both sides of it show one face of the wall."""
     wall = np.array([[-0.6, -0.6, 0], [0.6, -0.6, 0], [0.6, 0.6, 0], [-0.6, 0.6, 0]])
@@ -219,8 +248,11 @@ def test_a_wire_before_a_wall_is_seen_in_each_pixel_that_it_fills(gap, aside):
         seen = camera.observe(pose).depth
         row, column = np.nonzero(seen)
         ids = FaceCamera(mesh, 224).face_ids(pose, np.rint(seen * 1e4) / 1e4)[row, column]
-        x, y = column + 0.5, row + 0.5
-        points = (np.stack([x, y, np.ones(len(x))], 1) @ np.linalg.inv(camera.intrinsics).T) * seen[row, column, None]
+        x = column + 0.5
+        y = row + 0.5
+        points = (np.stack([x, y, np.ones(len(x))], 1) @ np.linalg.inv(camera.intrinsics).T) * seen[
+            row, column, None
+        ]
         before = (points @ pose[:3, :3].T + pose[:3, 3])[:, 0] > gap / 2
         assert before.sum() > 50
         np.testing.assert_array_equal(ids >= 2, before)
@@ -230,7 +262,9 @@ def test_a_wire_before_a_wall_is_seen_in_each_pixel_that_it_fills(gap, aside):
 def test_every_pixel_of_the_smallest_images_shows_a_face(size):
     view = view_of(load_mesh(SAMPLES / "chair.off"), CORNER, size)
     np.testing.assert_array_equal(view.face_ids >= 0, view.depth > 0)
-    assert np.isfinite([measure(view_of(CUBE, CORNER, size)) for measure in MEASURES.values()]).all()
+    assert np.isfinite(
+        [measure(view_of(CUBE, CORNER, size)) for measure in MEASURES.values()]
+    ).all()
 
 
 # What they must not depend on
@@ -238,11 +272,17 @@ def test_every_pixel_of_the_smallest_images_shows_a_face(size):
 
 @pytest.mark.parametrize("name", MEASURES)
 def test_nothing_depends_on_where_object_and_camera_are_together(name):
-    """Turned about the vertical and moved; for those who do not know up and down, turned any way."""
+    """Turned about the vertical and moved; for those who do not know up and down, turned any
+    way.
+    """
     mesh = load_mesh(SAMPLES / "chair.off")
     still = measured(name, mesh, CORNER, 96)
     upright = name in ("above_preference", "base_avoidance")
-    turn = Rotation.from_euler("z", 77, degrees=True) if upright else Rotation.from_euler("xyz", [40, 110, 200])
+    turn = (
+        Rotation.from_euler("z", 77, degrees=True)
+        if upright
+        else Rotation.from_euler("xyz", [40, 110, 200])
+    )
     move = np.eye(4)
     move[:3, :3], move[:3, 3] = turn.as_matrix(), (0, 0, 0) if upright else (0.3, -0.2, 0.1)
     moved = Mesh(mesh.vertices @ move[:3, :3].T + move[:3, 3], mesh.faces, mesh.centre, mesh.radius)
@@ -258,8 +298,8 @@ REMESHED = {
     "mesh_saliency": 0.15,
     "base_avoidance": 0.01,
 }
-"""How much a measure may differ, as a share of its value, when each face of a chair is cut into four. A half hidden
-face has half of the curvature of its edges, and its parts more or less."""
+"""How much a measure may differ, as a share of its value, when each face of a chair is cut into
+four. A half hidden face has half of the curvature of its edges, and its parts more or less."""
 
 
 @pytest.mark.parametrize("name", REMESHED)
@@ -268,7 +308,9 @@ def test_cutting_faces_changes_little(name):
     fine = mesh_of(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).subdivide())
     for view in (9, 20, 35):
         before = measured(name, mesh, SPHERE.poses[view], 128)
-        assert measured(name, fine, SPHERE.poses[view], 128) == pytest.approx(before, rel=REMESHED[name])
+        assert measured(name, fine, SPHERE.poses[view], 128) == pytest.approx(
+            before, rel=REMESHED[name]
+        )
 
 
 # Meshes as files have them
@@ -278,15 +320,23 @@ def soup(mesh: Mesh, rng) -> Mesh:
     """The same triangles, each with corners of its own, turned either way, in any order."""
     faces = mesh.faces[rng.permutation(len(mesh.faces))]
     faces = np.where(rng.random((len(faces), 1)) < 0.5, faces, faces[:, ::-1])
-    return Mesh(mesh.vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3), mesh.centre, mesh.radius)
+    return Mesh(
+        mesh.vertices[faces].reshape(-1, 3),
+        np.arange(faces.size).reshape(-1, 3),
+        mesh.centre,
+        mesh.radius,
+    )
 
 
 @pytest.mark.parametrize("name", MEASURES)
 def test_neither_shared_corners_nor_the_turn_of_faces_count(name):
     mesh = CUBE
     loose = soup(mesh, np.random.default_rng(0))
-    near = 0.02 if name == "mesh_saliency" else 1e-3  # which of two equal edges is cut first depends on the order
-    assert measured(name, loose, CORNER, 96) == pytest.approx(measured(name, mesh, CORNER, 96), rel=near, abs=1e-6)
+    # which of two equal edges is cut first depends on the order
+    near = 0.02 if name == "mesh_saliency" else 1e-3
+    assert measured(name, loose, CORNER, 96) == pytest.approx(
+        measured(name, mesh, CORNER, 96), rel=near, abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("name", MEASURES)
@@ -295,8 +345,14 @@ def test_broken_meshes_have_finite_measures(name):
     flat = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 0]], float)
     broken = {
         "open": (box.vertices, box.faces[:5]),
-        "without area here and there": (flat, np.array([[0, 1, 2], [0, 1, 3], [1, 1, 3], [4, 2, 3]])),
-        "three faces on one edge": (np.vstack([box.vertices, [[0, 0, 2]]]), np.vstack([box.faces, [[0, 1, 8]]])),
+        "without area here and there": (
+            flat,
+            np.array([[0, 1, 2], [0, 1, 3], [1, 1, 3], [4, 2, 3]]),
+        ),
+        "three faces on one edge": (
+            np.vstack([box.vertices, [[0, 0, 2]]]),
+            np.vstack([box.faces, [[0, 1, 8]]]),
+        ),
         "doubled": (np.vstack([box.vertices] * 2), np.vstack([box.faces, box.faces[:, ::-1] + 8])),
     }
     for vertices, faces in broken.values():
@@ -313,7 +369,10 @@ def test_real_meshes_have_finite_measures():
         for pose in SPHERE.poses[[0, 21]]:
             view = view_of(mesh, pose, 112)
             values = {name: function(view) for name, function in MEASURES.items()}
-            assert all(np.isfinite(value) and value >= 0 for value in values.values()), (entries[i].path, values)
+            assert all(np.isfinite(value) and value >= 0 for value in values.values()), (
+                entries[i].path,
+                values,
+            )
             assert values["visible_area_ratio"] <= 1
 
 

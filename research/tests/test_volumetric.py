@@ -1,4 +1,6 @@
-"""Policies by what is unseen, by peaks of the whole sphere and by true measures; their way into the benchmark."""
+"""Policies by what is unseen, by peaks of the whole sphere and by true measures; their way into
+the benchmark.
+"""
 
 from dataclasses import replace
 
@@ -51,7 +53,9 @@ def state_of(sphere, *episodes, **maps) -> EpisodeState:
         visited[row, list(views)] = True
     flat = np.full((len(episodes), 2), 0.5)
     current = np.array([views[-1] for views in episodes])
-    return EpisodeState(current, visited, flat, Evidence(flat, maps), len(episodes[0]), np.arange(len(episodes)))
+    return EpisodeState(
+        current, visited, flat, Evidence(flat, maps), len(episodes[0]), np.arange(len(episodes))
+    )
 
 
 # By what is unseen
@@ -61,7 +65,10 @@ def state_of(sphere, *episodes, **maps) -> EpisodeState:
 def test_after_one_view_of_a_ball_the_other_side_is_most_new(gain):
     looks = camera()
     policy = Volumetric(SPHERE, gain, SMALL)
-    state = replace(state_of(SPHERE, [8], [12]), observations=[[looks.observe(SPHERE.poses[v])] for v in (8, 12)])
+    state = replace(
+        state_of(SPHERE, [8], [12]),
+        observations=[[looks.observe(SPHERE.poses[v])] for v in (8, 12)],
+    )
     chosen = policy.next_views(state, np.random.default_rng(0))
     assert (SPHERE.arc[[8, 12], chosen] > np.radians(100)).all()
     values = policy.view_values(state)
@@ -75,11 +82,13 @@ def test_after_one_view_of_a_ball_the_other_side_is_most_new(gain):
 def test_a_session_hands_the_policy_what_was_seen(viewpoints):
     system = nextview.load(policy="volumetric", viewpoints=viewpoints)
     policy = replace(system.policy, grid=SMALL)
-    box, sphere = camera(trimesh.creation.box([1, 2, 1.5]), 112), viewpoints_of(viewpoints)
+    box = camera(trimesh.creation.box([1, 2, 1.5]), 112)
+    sphere = viewpoints_of(viewpoints)
     session = Session(system.models, policy, sphere, 3, FixedLength(max_views=4))
     while not session.done:
         session.update(box.observe(session.pose))
-    seen, visited = [view.observation for view in session.views], {3}
+    seen = [view.observation for view in session.views]
+    visited = {3}
     for k in (1, 2, 3):
         gains = new_volume(occupancy_of(seen[:k], SMALL), sphere.poses[:, :3, 3])
         np.testing.assert_array_equal(session.views[k - 1].values, gains)
@@ -128,7 +137,9 @@ def test_the_oracle_of_a_measure_goes_to_the_highest_view_left():
 def test_the_oracle_of_peaks_leaves_out_the_slope_below_a_peak():
     values = np.zeros((1, 40))
     values[0, [8, 9, 28]] = 1.0, 0.9, 0.5  # 9 is next to 8 and no peak
-    chosen = OracleMeasure(SPHERE, values, peaks=True).next_views(state_of(SPHERE, [8]), np.random.default_rng(0))
+    chosen = OracleMeasure(SPHERE, values, peaks=True).next_views(
+        state_of(SPHERE, [8]), np.random.default_rng(0)
+    )
     assert chosen.tolist() == [28]
 
 
@@ -139,7 +150,10 @@ def test_the_oracle_of_peaks_leaves_out_the_slope_below_a_peak():
 def stored(tmp_path_factory):
     """A store of two meshes, planned and measured, and made-up predictions of it."""
     folder = tmp_path_factory.mktemp("stored")
-    for label, mesh in (("ball", trimesh.creation.icosphere(2)), ("box", trimesh.creation.box([1, 3, 2]))):
+    for label, mesh in (
+        ("ball", trimesh.creation.icosphere(2)),
+        ("box", trimesh.creation.box([1, 3, 2])),
+    ):
         path = folder / "meshes" / label / "test" / f"{label}_1.off"
         path.parent.mkdir(parents=True)
         mesh.export(path)
@@ -148,9 +162,19 @@ def stored(tmp_path_factory):
     views = ViewStore.open(store)
     rng = np.random.default_rng(0)
     predictions = Predictions(
-        rng.normal(size=(2, 6, 3)).astype(np.float32), {}, views.measure(), tuple(views.names), np.array([0, 1]),
-        ("ball", "box", "pillar"), np.array(["test"] * 2), np.zeros(2, bool), RING, {}, {}, store=str(store),
-    )  # fmt: skip
+        rng.normal(size=(2, 6, 3)).astype(np.float32),
+        {},
+        views.measure(),
+        tuple(views.names),
+        np.array([0, 1]),
+        ("ball", "box", "pillar"),
+        np.array(["test"] * 2),
+        np.zeros(2, bool),
+        RING,
+        {},
+        {},
+        store=str(store),
+    )
     return store, predictions
 
 
@@ -161,7 +185,8 @@ def test_the_benchmark_goes_the_way_that_was_planned(stored):
         replay("volumetric", specs, 3, 0)
     assert "volumetric" not in default_entries(specs)
     plan(store, ("volumetric", "coverage"), workers=0)
-    assert list(plan_store(store, ("volumetric", "coverage"), workers=0)) == [(2, 2)]  # nothing is left to do
+    # nothing is left to do
+    assert list(plan_store(store, ("volumetric", "coverage"), workers=0)) == [(2, 2)]
     assert {"volumetric", "coverage"} <= set(default_entries(specs))
     views = ViewStore.open(store)
     for name, gain in (("volumetric", new_volume), ("coverage", new_surface)):
@@ -170,7 +195,9 @@ def test_the_benchmark_goes_the_way_that_was_planned(stored):
         np.testing.assert_array_equal(ways[:, :, 0], np.tile(np.arange(6), (2, 1)))
         paths = replay(name, specs, 3, 0)
         np.testing.assert_array_equal(paths.views, ways[specs.objects, specs.starts, :3])
-        seen, way = [], ways[1, 5].astype(int)  # by hand
+        # by hand
+        seen = []
+        way = ways[1, 5].astype(int)
         for k in range(3):
             seen.append(Observation(views.depth(1)[way[k]], RING.poses[way[k]], views.intrinsics))
             gains = gain(occupancy_of(seen, VoxelGrid(64)), RING.poses[:, :3, 3])
@@ -182,20 +209,29 @@ def test_the_benchmark_goes_the_way_that_was_planned(stored):
 
 @pytest.mark.parametrize("name", ["volumetric", "coverage"])
 def test_what_was_planned_is_where_the_policy_goes_by_itself(stored, name):
-    """One episode at a time, each with frames of its own: nothing that was found for another can be used."""
+    """One episode at a time, each with frames of its own: nothing that was found for another can
+    be used.
+    """
     store, _ = stored
     plan(store, (name,), workers=0)
     views = ViewStore.open(store)
-    policy, rule, rng = make_policy(name, RING), FixedLength(max_views=PLANNED), np.random.default_rng(0)
+    policy = make_policy(name, RING)
+    rule = FixedLength(max_views=PLANNED)
+    rng = np.random.default_rng(0)
     for i in range(2):
         for start in range(len(RING)):
 
             def observe(episodes, at, i=i):
-                frames = [Observation(views.depth(i)[view].copy(), RING.poses[view], views.intrinsics) for view in at]
+                frames = [
+                    Observation(views.depth(i)[view].copy(), RING.poses[view], views.intrinsics)
+                    for view in at
+                ]
                 return Evidence(np.zeros((len(at), 2)), observations=frames)
 
             alone = run_episodes(observe, RING, policy, np.array([start]), rule, rng)
-            np.testing.assert_array_equal(views.read(f"plans/{name}", i)[start], alone.outcome.views[0])
+            np.testing.assert_array_equal(
+                views.read(f"plans/{name}", i)[start], alone.outcome.views[0]
+            )
 
 
 def test_true_measures_come_from_the_store(stored):

@@ -1,4 +1,6 @@
-"""What users hand in, checked once at the door: numbers, points, and plugins, which are code of their own."""
+"""What users hand in, checked once at the door: numbers, points, and plugins, which are code of
+their own.
+"""
 
 import importlib
 import os
@@ -27,8 +29,13 @@ EXTRAS = {  # packages by the optional part of the installation that brings them
     "envs": ("gymnasium",),
     "train": ("lightning", "onnx", "onnxscript", "torch", "torchmetrics"),
 }
-TRACEBACK = "NEXTVIEW_TRACEBACK"  # an environment variable: set, the whole traceback of a plugin's error is printed too
-_NOT_PLUGINS = (f"{Path(__file__).parent}{os.sep}", "<frozen ", *map(sysconfig.get_path, ("stdlib", "purelib")))
+# an environment variable: set, the whole traceback of a plugin's error is printed too
+TRACEBACK = "NEXTVIEW_TRACEBACK"
+_NOT_PLUGINS = (
+    f"{Path(__file__).parent}{os.sep}",
+    "<frozen ",
+    *map(sysconfig.get_path, ("stdlib", "purelib")),
+)
 
 
 def needs_package(package: str, extra: str, project: str = "nextview") -> str:
@@ -37,7 +44,9 @@ def needs_package(package: str, extra: str, project: str = "nextview") -> str:
 
 
 def missing_extra(
-    error: ModuleNotFoundError, packages: Mapping[str, tuple[str, ...]] = EXTRAS, project: str = "nextview"
+    error: ModuleNotFoundError,
+    packages: Mapping[str, tuple[str, ...]] = EXTRAS,
+    project: str = "nextview",
 ) -> str | None:
     """What to install, a sentence; None where the module belongs to no optional part.
 
@@ -52,7 +61,9 @@ def missing_extra(
 
 
 @contextmanager
-def extras(packages: Mapping[str, tuple[str, ...]] = EXTRAS, project: str = "nextview") -> Iterator[None]:
+def extras(
+    packages: Mapping[str, tuple[str, ...]] = EXTRAS, project: str = "nextview"
+) -> Iterator[None]:
     """Stands around imports from optional parts of the installation.
 
     Args:
@@ -83,14 +94,20 @@ def one_line(text: str, most: int = 80) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """The known name that a wrong one is nearest to, as the next part of a sentence; "" if none is near."""
+    """The known name that a wrong one is nearest to, as the next part of a sentence; "" if none
+    is near.
+    """
     near = get_close_matches(name, list(known), 1, 0.6)
     return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def whole(value: Any, what: str, least: int = 0, most: int = 2**31 - 1) -> int:
     """A whole number within limits; UsageError if it is none."""
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Integral) or not least <= int(value) <= most:
+    if (
+        isinstance(value, bool | np.bool_)
+        or not isinstance(value, Integral)
+        or not least <= int(value) <= most
+    ):
         reach = f"from {least} on" if most == 2**31 - 1 else f"from {least} to {most}"
         raise UsageError(f"{what} is a whole number {reach}, not {one_line(repr(value))}")
     return int(value)
@@ -104,13 +121,20 @@ def one_of(value: Any, known: Iterable[Any], what: str) -> None:
         raise UsageError(f"{what} is one of {named}, not {one_line(repr(value))}")
 
 
-def number(value: Any, what: str, least: float = -np.inf, most: float = np.inf, above: float = -np.inf) -> float:
+def number(
+    value: Any, what: str, least: float = -np.inf, most: float = np.inf, above: float = -np.inf
+) -> float:
     """A finite number within limits, ``above`` the last excluded; UsageError if it is none."""
     fits = isinstance(value, Real) and not isinstance(value, bool | np.bool_)
     if not fits or not np.isfinite(float(value)) or not (least <= value <= most and value > above):
-        reach = [f"of at least {least:g}"] * (least > -np.inf) + [f"above {above:g}"] * (above > -np.inf)
+        reach = [f"of at least {least:g}"] * (least > -np.inf) + [f"above {above:g}"] * (
+            above > -np.inf
+        )
         reach += [f"of at most {most:g}"] * (most < np.inf)
-        raise UsageError(f"{what} is a number{' ' if reach else ''}{', '.join(reach)}, not {one_line(repr(value))}")
+        raise UsageError(
+            f"{what} is a number{' ' if reach else ''}{', '.join(reach)}, not"
+            f" {one_line(repr(value))}"
+        )
     return float(value)
 
 
@@ -171,7 +195,9 @@ def plugin(path: str) -> Any:
 
 @cache
 def plugins(group: str) -> dict[str, str]:
-    """What installed packages add, MODULE:NAME by name: the entry points of a group, "nextview.policies"."""
+    """What installed packages add, MODULE:NAME by name: the entry points of a group,
+    "nextview.policies".
+    """
     from importlib.metadata import entry_points
 
     return {entry.name: entry.value for entry in entry_points(group=group)}
@@ -181,7 +207,8 @@ def plugins(group: str) -> dict[str, str]:
 def plugin_errors(error: Callable[[str], NextviewError]) -> Iterator[None]:
     """Run a plugin: what it raises, an exit too, becomes one sentence. A Ctrl-C passes.
 
-    ``error`` makes the error from what is said of the exception: its kind, its message, and the plugin's last line.
+    ``error`` makes the error from what is said of the exception: its kind, its message, and the
+    plugin's last line.
     """
     try:
         yield
@@ -190,8 +217,13 @@ def plugin_errors(error: Callable[[str], NextviewError]) -> Iterator[None]:
     except BaseException as raised:
         if os.environ.get(TRACEBACK):
             traceback.print_exception(raised)
-        message, text = one_line(str(raised), 300), type(raised).__name__
+        message = one_line(str(raised), 300)
+        text = type(raised).__name__
         text += f": {message}" if message else ""
-        frames = [f for f in traceback.extract_tb(raised.__traceback__) if not f.filename.startswith(_NOT_PLUGINS)]
+        frames = [
+            f
+            for f in traceback.extract_tb(raised.__traceback__)
+            if not f.filename.startswith(_NOT_PLUGINS)
+        ]
         text += f", at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
         raise error(text) from raised

@@ -1,15 +1,16 @@
 """Everything that can be wrong with what a user handed in, asked for or has installed.
 
-Each message is one sentence: what is wrong, in which file, what to do. The command line prints it and ends with status
-2. Any other exception is a bug of nextview and keeps its traceback.
+Each message is one sentence: what is wrong, in which file, what to do. The command line prints it
+and ends with status 2. Any other exception is a bug of nextview and keeps its traceback.
 """
 
 import struct
 import zipfile
 import zlib
 
-# What the readers of NumPy, zarr, Pillow and others raise for a damaged file, which may lead them anywhere. A package
-# that is missing, memory that runs out, and a bug in this package's own names are not among them.
+# What the readers of NumPy, zarr, Pillow and others raise for a damaged file, which may lead them
+# anywhere. A package that is missing, memory that runs out, and a bug in this package's own names
+# are not among them.
 DAMAGED = (
     ArithmeticError,
     AttributeError,
@@ -51,7 +52,9 @@ class NoViewLeftError(ObservationError):
 
 
 class SessionError(NextviewError):
-    """A session is asked for what it cannot do: it has ended, has not ended yet, or lacks what its policy needs."""
+    """A session is asked for what it cannot do: it has ended, has not ended yet, or lacks what
+    its policy needs.
+    """
 
 
 class ModelError(NextviewError):

@@ -1,9 +1,12 @@
-"""Files that nextview writes and reads: outputs whole or not at all, typed JSON records, checked weights.
+"""Files that nextview writes and reads: outputs whole or not at all, typed JSON records, checked
+weights.
 
-What exists is refused; with ``overwrite`` exactly the files that are written are replaced. A file is written under a
-temporary name beside its place and then renamed, so a run that is killed leaves what was there before.
+What exists is refused; with ``overwrite`` exactly the files that are written are replaced. A file
+is written under a temporary name beside its place and then renamed, so a run that is killed leaves
+what was there before.
 
-Temporary folders have random names and hold a marker, MARKER: only a folder with the marker is ever removed.
+Temporary folders have random names and hold a marker, MARKER: only a folder with the marker is ever
+removed.
 """
 
 import errno
@@ -26,7 +29,8 @@ from nextview.checks import one_line
 from nextview.errors import DatasetError, ModelError, NextviewError, ResultsError
 
 T = TypeVar("T")
-Sha256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]  # a field of a record: a hash in hexadecimal digits
+# a field of a record: a hash in hexadecimal digits
+Sha256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # errors of a full disk
 MARKER = "nextview-unfinished.json"  # in each temporary folder: an ``Unfinished`` record
 LONGEST_NAME = 40  # letters of an output's name that the name of its temporary folder holds
@@ -37,7 +41,8 @@ LARGEST_RECORD = 64 * 2**20  # bytes of a JSON record; a card takes some hundred
 def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None:
     """Refuse, before any work is done, an output that cannot be written or must not be replaced.
 
-    A ``folder`` may be there if it is empty. ResultsError: it exists, is a link, or its place cannot be written.
+    A ``folder`` may be there if it is empty. ResultsError: it exists, is a link, or its place
+    cannot be written.
     """
     if path.is_symlink():
         raise ResultsError(f"{path}: is a link; give what it points to")
@@ -56,7 +61,9 @@ def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None
 
 @contextmanager
 def new_file(path: Path, overwrite: bool = False) -> Iterator[Path]:
-    """Write a file whole or not at all: yields a temporary path beside it, of the same suffix; see ``check_new``."""
+    """Write a file whole or not at all: yields a temporary path beside it, of the same suffix;
+    see ``check_new``.
+    """
     check_new(path, overwrite)
     with _beside(path) as temporary:
         part = temporary / path.name
@@ -67,27 +74,31 @@ def new_file(path: Path, overwrite: bool = False) -> Iterator[Path]:
 
 
 @contextmanager
-def new_folder(path: Path, overwrite: bool = False, last: str = "", withdraw: bool = False) -> Iterator[Path]:
+def new_folder(
+    path: Path, overwrite: bool = False, last: str = "", withdraw: bool = False
+) -> Iterator[Path]:
     """Write a folder of files: yields a temporary folder beside it.
 
-    A folder that was not there appears whole. Of one that is there, with ``overwrite``, each file that was written
-    replaces the one of its name, and all others stay: the deepest first, ``last`` at the end. No file is replaced
-    before every place is known to be free.
+    A folder that was not there appears whole. Of one that is there, with ``overwrite``, each file
+    that was written replaces the one of its name, and all others stay: the deepest first, ``last``
+    at the end. No file is replaced before every place is known to be free.
 
     Args:
         path: The folder.
         overwrite: Whether files in it may be replaced; without, it has to be empty.
-        last: The file, directly in the folder, that names or describes the others. Whoever is stopped before it is
-            replaced leaves the one that was there.
-        withdraw: Whether that file is removed before the first other is replaced: for files that keep their names, so
-            that whoever is stopped leaves no mixture of old and new ones, but a folder that says nothing.
+        last: The file, directly in the folder, that names or describes the others. Whoever is
+            stopped before it is replaced leaves the one that was there.
+        withdraw: Whether that file is removed before the first other is replaced: for files that
+            keep their names, so that whoever is stopped leaves no mixture of old and new ones, but
+            a folder that says nothing.
 
     Raises:
         ResultsError: see ``check_new``; or the disk is full.
     """
     check_new(path, overwrite, folder=True)
     there = path.is_dir()
-    place = path / "new" if there else path  # the folder above one that is there may not be writable
+    # the folder above one that is there may not be writable
+    place = path / "new" if there else path
     with _beside(place) as temporary:
         part = temporary / place.name
         part.mkdir()
@@ -113,7 +124,9 @@ def new_folder(path: Path, overwrite: bool = False, last: str = "", withdraw: bo
 
 
 def _replace(part: Path, folder: Path, files: Sequence[Path], last: str) -> None:
-    """Move files, by their relative paths, from one folder into another: the deepest first, ``last`` at the end."""
+    """Move files, by their relative paths, from one folder into another: the deepest first,
+    ``last`` at the end.
+    """
     for file in sorted(files, key=lambda file: (file.as_posix() == last, -len(file.parts), file)):
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         if file.as_posix() == last:
@@ -135,7 +148,8 @@ class Unfinished(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         output: The name of the output that it is for.
-        key: What the parts in it are of, see ``unfinished``; TEMPORARY where they are of no further use.
+        key: What the parts in it are of, see ``unfinished``; TEMPORARY where they are of no further
+            use.
     """
 
     output: str
@@ -149,9 +163,9 @@ TEMPORARY = "temporary"
 def unfinished(output: Path, key: str) -> Iterator[Path]:
     """A folder beside an output for the parts of it that are done, so that a stopped run can go on.
 
-    It is the folder that an earlier run with the same key left, or a new one. It is removed at the end, but stays after
-    an error if there is anything in it. Folders that earlier runs with other keys left are removed, and temporary ones
-    of runs that were killed. Use it inside ``only_one``.
+    It is the folder that an earlier run with the same key left, or a new one. It is removed at the
+    end, but stays after an error if there is anything in it. Folders that earlier runs with other
+    keys left are removed, and temporary ones of runs that were killed. Use it inside ``only_one``.
 
     Raises:
         ResultsError: it cannot be written.
@@ -207,7 +221,8 @@ def _marker(folder: Path) -> Unfinished | None:
         if folder.is_symlink() or file.is_symlink() or not file.is_file():
             return None
         return msgspec.json.decode(file.read_bytes(), type=Unfinished)
-    except (OSError, msgspec.DecodeError, UnicodeDecodeError):  # of another user, or another's file of that name
+    # of another user, or another's file of that name
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError):
         return None
 
 
@@ -228,7 +243,9 @@ def _remove(folder: Path) -> None:
 
 @contextmanager
 def _beside(path: Path) -> Iterator[Path]:
-    """A temporary folder on the same disk, removed at the end; what the disk refuses becomes one sentence."""
+    """A temporary folder on the same disk, removed at the end; what the disk refuses becomes one
+    sentence.
+    """
     with _folders_above(path):
         temporary = _marked_folder(path, TEMPORARY)
         try:
@@ -243,7 +260,9 @@ def _beside(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _folders_above(path: Path) -> Iterator[None]:
-    """Where the block fails, remove those folders above a path that were not there before and hold nothing."""
+    """Where the block fails, remove those folders above a path that were not there before and
+    hold nothing.
+    """
     missing = [folder for folder in path.absolute().parents if not folder.exists()]
     try:
         yield
@@ -263,7 +282,8 @@ def _sync_folder(path: Path) -> None:
     """See that the renames in a folder are on the disk, as far as the system can tell."""
     if not hasattr(os, "O_DIRECTORY"):
         return
-    with suppress(OSError):  # no file is lost without it: some network file systems refuse it, as does a folder that
+    # no file is lost without it: some network file systems refuse it, as does a folder that
+    with suppress(OSError):
         descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)  # can be written but not read
         try:
             os.fsync(descriptor)
@@ -273,34 +293,44 @@ def _sync_folder(path: Path) -> None:
 
 @contextmanager
 def only_one(path: Path) -> Iterator[None]:
-    """One writer of ``path`` at a time, among processes; DatasetError if another is at it, or it cannot be written."""
+    """One writer of ``path`` at a time, among processes; DatasetError if another is at it, or it
+    cannot be written.
+    """
     from filelock import FileLock, Timeout  # here, as whoever only recognises needs none
 
     place = path.absolute()
     file = place.with_name(f".{place.name}.lock")
     lock = FileLock(file, timeout=0)
     if file.is_symlink() or (file.exists() and (not file.is_file() or file.stat().st_size > 0)):
-        what = "another run's lock, or no file of this program"  # a lock is an empty file, where the system has locks
+        # a lock is an empty file, where the system has locks
+        what = "another run's lock, or no file of this program"
         raise DatasetError(f"{path}: cannot be written while {file} is there: {what}")
     with _folders_above(place):
         try:
             place.parent.mkdir(parents=True, exist_ok=True)
             lock.acquire()
         except Timeout:
-            raise DatasetError(f"{path}: another run is writing it; wait for that one or stop it") from None
+            raise DatasetError(
+                f"{path}: another run is writing it; wait for that one or stop it"
+            ) from None
         except OSError as error:
             raise DatasetError(f"{path}: cannot be written ({error.strerror})") from None
         try:
             yield
         finally:
-            file.unlink(missing_ok=True)  # while it is held: who opened it before sees that it is gone, and tries anew
+            # while it is held: who opened it before sees that it is gone, and tries anew
+            file.unlink(missing_ok=True)
             lock.release()
 
 
-def regular_file(path: Path, what: str, error: type[NextviewError], largest: int | None = None) -> None:
-    """See that a path names a regular file: a pipe would wait for its writer, a device might never end.
+def regular_file(
+    path: Path, what: str, error: type[NextviewError], largest: int | None = None
+) -> None:
+    """See that a path names a regular file: a pipe would wait for its writer, a device might never
+    end.
 
-    Else it is an ``error``, which says ``what`` it should be ("a model card"); ``largest`` is a size in bytes.
+    Else it is an ``error``, which says ``what`` it should be ("a model card"); ``largest`` is a
+    size in bytes.
     """
     # Not Path.exists, which raises where a name is too long.
     if not os.path.exists(path):
@@ -311,8 +341,12 @@ def regular_file(path: Path, what: str, error: type[NextviewError], largest: int
         raise error(f"{path}: not {what}, which takes {largest >> 20} MB at most")
 
 
-def read_record(path: Path, record: type[T], what: str, error: type[NextviewError] = ModelError) -> T:
-    """A typed record from a JSON file; an ``error`` if the file is missing, too large, or no such record."""
+def read_record(
+    path: Path, record: type[T], what: str, error: type[NextviewError] = ModelError
+) -> T:
+    """A typed record from a JSON file; an ``error`` if the file is missing, too large, or no
+    such record.
+    """
     regular_file(path, what, error, LARGEST_RECORD)
     try:
         content = path.read_bytes()
@@ -321,7 +355,9 @@ def read_record(path: Path, record: type[T], what: str, error: type[NextviewErro
     return decode_record(content, record, f"{path}: not {what}", error)
 
 
-def decode_record(content: bytes | dict[str, Any], record: type[T], where: str, error: type[NextviewError]) -> T:
+def decode_record(
+    content: bytes | dict[str, Any], record: type[T], where: str, error: type[NextviewError]
+) -> T:
     """A typed record from JSON, or from the objects that JSON was read to.
 
     Where it is none, an ``error`` names the field; its sentence begins with ``where``.
@@ -337,7 +373,9 @@ def decode_record(content: bytes | dict[str, Any], record: type[T], where: str, 
 def write_record(path: Path, record: Any, overwrite: bool = False) -> None:
     """Write a record as indented JSON, whole or not at all; see ``new_file``."""
     with new_file(path, overwrite) as part:
-        part.write_bytes(msgspec.json.format(msgspec.json.encode(record, enc_hook=_plain), indent=1) + b"\n")
+        part.write_bytes(
+            msgspec.json.format(msgspec.json.encode(record, enc_hook=_plain), indent=1) + b"\n"
+        )
 
 
 def _plain(value: Any) -> Any:
@@ -353,7 +391,9 @@ def sha256_of(path: Path) -> str:
 
 
 def checked_bytes(path: Path, sha256: str, what: str = "weights") -> bytes:
-    """The content of a file whose hash a card holds; ModelError if it is missing, or not that file."""
+    """The content of a file whose hash a card holds; ModelError if it is missing, or not that
+    file.
+    """
     regular_file(path, what, ModelError)
     content = path.read_bytes()
     if hashlib.sha256(content).hexdigest() != sha256:
@@ -361,7 +401,9 @@ def checked_bytes(path: Path, sha256: str, what: str = "weights") -> bytes:
     return content
 
 
-def arrays_in(content: bytes, names: Sequence[str], where: str, optional: Sequence[str] = ()) -> dict[str, np.ndarray]:
+def arrays_in(
+    content: bytes, names: Sequence[str], where: str, optional: Sequence[str] = ()
+) -> dict[str, np.ndarray]:
     """The arrays of these names in the content of a safetensors file.
 
     Args:
@@ -376,7 +418,8 @@ def arrays_in(content: bytes, names: Sequence[str], where: str, optional: Sequen
     Raises:
         ModelError: it is no such file, or an array is missing.
     """
-    from safetensors import SafetensorError  # here, as most of what imports this module reads no arrays
+    # here, as most of what imports this module reads no arrays
+    from safetensors import SafetensorError
     from safetensors.numpy import load
 
     try:

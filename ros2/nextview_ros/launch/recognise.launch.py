@@ -1,4 +1,6 @@
-"""Start the node on a camera's topics: ros2 launch nextview_ros recognise.launch.py camera:=/camera/depth."""
+"""Start the node on a camera's topics: ros2 launch nextview_ros recognise.launch.py
+camera:=/camera/depth.
+"""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
@@ -15,11 +17,26 @@ ARGUMENTS = {
     "models": ("modelnet10", "bundled models, or a folder"),
     "policy": ("", "how the next view is chosen; empty for what goes with the models"),
     "life_size": ("false", "the objects are as large as their kind is in life"),
-    "min_height": ("nan", "metres of the camera above the support plane, at least; nan for the usual limit"),
-    "max_height": ("nan", "metres of the camera above the support plane, at most; nan for the usual limit"),
-    "clearance": ("nan", "metres between the camera and what the frames show; nan for the usual limit"),
+    "min_height": (
+        "nan",
+        "metres of the camera above the support plane, at least; nan for the usual limit",
+    ),
+    "max_height": (
+        "nan",
+        "metres of the camera above the support plane, at most; nan for the usual limit",
+    ),
+    "clearance": (
+        "nan",
+        "metres between the camera and what the frames show; nan for the usual limit",
+    ),
 }
-TYPES = {"rectified": bool, "life_size": bool, "min_height": float, "max_height": float, "clearance": float}
+TYPES = {
+    "rectified": bool,
+    "life_size": bool,
+    "min_height": float,
+    "max_height": float,
+    "clearance": float,
+}
 
 
 def generate_launch_description():
@@ -40,5 +57,8 @@ def generate_launch_description():
             ("camera_info", PathJoinSubstitution([given["camera"], "camera_info"])),
         ],
     )
-    declared = [DeclareLaunchArgument(n, default_value=v, description=about) for n, (v, about) in ARGUMENTS.items()]
+    declared = [
+        DeclareLaunchArgument(n, default_value=v, description=about)
+        for n, (v, about) in ARGUMENTS.items()
+    ]
     return LaunchDescription([*declared, node])

@@ -1,4 +1,7 @@
-"""The node: one action, two services, one topic. What is computed is in ``conversion`` and in nextview's session."""
+"""The node: one action, two services, one topic.
+
+What is computed is in ``conversion`` and in nextview's session.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +47,9 @@ PARAMETERS = {
 
 
 class RecogniseNode(Node):
-    """Offers the action recognise, and the services look and failed for whoever moves the camera."""
+    """Offers the action recognise, and the services look and failed for whoever moves the
+    camera.
+    """
 
     def __init__(self) -> None:
         super().__init__("nextview")
@@ -57,13 +62,19 @@ class RecogniseNode(Node):
             max_views=self.value("max_views"),
         )
         self.session, self.goal, self.taken = None, None, False
-        self.busy, self.ended, self.arrived = threading.Lock(), threading.Event(), threading.Condition()
+        self.busy, self.ended, self.arrived = (
+            threading.Lock(),
+            threading.Event(),
+            threading.Condition(),
+        )
         self.latest = None
         group = ReentrantCallbackGroup()
         self.tf = Buffer()
         self.listener = TransformListener(self.tf, self)
         subscribe = [
-            message_filters.Subscriber(self, kind, topic, qos_profile=qos_profile_sensor_data, callback_group=group)
+            message_filters.Subscriber(
+                self, kind, topic, qos_profile=qos_profile_sensor_data, callback_group=group
+            )
             for kind, topic in ((Image, "depth"), (CameraInfo, "camera_info"))
         ]
         self.pairs = message_filters.TimeSynchronizer(subscribe, 10)
@@ -73,9 +84,14 @@ class RecogniseNode(Node):
         self.create_service(Trigger, "look", self.look, callback_group=group)
         self.create_service(Trigger, "failed", self.failed, callback_group=group)
         self.server = ActionServer(
-            self, Recognise, "recognise", self.execute, callback_group=group,
-            goal_callback=self.accept, cancel_callback=lambda goal: CancelResponse.ACCEPT,
-        )  # fmt: skip
+            self,
+            Recognise,
+            "recognise",
+            self.execute,
+            callback_group=group,
+            goal_callback=self.accept,
+            cancel_callback=lambda goal: CancelResponse.ACCEPT,
+        )
 
     def value(self, name: str):
         """A parameter."""
@@ -99,14 +115,20 @@ class RecogniseNode(Node):
         now = seconds(self.get_clock().now().to_msg())
         with self.arrived:
             fresh = self.arrived.wait_for(
-                lambda: self.latest is not None and seconds(self.latest[0].header.stamp) >= now, self.value("patience")
+                lambda: self.latest is not None and seconds(self.latest[0].header.stamp) >= now,
+                self.value("patience"),
             )
             if not fresh:
-                raise nextview.ObservationError(f"no depth image came within {self.value('patience')} s")
+                raise nextview.ObservationError(
+                    f"no depth image came within {self.value('patience')} s"
+                )
             image, info = self.latest
         header = image.header
         transform = self.tf.lookup_transform(
-            self.value("world_frame"), header.frame_id, Time.from_msg(header.stamp), Duration(seconds=1.0)
+            self.value("world_frame"),
+            header.frame_id,
+            Time.from_msg(header.stamp),
+            Duration(seconds=1.0),
         )
         return frame_of(image, info, transform, self.value("rectified"), self.value("axes"))
 
@@ -151,7 +173,9 @@ class RecogniseNode(Node):
             pose=self.pose_of(found),
             pose_of=found.pose_of or "",
             pose_degrees=0.0 if found.pose_uncertainty is None else found.pose_uncertainty.degrees,
-            pose_millimetres=0.0 if found.pose_uncertainty is None else found.pose_uncertainty.millimetres,
+            pose_millimetres=0.0
+            if found.pose_uncertainty is None
+            else found.pose_uncertainty.millimetres,
         )
 
     def pose_of(self, found: nextview.Recognition) -> PoseStamped:
@@ -165,19 +189,30 @@ class RecogniseNode(Node):
 
     def begin(self, asked: Recognise.Goal) -> nextview.Session:
         """A session for a goal; what it leaves at zero is the node's."""
-        threshold, max_views = asked.threshold or self.value("threshold"), asked.max_views or self.value("max_views")
-        stopping = Stopping.of(self.system.models.recogniser.calibration, threshold, max_views=max_views)
+        threshold, max_views = (
+            asked.threshold or self.value("threshold"),
+            asked.max_views or self.value("max_views"),
+        )
+        stopping = Stopping.of(
+            self.system.models.recogniser.calibration, threshold, max_views=max_views
+        )
         near = [[point.x, point.y, point.z] for point in asked.near]
         # Things are as large as they were taught, and known by it.
-        life_size = self.value("life_size") or isinstance(self.system.models.recogniser, JudgesTogether)
+        life_size = self.value("life_size") or isinstance(
+            self.system.models.recogniser, JudgesTogether
+        )
         thing = ObservedObject(point=near[0] if near else None, life_size=life_size)
         limits = {name: self.limit(name) for name in ("min_height", "max_height", "clearance")}
-        return replace(self.system, stopping=stopping).session(object=thing, distance=asked.distance or None, **limits)
+        return replace(self.system, stopping=stopping).session(
+            object=thing, distance=asked.distance or None, **limits
+        )
 
     # The services
 
     def look(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """The camera stands where it was asked to be, or for the first view anywhere: take in what it sees."""
+        """The camera stands where it was asked to be, or for the first view anywhere: take in
+        what it sees.
+        """
         return self.answer(response, lambda session: session.update(self.frame()))
 
     def failed(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -218,7 +253,9 @@ class RecogniseNode(Node):
 
 
 def give_up(session: nextview.Session) -> None:
-    """Tell a session that the pose that it asked for cannot be reached; before the first look it has asked for none."""
+    """Tell a session that the pose that it asked for cannot be reached; before the first look it
+    has asked for none.
+    """
     if not session.views:
         raise nextview.SessionError(
             "no pose was asked for yet: bring the camera anywhere before the object, and call look"

@@ -17,14 +17,23 @@ from nextview.policies.baselines import ViewList, orbit, ranked
 from nextview.policies.maps import MapPeak
 from nextview.policies.oracle import OracleGain, OracleMeasure, OracleValley
 from nextview.policies.policy_card import bundled_policies
-from nextview.policies.registry import DEFAULT, VISIBLE, make_policy, map_policy, map_policy_names, policy_names
+from nextview.policies.registry import (
+    DEFAULT,
+    VISIBLE,
+    make_policy,
+    map_policy,
+    map_policy_names,
+    policy_names,
+)
 from nextview.recognition.map_names import LCM, LEM, SPHERE, in_order, map_name
 from nextview.recognition.model_card import DISCRIMINATE
 
 
 @dataclass(frozen=True)
 class EpisodeSpecs:
-    """The E episodes that every entry has to go through: the same objects from the same first views."""
+    """The E episodes that every entry has to go through: the same objects from the same first
+    views.
+    """
 
     predictions: Predictions
     objects: NDArray[np.int64]
@@ -38,7 +47,8 @@ class EpisodeSpecs:
 
     def valley_classes(self, map_name: str) -> tuple[int, ...]:
         """Classes (indices) for which a map's valley is the better view."""
-        named, classes = self.predictions.valley_classes.get(map_name, ()), self.predictions.classes
+        named = self.predictions.valley_classes.get(map_name, ())
+        classes = self.predictions.classes
         return tuple(classes.index(name) for name in named if name in classes)
 
 
@@ -50,20 +60,26 @@ MAP_ORACLES = {  # the thesis's oracles, under its names
     f"{LCM}-oracle-valley": ("", LCM, "-oracle-valley"),
     f"{TRUE}{LCM}": (TRUE, LCM, "-peak"),
 }
-GAINS: dict[str, Scope] = {"oracle-gain": "local", "oracle-gain-all": "global"}  # the ceiling: one step of foresight
-ORACLES = (*MAP_ORACLES, *GAINS)  # by what a robot cannot know; always compared. Every map has such, see MAP_ORACLE
+# the ceiling: one step of foresight
+GAINS: dict[str, Scope] = {"oracle-gain": "local", "oracle-gain-all": "global"}
+# by what a robot cannot know; always compared. Every map has such, see MAP_ORACLE
+ORACLES = (*MAP_ORACLES, *GAINS)
 MAP_ORACLE = re.compile(r"(true-)?(.+?)(-peak|-oracle-valley)?")
-"""Oracles by a map. "true-MAP" climbs the true one: to its peaks, or to its valleys for some classes, by the belief;
-"true-MAP-peak" always to its peaks. With "-oracle-valley" the true class decides, also on the predicted map."""
+"""Oracles by a map. "true-MAP" climbs the true one: to its peaks, or to its valleys for some
+classes, by the belief; "true-MAP-peak" always to its peaks. With "-oracle-valley" the true class
+decides, also on the predicted map."""
 MORE = f"{LEM}{SPHERE}-peak"  # by Parisotto et al., see ``maps.SpherePeak``; always compared
 FIXED = ("best", "worst", "high-entropy", "low-entropy", "random-fixed", "orbit")
-"""Fixed views by name, followed by their number: "best-5", "orbit-8". They go on to the end whatever is believed.
+"""Fixed views by name, followed by their number: "best-5", "orbit-8". They go on to the end
+whatever is believed.
 
-"best" and "worst" are by the confidence in the true class; "orbit" goes round the first view's ring, then the next.
+"best" and "worst" are by the confidence in the true class; "orbit" goes round the first view's
+ring, then the next.
 """
 TRUE_MEASURE = re.compile(r"true-([\w.:]+)-all(-peak)?")
-"""Oracles by the true value of any measure in the view store, over all views: "true-NAME-all" goes to the highest
-unvisited view, "true-NAME-all-peak" to the peaks of its map first. "true-NAME-K" are fixed views: the K highest."""
+"""Oracles by the true value of any measure in the view store, over all views: "true-NAME-all" goes
+to the highest unvisited view, "true-NAME-all-peak" to the peaks of its map first. "true-NAME-K" are
+fixed views: the K highest."""
 
 
 def is_oracle(policy: str) -> bool:
@@ -76,13 +92,18 @@ def knows_truth(entry: str) -> bool:
     return is_oracle(entry) or entry.split("-")[0] in ("best", "worst", "high", "low")
 
 
-IN_SCENES = ("visibility", f"{VISIBLE}{DEFAULT}", "true-visible_share-all")  # where things hide an object
+# where things hide an object
+IN_SCENES = ("visibility", f"{VISIBLE}{DEFAULT}", "true-visible_share-all")
 
 
 def default_entries(specs: EpisodeSpecs) -> list[str]:
-    """All that these predictions allow. Fixed views ignore what can be reached, so scenes have none."""
+    """All that these predictions allow.
+
+    Fixed views ignore what can be reached, so scenes have none.
+    """
     sphere = specs.predictions.sphere
-    n, v = sphere.azimuths, len(sphere)
+    n = sphere.azimuths
+    v = len(sphere)
     maps = [name for name in in_order(specs.predictions.maps) if not name.endswith(SPHERE)]
     names = [*policy_names(), *(each for name in maps for each in (name, f"{name}-peak")), MORE]
     names = [name for name in (*names, *bundled_policies(), *ORACLES) if name not in IN_SCENES]
@@ -97,7 +118,11 @@ def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
     """The policy of that name."""
     policy = _make(name, specs)
     if "observations" in policy.needs:  # predictions hold no depth; the ways are planned
-        return ViewList(stored_rows(specs.predictions, f"plans/{name}")[specs.objects, specs.starts].astype(np.int64))
+        return ViewList(
+            stored_rows(specs.predictions, f"plans/{name}")[specs.objects, specs.starts].astype(
+                np.int64
+            )
+        )
     p = specs.predictions
     there = {"visibility", *p.maps, *(TRUE + name for name in known_maps(p))}
     there |= {"azimuth_bins"} if p.azimuth_bins is not None else set()
@@ -111,11 +136,20 @@ def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
 
 
 def _make(name: str, specs: EpisodeSpecs) -> Policy:
-    p, plain = specs.predictions, name.partition("@")[0]
+    p = specs.predictions
+    plain = name.partition("@")[0]
     if name in MAP_ORACLES:
         return _oracle(specs, *MAP_ORACLES[name])
     if name in GAINS:
-        return OracleGain(p.sphere, p.log_evidence, len(p.classes), p.labels, specs.objects, GAINS[name], p.calibration)
+        return OracleGain(
+            p.sphere,
+            p.log_evidence,
+            len(p.classes),
+            p.labels,
+            specs.objects,
+            GAINS[name],
+            p.calibration,
+        )
     if measured := TRUE_MEASURE.fullmatch(name):
         values = true_measure(p, measured[1])[specs.objects].astype(np.float64)
         return OracleMeasure(p.sphere, values, measured[2] == "-peak")
@@ -127,31 +161,41 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
         return _oracle(specs, true, base, how)
     if true and base.isidentifier():
         there = ", ".join(f"{TRUE}{known}" for known in known_maps(p))
-        raise EntryError(f"no true map is called {name!r}; there are {there}, and more after nextview measure")
+        raise EntryError(
+            f"no true map is called {name!r}; there are {there}, and more after nextview measure"
+        )
     known = plain in policy_names() or map_policy(plain, p.sphere, (), p.maps) is not None
     card = plain.removeprefix(VISIBLE)
     if known or card in bundled_policies() or card.endswith(".json") or ":" in name:
         return make_policy(name, p.sphere, specs.valley_classes(plain), p.classes, p.maps)
     if plain == DISCRIMINATE:
         raise EntryError(
-            "the policy discriminate needs the memory of taught things that made these predictions: name its models, "
-            "--models FOLDER (or ycb), or its card, --policies FOLDER/memory.json"
+            "the policy discriminate needs the memory of taught things that made these predictions:"
+            " name its models, --models FOLDER (or ycb), or its card, --policies FOLDER/memory.json"
         )
     names = [*policy_names(), *map_policy_names(p.maps), *bundled_policies(), *ORACLES]
     names += ["true-MEASURE-all", *(f"{kind}-K" for kind in FIXED)]
-    raise EntryError(f"no policy is called {name!r}{did_you_mean(name, names) or '; there are ' + ', '.join(names)}")
+    raise EntryError(
+        "no policy is called"
+        f" {name!r}{did_you_mean(name, names) or '; there are ' + ', '.join(names)}"
+    )
 
 
 def _oracle(t: EpisodeSpecs, true: str, base: str, how: str) -> Policy:
-    """The oracle by the map ``base``, the true one where ``true`` is TRUE; ``how`` ends its name."""
-    sphere, valleys = t.predictions.sphere, t.valley_classes(base)
+    """The oracle by the map ``base``, the true one where ``true`` is TRUE; ``how`` ends its
+    name.
+    """
+    sphere = t.predictions.sphere
+    valleys = t.valley_classes(base)
     if how == "-oracle-valley":
         return OracleValley(sphere, t.labels, valleys, true + base)
     return MapPeak(sphere, true + base, () if how == "-peak" else valleys)
 
 
 def _ready(name: str, specs: EpisodeSpecs) -> bool:
-    """Whether an entry is for these classes and views, and the predictions and their view store hold what it needs."""
+    """Whether an entry is for these classes and views, and the predictions and their view store
+    hold what it needs.
+    """
     try:
         entry_policy(name, specs)
     except (EntryError, OtherUseError):
@@ -159,14 +203,24 @@ def _ready(name: str, specs: EpisodeSpecs) -> bool:
     return True
 
 
-def fixed_views(name: str, specs: EpisodeSpecs, rng: np.random.Generator) -> NDArray[np.int64] | None:
-    """The views of each episode in order, (E, k) int64; None if the name is not one of fixed views."""
+def fixed_views(
+    name: str, specs: EpisodeSpecs, rng: np.random.Generator
+) -> NDArray[np.int64] | None:
+    """The views of each episode in order, (E, k) int64; None if the name is not one of fixed
+    views.
+    """
     match = re.fullmatch(rf"({'|'.join([*FIXED, 'true-[a-z0-9_]+'])})-(\d+)", name)
     if not match:
         return None
-    p, objects, kind, k = specs.predictions, specs.objects, match[1], int(match[2])
+    p = specs.predictions
+    objects = specs.objects
+    kind = match[1]
+    k = int(match[2])
     if not 1 <= k <= len(p.sphere):
-        raise EntryError(f"{name}: the sphere has {len(p.sphere)} views, so between 1 and {len(p.sphere)} can be taken")
+        raise EntryError(
+            f"{name}: the sphere has {len(p.sphere)} views, so between 1 and {len(p.sphere)} can be"
+            " taken"
+        )
     if kind == "orbit":
         return orbit(p.sphere, specs.starts, k)
     if kind == "random-fixed":

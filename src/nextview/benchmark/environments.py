@@ -1,6 +1,8 @@
-"""Gymnasium environments: learn, or judge, a policy of your own. Importing this registers them; docs/environments.md.
+"""Gymnasium environments: learn, or judge, a policy of your own. Importing this registers them;
+docs/environments.md.
 
-- ``nextview/Recognise-v0``: over a file of predictions, thousands of episodes in one batch, nothing is rendered.
+- ``nextview/Recognise-v0``: over a file of predictions, thousands of episodes in one batch, nothing
+is rendered.
 - ``nextview/RecogniseMesh-v0``: over meshes, rendered and shown to the networks as the agent goes.
 """
 
@@ -9,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +25,16 @@ from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning.rollout import OBJECTIVES, value_of
 from nextview.policies.base import EpisodeState
-from nextview.policies.gain import INPUTS, VISIBILITY, Frame, features, maps_of, mirrored_features, ordered, origin
+from nextview.policies.gain import (
+    INPUTS,
+    VISIBILITY,
+    Frame,
+    features,
+    maps_of,
+    mirrored_features,
+    ordered,
+    origin,
+)
 from nextview.policies.learned_tables import cells_from
 from nextview.recognition.belief import Calibration, FixedLength, Stopping
 from nextview.recognition.evidence import Evidence
@@ -43,30 +54,50 @@ Rows = NDArray[np.int64]
 Source = str | Path | Predictions
 CAMERAS = 16  # meshes that are kept ready to be looked at
 _HERE = "nextview.benchmark.environments"
-gymnasium.register("nextview/Recognise-v0", f"{_HERE}:RecogniseEnv", vector_entry_point=f"{_HERE}:RecogniseVectorEnv")
+gymnasium.register(
+    "nextview/Recognise-v0",
+    f"{_HERE}:RecogniseEnv",
+    vector_entry_point=f"{_HERE}:RecogniseVectorEnv",
+)
 gymnasium.register("nextview/RecogniseMesh-v0", f"{_HERE}:RecogniseMeshEnv")
-Split = Literal["train", "test"] | None  # objects to learn from, or objects to judge by; None for all
+# objects to learn from, or objects to judge by; None for all
+Split = Literal["train", "test"] | None
 Info = dict[str, Any]
-FAR = 100.0  # bound of the observation space for what a map network says; the networks of this project stay far below
+# bound of the observation space for what a map network says; the networks of this project stay far
+# below
+FAR = 100.0
 
 
 @dataclass(frozen=True)
 class Rules:
-    """What the agent sees, what it is paid for, and when an episode ends."""
+    """What the agent sees, what it is paid for, and when an episode ends.
 
-    # of an observation: "belief", "view" (what the last one alone says), "place" (the ring and which views were taken),
-    # "azimuth_bin", and predicted maps by name ("lem", "view_area-sphere")
+    Attributes:
+        inputs: of an observation: "belief", "view" (what the last one alone says), "place" (the
+            ring and which views were taken), "azimuth_bin", and predicted maps by name ("lem",
+            "view_area-sphere").
+        frame: where azimuths are counted from: or the "object" as it is believed to be turned.
+        objective: or "belief" in the true class, or its "log-belief": what is paid is the change by
+            a view.
+        max_views: at most, at least 2; the first is not the agent's.
+        threshold: belief that ends an episode after the second view or later; None takes all views.
+        view_price: taken from the reward for each view.
+        travel_price: taken from it for each grid cell of travel.
+    """
+
     inputs: tuple[str, ...] = ("belief", "view", "place")
-    frame: Frame = "camera"  # where azimuths are counted from: or the "object" as it is believed to be turned
-    objective: str = "right"  # or "belief" in the true class, or its "log-belief": what is paid is the change by a view
-    max_views: int = 5  # at most, at least 2; the first is not the agent's
-    threshold: float | None = None  # belief that ends an episode after the second view or later; None takes all views
-    view_price: float = 0.0  # taken from the reward for each view
-    travel_price: float = 0.0  # taken from it for each grid cell of travel
+    frame: Frame = "camera"
+    objective: str = "right"
+    max_views: int = 5
+    threshold: float | None = None
+    view_price: float = 0.0
+    travel_price: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.inputs or VISIBILITY in self.inputs:
-            raise UsageError(f"inputs are some of {', '.join(INPUTS)} and maps, not {', '.join(self.inputs)}")
+            raise UsageError(
+                f"inputs are some of {', '.join(INPUTS)} and maps, not {', '.join(self.inputs)}"
+            )
         for value, known in ((self.frame, get_args(Frame)), (self.objective, OBJECTIVES)):
             if value not in known:
                 raise UsageError(f"{value!r} is none of {', '.join(known)}")
@@ -88,7 +119,9 @@ class Rules:
 
 @dataclass(frozen=True)
 class AfterAction(Stopping):
-    """As ``Stopping``, but never at the first view: an environment has no episode without an action."""
+    """As ``Stopping``, but never at the first view: an environment has no episode without an
+    action.
+    """
 
     def threshold_at(self, n_views: NDArray[np.int64] | int) -> NDArray[np.float64]:
         """See ``Stopping``; infinity for one view."""
@@ -96,9 +129,15 @@ class AfterAction(Stopping):
 
 
 def rows(values: Any, n: int, below: int, what: str) -> Rows:
-    """What an agent or a user chose, ``n`` whole numbers from 0 to below ``below``; (n,), or one number for one."""
+    """What an agent or a user chose, ``n`` whole numbers from 0 to below ``below``; (n,), or one
+    number for one.
+    """
     array = np.atleast_1d(np.asarray(values))
-    if array.shape != (n,) or array.dtype.kind not in "iu" or not ((array >= 0) & (array < below)).all():
+    if (
+        array.shape != (n,)
+        or array.dtype.kind not in "iu"
+        or not ((array >= 0) & (array < below)).all()
+    ):
         many = "a whole number" if n == 1 else f"{n} whole numbers"
         raise UsageError(f"{what}: {many} from 0 to {below - 1}, not {one_line(repr(values))}")
     return array.astype(np.int64)
@@ -120,70 +159,101 @@ class Task:
         whole(self.rules.max_views, "the number of views", 2, len(self.sphere))
 
     def begin(self, n: int, rng: np.random.Generator, options: Info | None = None) -> "Cohort":
-        """Begin ``n`` episodes: the options of ``reset`` may name each "object" and "start"; else they are drawn."""
+        """Begin ``n`` episodes: the options of ``reset`` may name each "object" and "start";
+        else they are drawn.
+        """
         weight = 1 / np.bincount(self.labels)[self.labels]
         chance = weight / weight.sum() if self.balanced else None
-        objects, starts = rng.choice(len(self.labels), n, p=chance), rng.integers(len(self.sphere), size=n)
+        objects = rng.choice(len(self.labels), n, p=chance)
+        starts = rng.integers(len(self.sphere), size=n)
         given = {"object": objects, "start": starts} | (options or {})
         below = {"object": len(self.labels), "start": len(self.sphere)}
         return Cohort(self, *(rows(given[name], n, most, name) for name, most in below.items()))
 
     @property
     def observation_space(self) -> gymnasium.spaces.Box:
-        """Of the numbers that ``policies.gain.features`` makes, (D,) float32; all but the maps from 0 to 1."""
-        c, rules = len(self.classes), self.rules
-        widths = {name: len(mirrored_features(self.sphere, c, (name,), rules.frame)) for name in ordered(rules.inputs)}
-        high = np.concatenate([np.full(wide, FAR if name in rules.maps else 1.0) for name, wide in widths.items()])
-        return gymnasium.spaces.Box(np.where(high > 1, -FAR, 0).astype(np.float32), high.astype(np.float32))
+        """Of the numbers that ``policies.gain.features`` makes, (D,) float32; all but the maps
+        from 0 to 1.
+        """
+        c = len(self.classes)
+        rules = self.rules
+        widths = {
+            name: len(mirrored_features(self.sphere, c, (name,), rules.frame))
+            for name in ordered(rules.inputs)
+        }
+        high = np.concatenate(
+            [np.full(wide, FAR if name in rules.maps else 1.0) for name, wide in widths.items()]
+        )
+        return gymnasium.spaces.Box(
+            np.where(high > 1, -FAR, 0).astype(np.float32), high.astype(np.float32)
+        )
 
     @property
     def action_space(self) -> gymnasium.spaces.Discrete:
-        """Where to go: a ring, and how many azimuth steps ahead: ``ring * azimuths + steps``, V of them."""
+        """Where to go: a ring, and how many azimuth steps ahead: ``ring * azimuths + steps``, V
+        of them.
+        """
         return gymnasium.spaces.Discrete(len(self.sphere))
 
 
-def replayed(predictions: Source, split: Split = "train", balanced: bool = False, rules: Rules = Rules()) -> Task:
-    """The task of recognising the objects of one split, each shape once for "train"; None takes all objects.
+def replayed(
+    predictions: Source, split: Split = "train", balanced: bool = False, rules: Rules = Rules()
+) -> Task:
+    """The task of recognising the objects of one split, each shape once for "train"; None takes all
+    objects.
 
-    ``predictions`` to learn from are of objects that the recogniser was not trained on (``nextview predict
-    --held-out``). Of predictions that name no splits, as those of taught things, "train" takes all. ``balanced`` draws
-    every class equally often. PredictionsError: no objects of that split, no such map
-    or azimuth bins.
+    ``predictions`` to learn from are of objects that the recogniser was not trained on (``nextview
+    predict --held-out``). Of predictions that name no splits, as those of taught things, "train"
+    takes all. ``balanced`` draws every class equally often. PredictionsError: no objects of that
+    split, no such map or azimuth bins.
     """
     p = predictions if isinstance(predictions, Predictions) else Predictions.load(Path(predictions))
     if split == "train" and not p.splits.any():
-        log.warning("the predictions name no splits, as those of taught things: all %d objects are taken", len(p))
+        log.warning(
+            "the predictions name no splits, as those of taught things: all %d objects are taken",
+            len(p),
+        )
         split = None
     p = p if split is None else p.of_split(split)
     p = p.deduplicate() if split == "train" else p
     for name in rules.maps:
         if name not in p.maps:
             known = ", ".join((*INPUTS, *in_order(p.maps)))
-            raise PredictionsError(f"these predictions hold no map {name!r}; inputs are some of {known}")
+            raise PredictionsError(
+                f"these predictions hold no map {name!r}; inputs are some of {known}"
+            )
     if ("azimuth_bin" in rules.inputs or rules.frame == "object") and p.azimuth_bins is None:
-        raise PredictionsError("these predictions hold no azimuth bins, which the inputs or the frame need")
+        raise PredictionsError(
+            "these predictions hold no azimuth bins, which the inputs or the frame need"
+        )
     p = replace(p, maps={name: p.maps[name] for name in rules.maps})
     return Task(p.labels, p.classes, p.sphere, p.calibration, p.evidence, rules, balanced)
 
 
 @dataclass
 class Asked:
-    """The policy of a cohort: goes where the actions want, or as near to there as a view is free."""
+    """The policy of a cohort: goes where the actions want, or as near to there as a view is
+    free.
+    """
 
     sphere: ViewSphere
     views: Rows
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Rows:
-        return np.where(state.free, self.sphere.travel[self.views[state.episodes]], np.inf).argmin(1)
+        return np.where(state.free, self.sphere.travel[self.views[state.episodes]], np.inf).argmin(
+            1
+        )
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What the agent is handed after a view in A episodes: (A, D) float32, and change of the objective and price, (A,).
+    """What the agent is handed after a view in A episodes: (A, D) float32, and change of the
+    objective and price, (A,).
 
-    ``info`` has for each: "object", "view", "n_views", "travel" (cells so far), "answer", its "confidence",
-    "prediction_target" and "action_mask", the actions that lead to a view not taken yet, (A, V) int8.
+    ``info`` has for each: "object", "view", "n_views", "travel" (cells so far), "answer", its
+    "confidence", "prediction_target" and "action_mask", the actions that lead to a view not taken
+    yet, (A, V) int8.
     """
 
     observation: NDArray[np.float32]
@@ -194,21 +264,33 @@ class Seen:
 
 
 class Cohort:
-    """B episodes side by side, all at the same view. ``first`` is what is seen before any action."""
+    """B episodes side by side, all at the same view.
+
+    ``first`` is what is seen before any action.
+    """
 
     def __init__(self, task: Task, objects: Rows, starts: Rows) -> None:
-        self.task, self.objects = task, objects
+        self.task = task
+        self.objects = objects
         self._asked = Asked(task.sphere, np.array(starts))
-        rng, stopping = np.random.default_rng(0), task.rules.stopping(task.calibration)  # nothing is drawn
+        # nothing is drawn
+        rng = np.random.default_rng(0)
+        stopping = task.rules.stopping(task.calibration)
         self.episodes = Episodes(task.sphere, self._asked, starts, stopping, rng, task.calibration)
         self._visited = np.zeros((len(objects), len(task.sphere)), bool)
-        self._value, self._travel = np.zeros(len(objects)), np.zeros(len(objects))
+        self._value = np.zeros(len(objects))
+        self._travel = np.zeros(len(objects))
         self.first = self._look(np.zeros(len(objects)))
 
     def step(self, actions: Rows) -> Seen:
-        """Go on in each running episode; where a view was taken before, to the nearest one that was not."""
-        sphere, running, rules = self.task.sphere, self.episodes.running, self.task.rules
-        before = self.episodes.steps[-1].views[~self.episodes.steps[-1].stopped]  # ``current`` is what comes next
+        """Go on in each running episode; where a view was taken before, to the nearest one that
+        was not.
+        """
+        sphere = self.task.sphere
+        running = self.episodes.running
+        rules = self.task.rules
+        # ``current`` is what comes next
+        before = self.episodes.steps[-1].views[~self.episodes.steps[-1].stopped]
         self._asked.views[running] = self._reached[np.arange(len(running)), actions]
         self.episodes.keep_choice(self.episodes.next_choice())
         way = sphere.travel[before, self.episodes.current[running]]
@@ -216,16 +298,24 @@ class Cohort:
         return self._look(rules.view_price + rules.travel_price * way)
 
     def _look(self, price: NDArray[np.float64]) -> Seen:
-        task, running, k = self.task, self.episodes.running, len(self.episodes.steps) + 1
-        sphere, calibration, classes = task.sphere, task.calibration, len(task.classes)
-        objects, views = self.objects[running], self.episodes.current[running]
+        task = self.task
+        running = self.episodes.running
+        k = len(self.episodes.steps) + 1
+        sphere = task.sphere
+        calibration = task.calibration
+        classes = len(task.classes)
+        objects = self.objects[running]
+        views = self.episodes.current[running]
         step = self.episodes.update(task.observe(objects, views))
         n_seen = np.maximum(step.seen, 1)
         self._visited[running, views] = True
-        visited, labels = self._visited[running], task.labels[objects]
+        visited = self._visited[running]
+        labels = task.labels[objects]
         azimuth_bins = calibration.azimuth_bins(step.total, n_seen, classes, sphere.azimuth[views])
         state = EpisodeState(views, visited, step.belief, step.evidence, k, running, azimuth_bins)
-        value = value_of(calibration.log_belief(step.total, n_seen, classes), labels, task.rules.objective)
+        value = value_of(
+            calibration.log_belief(step.total, n_seen, classes), labels, task.rules.objective
+        )
         change = value - self._value[running] if k > 1 else np.zeros(len(running))
         self._value[running] = value
         reached = cells_from(sphere)[origin(sphere, state, task.rules.frame)]
@@ -247,11 +337,12 @@ class Cohort:
 class TaskEnv(gymnasium.Env[Any, Any]):
     """One episode at a time of any task."""
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}  # Gymnasium's own form
 
     def __init__(self, task: Task) -> None:
         self.task = task
-        self.observation_space, self.action_space = task.observation_space, task.action_space
+        self.observation_space = task.observation_space
+        self.action_space = task.action_space
         self._cohort: Cohort | None = None
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
@@ -261,7 +352,13 @@ class TaskEnv(gymnasium.Env[Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
         seen = self.go(action)
-        return self.observed(seen), float((seen.change - seen.price)[0]), bool(seen.ended[0]), False, info_of(seen)
+        return (
+            self.observed(seen),
+            float((seen.change - seen.price)[0]),
+            bool(seen.ended[0]),
+            False,
+            info_of(seen),
+        )
 
     def go(self, action: Any) -> Seen:
         """What is seen after an action."""
@@ -280,64 +377,108 @@ def info_of(seen: Seen) -> Info:
 
 
 class RecogniseEnv(TaskEnv):
-    """Recognise an object by few views, looked up in predictions: see ``replayed``; ``rules`` as of ``Rules``."""
+    """Recognise an object by few views, looked up in predictions: see ``replayed``; ``rules`` as
+    of ``Rules``.
+    """
 
-    def __init__(self, predictions: Source, split: Split = "train", balanced: bool = False, **rules: Any) -> None:
+    def __init__(
+        self, predictions: Source, split: Split = "train", balanced: bool = False, **rules: Any
+    ) -> None:
         super().__init__(replayed(predictions, split, balanced, Rules(**rules)))
 
 
 class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
-    """Many episodes of a task at once; as many cohorts as there are numbers of views are under way at most."""
+    """Many episodes of a task at once; as many cohorts as there are numbers of views are under
+    way at most.
+    """
 
-    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": [],
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
 
     def __init__(self, task: Task, num_envs: int) -> None:
-        self.task, self.num_envs = task, whole(num_envs, "the number of environments", 1)
-        self.single_observation_space, self.single_action_space = task.observation_space, task.action_space
+        self.task = task
+        self.num_envs = whole(num_envs, "the number of environments", 1)
+        self.single_observation_space = task.observation_space
+        self.single_action_space = task.action_space
         self.observation_space = batch_space(task.observation_space, num_envs)
         self.action_space = batch_space(task.action_space, num_envs)
         self._cohorts: list[tuple[Cohort, Rows]] = []
 
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[NDArray[np.float32], Info]:
+    def reset(
+        self, *, seed: int | None = None, options: Info | None = None
+    ) -> tuple[NDArray[np.float32], Info]:
         super().reset(seed=seed)
         cohort = self.task.begin(self.num_envs, self.np_random, options)
         self._cohorts = [(cohort, np.arange(self.num_envs))]
         return cohort.first.observation, cohort.first.info
 
-    def step(self, actions: Any) -> tuple[NDArray[np.float32], NDArray, NDArray[np.bool_], NDArray[np.bool_], Info]:
+    def step(
+        self, actions: Any
+    ) -> tuple[NDArray[np.float32], NDArray, NDArray[np.bool_], NDArray[np.bool_], Info]:
         seen, info = self.go(actions)
-        return seen.observation, seen.change - seen.price, seen.ended, np.zeros(self.num_envs, bool), info
+        return (
+            seen.observation,
+            seen.change - seen.price,
+            seen.ended,
+            np.zeros(self.num_envs, bool),
+            info,
+        )
 
     def go(self, actions: Any) -> tuple[Seen, Info]:
-        """What is seen in each episode; where one ended, the observation and the info are those of the next."""
+        """What is seen in each episode; where one ended, the observation and the info are those
+        of the next.
+        """
         if not self._cohorts:
             raise SessionError("no episode is under way; call reset")
         actions = rows(actions, self.num_envs, len(self.task.sphere), "actions")
         wheres = [members[cohort.episodes.running] for cohort, members in self._cohorts]
-        parts = [cohort.step(actions[where]) for (cohort, _), where in zip(self._cohorts, wheres, strict=True)]
+        parts = [
+            cohort.step(actions[where])
+            for (cohort, _), where in zip(self._cohorts, wheres, strict=True)
+        ]
         order = np.argsort(np.concatenate(wheres))
         names = ("observation", "change", "price", "ended")
-        joined = {name: np.concatenate([getattr(part, name) for part in parts])[order] for name in names}
-        info = {name: np.concatenate([part.info[name] for part in parts])[order] for name in parts[0].info}
+        joined = {
+            name: np.concatenate([getattr(part, name) for part in parts])[order] for name in names
+        }
+        info = {
+            name: np.concatenate([part.info[name] for part in parts])[order]
+            for name in parts[0].info
+        }
         seen = Seen(**joined, info=info)
-        self._cohorts = [(cohort, members) for cohort, members in self._cohorts if len(cohort.episodes.running)]
+        self._cohorts = [
+            (cohort, members) for cohort, members in self._cohorts if len(cohort.episodes.running)
+        ]
         over = np.flatnonzero(seen.ended)
         if len(over) == 0:
             return seen, info
-        last, now = seen.observation.copy(), {name: values.copy() for name, values in info.items()}
+        last = seen.observation.copy()
+        now = {name: values.copy() for name, values in info.items()}
         fresh = self.task.begin(len(over), self.np_random)
         self._cohorts.append((fresh, over))
         seen.observation[over] = fresh.first.observation
         for name, values in fresh.first.info.items():
             now[name][over] = values
-        return seen, now | {"final_obs": last, "_final_obs": seen.ended, "final_info": info, "_final_info": seen.ended}
+        return seen, now | {
+            "final_obs": last,
+            "_final_obs": seen.ended,
+            "final_info": info,
+            "_final_info": seen.ended,
+        }
 
 
 class RecogniseVectorEnv(TaskVectorEnv):
     """See ``RecogniseEnv``, of which this runs ``num_envs`` side by side."""
 
     def __init__(
-        self, num_envs: int, predictions: Source, split: Split = "train", balanced: bool = False, **rules: Any
+        self,
+        num_envs: int,
+        predictions: Source,
+        split: Split = "train",
+        balanced: bool = False,
+        **rules: Any,
     ) -> None:
         super().__init__(replayed(predictions, split, balanced, Rules(**rules)), num_envs)
 
@@ -345,12 +486,13 @@ class RecogniseVectorEnv(TaskVectorEnv):
 class RecogniseMeshEnv(TaskEnv):
     """Recognise an object by few views of its mesh.
 
-    ``meshes`` are a folder, CLASS/train|test/MESH or CLASS/MESH; ``split`` None is for one without splits, as are the
-    samples, the default. ``models`` are bundled ones by name, or a folder; ``viewpoints`` a layout of
-    ``ViewSphere.named``. With ``depth`` the observation is {"state": (D,), "depth": (size, size) float32, object radii,
-    0 where there is no object}; ``size`` is a multiple of what the networks take, 112 for the bundled ones.
-    ``balanced`` draws every class equally often; ``rules`` are options of ``Rules``. DatasetError: no such meshes, or a
-    class that the recogniser does not know.
+    ``meshes`` are a folder, CLASS/train|test/MESH or CLASS/MESH; ``split`` None is for one without
+    splits, as are the samples, the default. ``models`` are bundled ones by name, or a folder;
+    ``viewpoints`` a layout of ``ViewSphere.named``. With ``depth`` the observation is {"state":
+    (D,), "depth": (size, size) float32, object radii, 0 where there is no object}; ``size`` is a
+    multiple of what the networks take, 112 for the bundled ones. ``balanced`` draws every class
+    equally often; ``rules`` are options of ``Rules``. DatasetError: no such meshes, or a class that
+    the recogniser does not know.
     """
 
     def __init__(
@@ -365,25 +507,43 @@ class RecogniseMeshEnv(TaskEnv):
         **rules: Any,
     ) -> None:
         whole(size, "the side of an image", 1)
-        given, found, sphere = Rules(**rules), find_models(models), ViewSphere.named(viewpoints)
-        self._models = Models(NetworkRecogniser(found.recogniser), open_maps(found.maps, given.maps))
-        classes, calibration = self._models.classes, self._models.recogniser.calibration
-        objects: list[tuple[str, Callable[[], Mesh]]] = [(name, partial(sample_mesh, name)) for name in SAMPLES]
+        given = Rules(**rules)
+        found = find_models(models)
+        sphere = ViewSphere.named(viewpoints)
+        self._models = Models(
+            NetworkRecogniser(found.recogniser), open_maps(found.maps, given.maps)
+        )
+        classes = self._models.classes
+        calibration = self._models.recogniser.calibration
+        objects: list[tuple[str, Callable[[], Mesh]]] = [
+            (name, partial(sample_mesh, name)) for name in SAMPLES
+        ]
         if meshes is not None:
             entries = [e for e in list_dataset(Path(meshes)) if split in (None, e.split)]
             objects = [(e.label, partial(load_mesh, e.path)) for e in entries]
         if not objects:
-            raise DatasetError(f"{meshes}: holds no meshes of the split {split!r}; split=None takes all that there are")
+            raise DatasetError(
+                f"{meshes}: holds no meshes of the split {split!r}; split=None takes all that"
+                " there are"
+            )
         for label, _ in objects:
             if label not in classes:
-                raise DatasetError(f"the recogniser knows no class {label!r}; it knows {', '.join(classes)}")
+                raise DatasetError(
+                    f"the recogniser knows no class {label!r}; it knows {', '.join(classes)}"
+                )
         labels = np.array([classes.index(label) for label, _ in objects])
-        self._camera = lru_cache(CAMERAS)(lambda k: SimulatedCamera(objects[k][1](), size, sphere.distance))
-        super().__init__(Task(labels, classes, sphere, calibration, self._rendered, given, balanced))
+        self._camera = lru_cache(CAMERAS)(
+            lambda k: SimulatedCamera(objects[k][1](), size, sphere.distance)
+        )
+        super().__init__(
+            Task(labels, classes, sphere, calibration, self._rendered, given, balanced)
+        )
         self._depth = depth
         if depth:
             image = gymnasium.spaces.Box(0, np.float32(sphere.distance + 1), (size, size))
-            self.observation_space = gymnasium.spaces.Dict({"state": self.task.observation_space, "depth": image})
+            self.observation_space = gymnasium.spaces.Dict(
+                {"state": self.task.observation_space, "depth": image}
+            )
 
     def _rendered(self, objects: Rows, views: Rows) -> Evidence:
         poses = self.task.sphere.poses

@@ -1,4 +1,6 @@
-"""How good the models under the policies are: every view of every object judged, no policy asked."""
+"""How good the models under the policies are: every view of every object judged, no policy
+asked.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,59 +25,87 @@ with extras():
 
 Index = NDArray[np.int64]
 Float = NDArray[np.float64]
-RELIABILITY_LOOKS = (1, 2, 5)  # views after which confidence is compared with accuracy, beside all of them
+# views after which confidence is compared with accuracy, beside all of them
+RELIABILITY_LOOKS = (1, 2, 5)
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The results as long tables; intervals are 95 % bootstrap intervals over objects, ``low`` to ``high``."""
+    """The results as long tables; intervals are 95 % bootstrap intervals over objects, ``low``
+    to ``high``.
 
-    # by n_views (1, or V: all logits summed), label (empty: all) and measure: ``accuracy``; ``clean_accuracy``, without
-    # the objects whose very mesh also has another label; ``shape_accuracy``, where the recogniser is not told the size;
-    # with ``class_`` before it the mean over classes
+    Attributes:
+        accuracy: by n_views (1, or V: all logits summed), label (empty: all) and measure:
+            ``accuracy``; ``clean_accuracy``, without the objects whose very mesh also has another
+            label; ``shape_accuracy``, where the recogniser is not told the size; with ``class_``
+            before it the mean over classes.
+        fusion: the same, mean confidence and calibration error of so many random views fused.
+        confusion: answers by n_views, label and answer; a view is an answer, or a whole object.
+        reliability: confidence and accuracy by n_views and bin.
+        maps: scores (``metrics.map_errors``) by map, by, label. ``by`` is the network, or the mean
+            of the true maps of these very objects: over all, or for the true class at the view.
+        left_out: for each map that is not judged, or not of all objects, why.
+    """
+
     accuracy: pd.DataFrame
-    fusion: pd.DataFrame  # the same, mean confidence and calibration error of so many random views fused
-    confusion: pd.DataFrame  # answers by n_views, label and answer; a view is an answer, or a whole object
-    reliability: pd.DataFrame  # confidence and accuracy by n_views and bin
-    # scores (``metrics.map_errors``) by map, by, label. ``by`` is the network, or the mean of the true maps of these
-    # very objects: over all, or for the true class at the view
+    fusion: pd.DataFrame
+    confusion: pd.DataFrame
+    reliability: pd.DataFrame
     maps: pd.DataFrame
-    left_out: dict[str, str]  # for each map that is not judged, or not of all objects, why
+    left_out: dict[str, str]
 
     def tables(self) -> dict[str, pd.DataFrame]:
         """The tables by name."""
-        return {name: table for name, table in vars(self).items() if isinstance(table, pd.DataFrame)}
+        return {
+            name: table for name, table in vars(self).items() if isinstance(table, pd.DataFrame)
+        }
 
 
 def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluation:
     """Judge the recogniser and the map networks behind some predictions."""
     if len(p.classes) < 2:
-        raise ResultsError(f"the recogniser knows one class only, {p.classes[0]}: there is nothing to tell apart")
+        raise ResultsError(
+            f"the recogniser knows one class only, {p.classes[0]}: there is nothing to tell apart"
+        )
     if samples < 1:
         raise ResultsError(f"at least one sample of the bootstrap is needed, not {samples}")
     weights = st.resample(len(p), samples, rng)
     right, confidence = fused_views(p.log_evidence, p.labels, p.calibration, rng, len(p.classes))
     judged, (maps, left_out) = _judged(p), _maps(p, weights)
-    accuracy, fusion = _accuracy(p, judged, weights), _fusion(p, right, confidence, weights)
-    return Evaluation(accuracy, fusion, _confusion(p, judged), _reliability(right, confidence), maps, left_out)
+    accuracy = _accuracy(p, judged, weights)
+    fusion = _fusion(p, right, confidence, weights)
+    return Evaluation(
+        accuracy, fusion, _confusion(p, judged), _reliability(right, confidence), maps, left_out
+    )
 
 
 def _judged(p: Predictions) -> dict[int, NDArray]:
-    """Logits of single views, and log-beliefs of all views together, by the number of views, each (N, answers, C)."""
-    fused = p.calibration.log_belief(p.log_evidence.astype(np.float64).sum(1), len(p.sphere), len(p.classes))
+    """Logits of single views, and log-beliefs of all views together, by the number of views,
+    each (N, answers, C).
+    """
+    fused = p.calibration.log_belief(
+        p.log_evidence.astype(np.float64).sum(1), len(p.sphere), len(p.classes)
+    )
     return {1: p.logits, len(p.sphere): fused[:, None]}
 
 
 def fused_views(
-    log_evidence: NDArray[np.floating], labels: Index, calibration: Calibration, rng: np.random.Generator, classes: int
+    log_evidence: NDArray[np.floating],
+    labels: Index,
+    calibration: Calibration,
+    rng: np.random.Generator,
+    classes: int,
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
     """Fuse 1, 2, ... V views of each object, in a random order and in all its rotations."""
     n, v, _ = log_evidence.shape
     order = rng.permuted(np.tile(np.arange(v), (n, 1)), axis=1)
     shuffled = np.take_along_axis(log_evidence.astype(np.float64), order[:, :, None], axis=1)
-    right, confidence = np.empty((v, n, v), bool), np.empty((v, n, v), np.float32)
+    right = np.empty((v, n, v), bool)
+    confidence = np.empty((v, n, v), np.float32)
     for turn in range(v):
-        belief = calibration.belief(np.roll(shuffled, -turn, axis=1).cumsum(1), np.arange(1, v + 1), classes)
+        belief = calibration.belief(
+            np.roll(shuffled, -turn, axis=1).cumsum(1), np.arange(1, v + 1), classes
+        )
         right[:, :, turn] = (belief.argmax(2) == labels[:, None]).T
         confidence[:, :, turn] = belief.max(2).T
     return right, confidence
@@ -84,17 +114,22 @@ def fused_views(
 def _means(
     top: Float, bottom: Float, labels: Index, classes: tuple[str, ...], weights: Float | None
 ) -> Iterator[tuple[str, str, Float, Float, Float]]:
-    """Ratios of sums over objects (N, M): over all of them, as the mean over classes ("class_"), and in each class."""
+    """Ratios of sums over objects (N, M): over all of them, as the mean over classes ("class_"),
+    and in each class.
+    """
     every = np.ones(len(labels), bool)
     in_classes = [(classes[index], "", labels == index) for index in np.unique(labels)]
     for label, over, here in (("", "", every), ("", "class_", every), *in_classes):
         drawn = np.zeros((1, len(labels))) if weights is None else weights
-        value, samples = st.estimate(top[here], bottom[here], drawn[:, here], labels if over else None)
+        value, samples = st.estimate(
+            top[here], bottom[here], drawn[:, here], labels if over else None
+        )
         yield label, over, value, *st.interval(samples)
 
 
 def _accuracy(p: Predictions, judged: dict[int, NDArray], weights: Float) -> pd.DataFrame:
-    one, clean = np.ones(len(p)), np.where(p.conflicting, 0.0, 1.0)
+    one = np.ones(len(p))
+    clean = np.where(p.conflicting, 0.0, 1.0)
     by_shape = {} if p.of_size is None else _judged(p.by_shape())
     best = published_recognisers(comparable_classes(p), len(p.sphere))
     rows = []
@@ -104,19 +139,42 @@ def _accuracy(p: Predictions, judged: dict[int, NDArray], weights: Float) -> pd.
             scored["shape_accuracy"] = by_shape[n_views]
         right = np.stack([(x.argmax(2) == p.labels[:, None]).mean(1) for x in scored.values()], 1)
         bottom = np.stack([clean if measure == "clean_accuracy" else one for measure in scored], 1)
-        for label, over, value, low, high in _means(right * bottom, bottom, p.labels, p.classes, weights):
+        for label, over, value, low, high in _means(
+            right * bottom, bottom, p.labels, p.classes, weights
+        ):
             here = p.labels == p.classes.index(label) if label else slice(None)
             for i, (measure, objects) in enumerate(zip(scored, bottom[here].sum(0), strict=True)):
-                beside = best[0][2] if best and (n_views, label, over, i) == (1, "", "", 0) else np.nan
-                rows.append((n_views, label, over + measure, int(objects), value[i], low[i], high[i], beside))
-    return pd.DataFrame(rows, columns=["n_views", "label", "measure", "objects", "value", "low", "high", "published"])
+                beside = (
+                    best[0][2] if best and (n_views, label, over, i) == (1, "", "", 0) else np.nan
+                )
+                rows.append(
+                    (
+                        n_views,
+                        label,
+                        over + measure,
+                        int(objects),
+                        value[i],
+                        low[i],
+                        high[i],
+                        beside,
+                    )
+                )
+    return pd.DataFrame(
+        rows,
+        columns=["n_views", "label", "measure", "objects", "value", "low", "high", "published"],
+    )
 
 
-def _fusion(p: Predictions, right: NDArray[np.bool_], confidence: NDArray[np.float32], weights: Float) -> pd.DataFrame:
+def _fusion(
+    p: Predictions, right: NDArray[np.bool_], confidence: NDArray[np.float32], weights: Float
+) -> pd.DataFrame:
     top = right.mean(2).T
     one = np.ones_like(top)
     low, high = st.interval(metrics.ratio(top, one, weights))
-    errors = [metrics.calibration_error(c.ravel(), r.ravel()) for c, r in zip(confidence, right, strict=True)]
+    errors = [
+        metrics.calibration_error(c.ravel(), r.ravel())
+        for c, r in zip(confidence, right, strict=True)
+    ]
     return pd.DataFrame(
         {
             "n_views": np.arange(1, len(right) + 1),
@@ -135,31 +193,43 @@ def _confusion(p: Predictions, judged: dict[int, NDArray]) -> pd.DataFrame:
     for n_views, logits in judged.items():
         counts = np.zeros((len(p.classes), len(p.classes)), np.int64)
         np.add.at(counts, (p.labels[:, None], logits.argmax(2)), 1)
-        rows += [(n_views, p.classes[i], p.classes[j], int(count)) for (i, j), count in np.ndenumerate(counts)]
+        rows += [
+            (n_views, p.classes[i], p.classes[j], int(count))
+            for (i, j), count in np.ndenumerate(counts)
+        ]
     return pd.DataFrame(rows, columns=["n_views", "label", "answer", "answers"])
 
 
 def _reliability(right: NDArray[np.bool_], confidence: NDArray[np.float32]) -> pd.DataFrame:
-    rows, v = [], len(right)
+    rows = []
+    v = len(right)
     for n_views in [k for k in RELIABILITY_LOOKS if k < v] + [v]:
         turns = slice(None) if n_views < v else slice(1)  # all views are the same in every order
-        belief, answers = confidence[n_views - 1, :, turns].ravel().astype(np.float64), right[n_views - 1, :, turns]
+        belief = confidence[n_views - 1, :, turns].ravel().astype(np.float64)
+        answers = right[n_views - 1, :, turns]
         sure, share, count = metrics.reliability(belief, answers.ravel())
         rows += [(n_views, i, sure[i], share[i], count[i]) for i in np.flatnonzero(count)]
     return pd.DataFrame(rows, columns=["n_views", "bin", "confidence", "accuracy", "answers"])
 
 
 def judged_objects(p: Predictions, name: str) -> Index:
-    """The objects whose true map can be told: of the confidence those that are right from any view (section 4.1.3)."""
+    """The objects whose true map can be told: of the confidence those that are right from any
+    view (section 4.1.3).
+    """
     right = p.logits.argmax(2) == p.labels[:, None]
     return np.flatnonzero(right.any(1)) if measure_of(name) == CONFIDENCE else np.arange(len(p))
 
 
 def baselines(true: NDArray[np.floating], labels: Index) -> dict[str, NDArray[np.floating]]:
-    """Maps to be measured against: the mean map, and the mean map of the class at the view, each as ``true`` is."""
+    """Maps to be measured against: the mean map, and the mean map of the class at the view, each
+    as ``true`` is.
+    """
     classes, row = np.unique(labels, return_inverse=True)
     of_class = np.stack([true[labels == index].mean(0) for index in classes])
-    return {"mean map": np.broadcast_to(true.mean((0, 1)), true.shape), "mean map of the class": of_class[row]}
+    return {
+        "mean map": np.broadcast_to(true.mean((0, 1)), true.shape),
+        "mean map of the class": of_class[row],
+    }
 
 
 def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]:
@@ -177,19 +247,29 @@ def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]
             left_out[name] = "no object is recognised from any view"
             continue
         if len(kept) < len(p):
-            left_out[name] = f"without the objects that are recognised from no view: {len(p) - len(kept)} of {len(p)}"
-        true, labels = true_map(p, name)[kept], p.labels[kept]
+            left_out[name] = (
+                f"without the objects that are recognised from no view: {len(p) - len(kept)} of"
+                f" {len(p)}"
+            )
+        true = true_map(p, name)[kept]
+        labels = p.labels[kept]
         for by, maps in {"network": predicted[kept], **baselines(true, labels)}.items():
             window = true.shape[2:]
             errors = metrics.map_errors(maps.reshape(-1, *window), true.reshape(-1, *window))
             top = np.stack([values.reshape(len(kept), -1).mean(1) for values in errors.values()], 1)
             drawn = weights[:, kept] if by == "network" else None
-            for label, over, value, low, high in _means(top, np.ones_like(top), labels, p.classes, drawn):
+            for label, over, value, low, high in _means(
+                top, np.ones_like(top), labels, p.classes, drawn
+            ):
                 for i, measure in enumerate(errors):
                     beside = None
                     if by == "network":
-                        beside = published_map(name, over + measure, comparable_classes(p), label or None)
-                    rows.append((name, by, label, over + measure, value[i], low[i], high[i], beside))
+                        beside = published_map(
+                            name, over + measure, comparable_classes(p), label or None
+                        )
+                    rows.append(
+                        (name, by, label, over + measure, value[i], low[i], high[i], beside)
+                    )
     columns = ["map", "by", "label", "measure", "value", "low", "high", "published"]
     return pd.DataFrame(rows, columns=columns).astype({"published": "float64"}), left_out
 
@@ -202,6 +282,10 @@ def scores_for_card(card: ModelCard, p: Predictions) -> dict[str, Any]:
         return metrics.recogniser_scores(p.logits, p.labels)
     kept = judged_objects(p, card.kind)
     if card.kind not in known_maps(p) or len(kept) == 0:
-        raise ResultsError(f"these predictions hold no object by which model {card.name} can be judged")
+        raise ResultsError(
+            f"these predictions hold no object by which model {card.name} can be judged"
+        )
     shape = (-1, p.sphere.rings, 3)
-    return metrics.map_scores(p.maps[card.kind][kept].reshape(shape), true_map(p, card.kind)[kept].reshape(shape))
+    return metrics.map_scores(
+        p.maps[card.kind][kept].reshape(shape), true_map(p, card.kind)[kept].reshape(shape)
+    )

@@ -1,4 +1,6 @@
-"""The stage that judges the models behind some predictions: a folder of tables and one HTML page."""
+"""The stage that judges the models behind some predictions: a folder of tables and one HTML
+page.
+"""
 
 import json
 from dataclasses import asdict, dataclass
@@ -22,28 +24,41 @@ from nextview.recognition.model_card import find_card, read_card, write_card
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """What is judged."""
+    """What is judged.
 
-    # take only the objects of this one; needed where the predictions hold several
+    Attributes:
+        split: take only the objects of this one; needed where the predictions hold several.
+        deduplicate: of objects with the same label that look the same from every view, copies of
+            one mesh, judge only the first; the published numbers count them all.
+        cards: of the models that made the predictions; their scores are noted on these.
+        samples: of the bootstrap.
+        seed: decides the bootstrap and the orders of views.
+    """
+
     split: Literal["train", "test", "val"] | None = None
-    # of objects with the same label that look the same from every view, copies of one mesh, judge only the first; the
-    # published numbers count them all
     deduplicate: bool = False
-    cards: tuple[str, ...] = ()  # of the models that made the predictions; their scores are noted on these
-    samples: int = 2000  # of the bootstrap
-    seed: int = 0  # decides the bootstrap and the orders of views
+    cards: tuple[str, ...] = ()
+    samples: int = 2000
+    seed: int = 0
 
 
 def write_evaluation(
-    predictions: Path,  # made by nextview predict
-    out: Path,  # folder for tables (.csv), settings and evaluate.html
+    predictions: Path,
+    out: Path,
     settings: EvaluationSettings = EvaluationSettings(),
     *,
-    # write every figure of the page as PDF and SVG too, and the tables as CSV and LaTeX, into this folder
     figures: Path | None = None,
-    overwrite: bool = False,  # replace the files of an earlier evaluation
+    overwrite: bool = False,
 ) -> Evaluation:
-    """Judge recogniser and maps on every view: accuracy, confusions, calibration, map scores, beside the published.
+    """Judge recogniser and maps on every view: accuracy, confusions, calibration, map scores,
+    beside the published.
+
+    Args:
+        predictions: made by nextview predict.
+        out: folder for tables (.csv), settings and evaluate.html.
+        figures: write every figure of the page as PDF and SVG too, and the tables as CSV and LaTeX,
+            into this folder.
+        overwrite: replace the files of an earlier evaluation.
 
     Raises:
         UsageError: the predictions hold several splits, and none is chosen.
@@ -56,16 +71,25 @@ def write_evaluation(
     noted = {}
     for name in settings.cards:
         card = find_card(name)
-        what = f"{'shapes' if settings.deduplicate else 'objects'}{'' if p.of_size is None else ', of known size'}"
-        scores = {f"{settings.split or p.splits[0] or 'all'} ({len(p)} {what})": scores_for_card(card, p)}
+        what = "shapes" if settings.deduplicate else "objects"
+        if p.of_size is not None:
+            what += ", of known size"
+        scores = {
+            f"{settings.split or p.splits[0] or 'all'} ({len(p)} {what})": scores_for_card(card, p)
+        }
         noted[card.card_path] = card.sha256, scores
-    made = asdict(settings) | {"predictions": predictions.name, "predictions_sha256": sha256_of(predictions)}
+    made = asdict(settings) | {
+        "predictions": predictions.name,
+        "predictions_sha256": sha256_of(predictions),
+    }
     made |= {"models": p.models, "objects": len(p)}
     found = evaluate(p, settings.samples, np.random.default_rng([settings.seed, 0]))
     with new_folder(out, overwrite, last="evaluate.json", withdraw=True) as part:
         for name, frame in found.tables().items():
             frame.to_csv(part / f"{name}.csv", index=False)
-        (part / "evaluate.json").write_text(json.dumps({"settings": made, "left_out": found.left_out}, indent=1) + "\n")
+        (part / "evaluate.json").write_text(
+            json.dumps({"settings": made, "left_out": found.left_out}, indent=1) + "\n"
+        )
         (part / "evaluate.html").write_text(page(found, p, made), encoding="utf-8")
     if figures is not None:
         write_figures(figures, _figures(found, p), found.tables(), overwrite)
@@ -73,7 +97,9 @@ def write_evaluation(
         with only_one(path):
             card = read_card(path)  # as it is by now
             if card.sha256 != sha256:
-                raise ModelError(f"{path}: became the card of another model while this ran, and is left as it is")
+                raise ModelError(
+                    f"{path}: became the card of another model while this ran, and is left as it is"
+                )
             write_card(path, replace(card, scores={**card.scores, **scores}))
     return found
 
@@ -89,11 +115,18 @@ def _figures(e: Evaluation, p: Predictions) -> dict[str, Figure]:
 
 def page(e: Evaluation, p: Predictions, settings: dict[str, Any]) -> str:
     """The whole page as text."""
-    v, curve, c = len(p.sphere), e.fusion.set_index("n_views"), p.calibration
-    counts = e.accuracy.query("n_views == 1 and measure == 'accuracy' and label != ''").set_index("label")["objects"]
+    v = len(p.sphere)
+    curve = e.fusion.set_index("n_views")
+    c = p.calibration
+    counts = e.accuracy.query("n_views == 1 and measure == 'accuracy' and label != ''").set_index(
+        "label"
+    )["objects"]
     made = {
         **origin(p, settings),
-        "calibration": f"temperature {c.temperature:.3g} for one view, correlation {c.correlation:.3g} between views",
+        "calibration": (
+            f"temperature {c.temperature:.3g} for one view, correlation {c.correlation:.3g} between"
+            " views"
+        ),
         "bootstrap": f"{settings['samples']} samples of objects; seed {settings['seed']}",
         "calibration error": "15 bins of equal width (Guo et al. 2017)",
     }
@@ -104,9 +137,16 @@ def page(e: Evaluation, p: Predictions, settings: dict[str, Any]) -> str:
         counts=counts.to_dict(),
         published=published_recognisers(comparable_classes(p), v),
         errors=curve["calibration_error"],
-        fused_views=", ".join(f"{k}: {curve.accuracy[k]:.3f}" for k in (1, 2, 5, 10, v) if k in curve.index),
-        bins=", ".join(f"{curve.calibration_error[k]:.3f} after {k}" for k in e.reliability["n_views"].unique()),
-        maps={kind: numbers(rows, "by", "label", "measure") for kind, rows in e.maps.groupby("map", sort=False)},
+        fused_views=", ".join(
+            f"{k}: {curve.accuracy[k]:.3f}" for k in (1, 2, 5, 10, v) if k in curve.index
+        ),
+        bins=", ".join(
+            f"{curve.calibration_error[k]:.3f} after {k}" for k in e.reliability["n_views"].unique()
+        ),
+        maps={
+            kind: numbers(rows, "by", "label", "measure")
+            for kind, rows in e.maps.groupby("map", sort=False)
+        },
         baselines=[by for by in e.maps["by"].unique() if by != "network"],
         figures={name: picture(figure) for name, figure in _figures(e, p).items()},
         left_out=e.left_out,

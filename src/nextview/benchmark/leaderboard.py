@@ -1,4 +1,6 @@
-"""Who leads under one threshold, which differences can be told from chance, and when there are too few objects."""
+"""Who leads under one threshold, which differences can be told from chance, and when there are
+too few objects.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,8 +12,11 @@ from nextview.checks import extras
 with extras():
     import pandas as pd
 
-SIGNIFICANT = 0.05  # a difference is called one when its p-value after Holm's correction is below this
-FEW_OBJECTS, WIDE = 200, 0.03  # with fewer objects, or wider intervals of differences in accuracy, little can be told
+# a difference is called one when its p-value after Holm's correction is below this
+SIGNIFICANT = 0.05
+# with fewer objects, or wider intervals of differences in accuracy, little can be told
+FEW_OBJECTS = 200
+WIDE = 0.03
 
 
 def headline_threshold(thresholds: Sequence[float]) -> float:
@@ -20,54 +25,77 @@ def headline_threshold(thresholds: Sequence[float]) -> float:
 
 
 def leaderboard(tables: Tables, threshold: float) -> list[Any]:
-    """The policies under one threshold, the most accurate first and those that no robot could follow last.
+    """The policies under one threshold, the most accurate first and those that no robot could
+    follow last.
 
-    Rows with policy, accuracy, its 95 % interval low to high, class_accuracy, n_views, travel (grid cells, over all
-    episodes), difference and p_holm to the reference (NaN for the reference itself), and differs: whether that is
-    significant.
+    Rows with policy, accuracy, its 95 % interval low to high, class_accuracy, n_views, travel (grid
+    cells, over all episodes), difference and p_holm to the reference (NaN for the reference
+    itself), and differs: whether that is significant.
     """
     rows = tables.summary[tables.summary["threshold"] == threshold]
     table = rows.pivot(index="policy", columns="measure", values="value")
     table = table.join(rows[rows["measure"] == "accuracy"].set_index("policy")[["low", "high"]])
-    table = table.join(_tests(tables, threshold).set_index("policy")[["difference", "p_holm"]]).reset_index()
-    table = table.rename(columns={"travel_all": "travel"}).assign(differs=table["p_holm"] < SIGNIFICANT)
+    table = table.join(
+        _tests(tables, threshold).set_index("policy")[["difference", "p_holm"]]
+    ).reset_index()
+    table = table.rename(columns={"travel_all": "travel"}).assign(
+        differs=table["p_holm"] < SIGNIFICANT
+    )
     return sorted(table.itertuples(index=False), key=lambda s: (is_oracle(s.policy), -s.accuracy))
 
 
 def promised_risks(tables: Tables) -> list[Any]:
-    """The rows of ``Tables.risks``, and broken: whether more were wrong than was promised, beyond chance."""
-    return list(tables.risks.assign(broken=tables.risks["low"] > tables.risks["risk"]).itertuples(index=False))
+    """The rows of ``Tables.risks``, and broken: whether more were wrong than was promised,
+    beyond chance.
+    """
+    return list(
+        tables.risks.assign(broken=tables.risks["low"] > tables.risks["risk"]).itertuples(
+            index=False
+        )
+    )
 
 
 def level_rows(tables: Tables) -> list[list[tuple[str, list[Any]]]]:
     """The rows of ``Tables.levels`` by level and policy, those that no robot could follow last."""
     found = []
     for _, rows in tables.levels.groupby("level", sort=False):
-        policies = [(str(name), list(mine.itertuples())) for name, mine in rows.groupby("policy", sort=False)]
+        policies = [
+            (str(name), list(mine.itertuples()))
+            for name, mine in rows.groupby("policy", sort=False)
+        ]
         found.append(sorted(policies, key=lambda policy: is_oracle(policy[0])))
     return found
 
 
 def level_differences(tables: Tables, reference: str) -> str | None:
-    """A sentence that names the policies of a robot that differ in scenes after so many views; None if none does."""
+    """A sentence that names the policies of a robot that differ in scenes after so many views;
+    None if none does.
+    """
     found = [
-        f"{policy} by {100 * row.difference:+.1f} points after {row.n_views} views under {row.level} clutter"
+        f"{policy} by {100 * row.difference:+.1f} points after {row.n_views} views under"
+        f" {row.level} clutter"
         for policies in level_rows(tables)
         for policy, rows in policies
         for row in rows
         if not is_oracle(policy) and row.p_holm < SIGNIFICANT
     ]
-    return f"With no threshold, significantly different from {reference}: {'; '.join(found)}." if found else None
+    return (
+        f"With no threshold, significantly different from {reference}: {'; '.join(found)}."
+        if found
+        else None
+    )
 
 
 def nothing_differs(tables: Tables, threshold: float, reference: str) -> str | None:
-    """A sentence where no policy that a robot could follow differs from the reference in accuracy; else None."""
+    """A sentence where no policy that a robot could follow differs from the reference in
+    accuracy; else None.
+    """
     tests = _robot_tests(tables, threshold)
     if tests.empty or (tests["p_holm"] < SIGNIFICANT).any():
         return None
     return (
-        f"No policy that a robot could follow differs significantly from {reference} in accuracy at threshold "
-        f"{threshold:g} (every p after Holm's correction is {SIGNIFICANT} or more)."
+        f"No policy that a robot could follow differs significantly from {reference} in accuracy at"
+        f" threshold {threshold:g} (every p after Holm's correction is {SIGNIFICANT} or more)."
     )
 
 
@@ -77,8 +105,15 @@ def too_few(tables: Tables, threshold: float, objects: int) -> str | None:
     half = float((tests["high"] - tests["low"]).median() / 2)  # NaN if nothing was compared
     if objects >= FEW_OBJECTS and not half > WIDE:
         return None
-    unclear = "" if half != half else f" and differences in accuracy are known to ±{100 * half:.1f} points"
-    what = f"Too few objects to tell: there are {objects:,}{unclear}. Take no order of the policies from this"
+    unclear = (
+        ""
+        if half != half
+        else f" and differences in accuracy are known to ±{100 * half:.1f} points"
+    )
+    what = (
+        f"Too few objects to tell: there are {objects:,}{unclear}. Take no order of the policies"
+        " from this"
+    )
     return f"{what}; it wants at least {FEW_OBJECTS} objects and ±{100 * WIDE:g} points."
 
 

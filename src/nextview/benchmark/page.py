@@ -1,4 +1,6 @@
-"""The pages of a benchmark and of an evaluation: numbers as they are written, and the templates that take them."""
+"""The pages of a benchmark and of an evaluation: numbers as they are written, and the templates
+that take them.
+"""
 
 import base64
 from collections.abc import Mapping
@@ -33,7 +35,10 @@ class Number(NamedTuple):
 
 def numbers(frame: pd.DataFrame, *keys: str) -> dict[tuple, Number]:
     """A long table as a mapping; a threshold that is NaN becomes None."""
-    names = [[None if key != key else key for key in row] for row in frame[list(keys)].to_numpy(object).tolist()]
+    names = [
+        [None if key != key else key for key in row]
+        for row in frame[list(keys)].to_numpy(object).tolist()
+    ]
     values = frame[list(Number._fields)].to_numpy(float).tolist()
     return {tuple(name): Number(*value) for name, value in zip(names, values, strict=True)}
 
@@ -56,7 +61,13 @@ def words(name: str) -> str:
 def render(template: str, **given: Any) -> str:
     """A whole page by a template of this package. All that is given is text and never markup."""
     loader = PackageLoader("nextview.benchmark", "templates")
-    pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    pages = Environment(
+        loader=loader,
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
     pages.tests["oracle"] = knows_truth
     pages.filters |= {
         "percent": percent,
@@ -76,17 +87,25 @@ def picture(figure: Figure) -> str:
 
 
 def write_figures(
-    folder: Path, figures: Mapping[str, Figure], tables: Mapping[str, pd.DataFrame], overwrite: bool = False
+    folder: Path,
+    figures: Mapping[str, Figure],
+    tables: Mapping[str, pd.DataFrame],
+    overwrite: bool = False,
 ) -> None:
-    """Write every figure as PDF and SVG, and every table as CSV and LaTeX; see ``files.new_folder``."""
+    """Write every figure as PDF and SVG, and every table as CSV and LaTeX; see
+    ``files.new_folder``.
+    """
     with new_folder(folder, overwrite) as part:
         for name, figure in figures.items():
             (part / f"{name}.svg").write_text(to_svg(figure), encoding="utf-8")
-            figure.savefig(part / f"{name}.pdf", bbox_inches="tight", metadata={"CreationDate": None})
+            figure.savefig(
+                part / f"{name}.pdf", bbox_inches="tight", metadata={"CreationDate": None}
+            )
         for name, table in tables.items():
             table.to_csv(part / f"{name}.csv", index=False)
             (part / f"{name}.tex").write_text(
-                table.to_latex(index=False, escape=True, float_format="%.4g", na_rep=""), encoding="utf-8"
+                table.to_latex(index=False, escape=True, float_format="%.4g", na_rep=""),
+                encoding="utf-8",
             )
 
 

@@ -1,4 +1,6 @@
-"""The numbers of the thesis "Multi-View 3D Object Recognition: Selecting the Best Sequences of Views", beside ours."""
+"""The numbers of the thesis "Multi-View 3D Object Recognition: Selecting the Best Sequences of
+Views", beside ours.
+"""
 
 import csv
 from functools import cache
@@ -48,27 +50,43 @@ def published_classes(classes: tuple[str, ...]) -> int | None:
 
 
 def comparable_classes(p: Predictions) -> tuple[str, ...]:
-    """The classes by which published numbers are found; none for scenes: those published are of single objects."""
+    """The classes by which published numbers are found; none for scenes: those published are of
+    single objects.
+    """
     return () if any(map(clutter_level, p.names)) else p.classes
 
 
 def published_threshold(policy: str) -> float | None:
-    """The threshold of the published numbers of a policy (table 5); None if there are none or none is needed."""
-    return read_table("table5_nbv_modelnet10")["threshold"][COLUMNS[policy]] if policy in COLUMNS else None
+    """The threshold of the published numbers of a policy (table 5); None if there are none or
+    none is needed.
+    """
+    return (
+        read_table("table5_nbv_modelnet10")["threshold"][COLUMNS[policy]]
+        if policy in COLUMNS
+        else None
+    )
 
 
 def published(
-    policy: str, threshold: float | None, measure: str, classes: tuple[str, ...], label: str | None = None
+    policy: str,
+    threshold: float | None,
+    measure: str,
+    classes: tuple[str, ...],
+    label: str | None = None,
 ) -> float | None:
     """The published value of one of our cells; None where nothing was published for it."""
     n = published_classes(classes)
     if n is None:
         return None
-    over_classes, kind = measure.startswith("class_"), measure.removeprefix("class_")
+    over_classes = measure.startswith("class_")
+    kind = measure.removeprefix("class_")
     if policy in FIVE_VIEWS and kind == "accuracy":
         rows = read_table("table12_fixed_five_views_modelnet40")
         column = {name: rows[name][FIVE_VIEWS[policy]] for name in classes}
-    elif threshold == published_threshold(policy) is not None and kind in ("accuracy", "travel_moved"):
+    elif threshold == published_threshold(policy) is not None and kind in (
+        "accuracy",
+        "travel_moved",
+    ):
         rows = read_table((ACCURACY if kind == "accuracy" else TRAVEL)[n])
         column = {name: rows[name][COLUMNS[policy]] for name in classes}
     else:
@@ -84,7 +102,9 @@ def published(
 
 
 def published_recognisers(classes: tuple[str, ...], views: int) -> list[tuple[str, int, float]]:
-    """Network, batch size and accuracy from one of so many views, over objects, of table 6; the best first."""
+    """Network, batch size and accuracy from one of so many views, over objects, of table 6; the
+    best first.
+    """
     n = published_classes(classes)
     rows = [
         (row["model"], int(row["batch_size"]), float(row["accuracy"]))
@@ -94,18 +114,31 @@ def published_recognisers(classes: tuple[str, ...], views: int) -> list[tuple[st
     return sorted(rows, key=lambda row: -row[2])
 
 
-def published_map(name: str, measure: str, classes: tuple[str, ...], label: str | None = None) -> float | None:
-    """The published score of a map network that was trained on these classes and tested on them (tables 4 and 7)."""
+def published_map(
+    name: str, measure: str, classes: tuple[str, ...], label: str | None = None
+) -> float | None:
+    """The published score of a map network that was trained on these classes and tested on them
+    (tables 4 and 7).
+    """
     n = published_classes(classes)
-    over_classes, kind = measure.startswith("class_"), measure.removeprefix("class_")
+    over_classes = measure.startswith("class_")
+    kind = measure.removeprefix("class_")
     column = {"mse": "loss"}.get(kind, kind)
     if n is None or column not in ("loss", "d0", "d_le_1", "d_lt_2"):
         return None
     if label is None and over_classes == (kind != "mse"):
         for row in read_rows("table4_map_prediction"):
-            if (row["model"].lower(), int(row["classes_train"]), int(row["classes_test"])) == (name, n, n):
+            if (row["model"].lower(), int(row["classes_train"]), int(row["classes_test"])) == (
+                name,
+                n,
+                n,
+            ):
                 return float(row[column])
     if (name, n) == (LEM, 10) and (label is not None or over_classes):
         rows = read_table("table7_lem_per_class_modelnet10")
-        return rows[label][column] if label is not None else float(np.mean([row[column] for row in rows.values()]))
+        return (
+            rows[label][column]
+            if label is not None
+            else float(np.mean([row[column] for row in rows.values()]))
+        )
     return None

@@ -1,7 +1,8 @@
 """Replay: run policies through all episodes at once, from predictions instead of a camera.
 
-A policy does not know the threshold, so every policy is run once, to the last view, through the same loop as live use;
-``truncate`` ends the episodes where a ``Stopping`` rule does. A path ends early only where the belief is exactly 1.
+A policy does not know the threshold, so every policy is run once, to the last view, through the
+same loop as live use; ``truncate`` ends the episodes where a ``Stopping`` rule does. A path ends
+early only where the belief is exactly 1.
 """
 
 from collections.abc import Iterator, Sequence
@@ -28,32 +29,47 @@ PART = 4096  # episodes of fixed views that are run at once
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Where E episodes went, up to K views, and what was believed after each."""
+    """Where E episodes went, up to K views, and what was believed after each.
+
+    Attributes:
+        seen: views so far that showed anything.
+        beliefs: in all classes, (E, K, classes), for rules that look at more than one.
+    """
 
     views: NDArray[np.int64]
     answers: NDArray[np.int64]
     confidences: NDArray[np.float64]
     travel: NDArray[np.float64]
     arc: NDArray[np.float64]
-    seen: NDArray[np.int64]  # views so far that showed anything
+    seen: NDArray[np.int64]
     fixed: bool
-    beliefs: NDArray[np.float64] | None = None  # in all classes, (E, K, classes), for rules that look at more than one
+    beliefs: NDArray[np.float64] | None = None
 
 
 def make_specs(predictions: Predictions, runs: int, seed: int) -> EpisodeSpecs:
-    """Every object from ``runs`` first views in reach, which the seed draws: episode = run * objects + object."""
+    """Every object from ``runs`` first views in reach, which the seed draws: episode = run *
+    objects + object.
+    """
     if runs < 1:
         raise UsageError(f"at least one run is needed, not {runs}")
-    n, rng, scenes = len(predictions), np.random.default_rng([seed]), scenes_of(predictions)
+    n = len(predictions)
+    rng = np.random.default_rng([seed])
+    scenes = scenes_of(predictions)
     starts = rng.integers(len(predictions.sphere), size=runs * n)
     objects = np.tile(np.arange(n), runs)
     if scenes is not None:
-        starts = np.where(scenes.reachable[objects], rng.random((len(objects), len(predictions.sphere))), -1).argmax(1)
+        starts = np.where(
+            scenes.reachable[objects], rng.random((len(objects), len(predictions.sphere))), -1
+        ).argmax(1)
     return EpisodeSpecs(predictions, objects, starts, scenes)
 
 
-def replay(name: str, specs: EpisodeSpecs, max_views: int, seed: int, beliefs: bool = False) -> Trajectories:
-    """Run one entry through all episodes, to the last view; keep whole ``beliefs`` for a stopping rule of your own."""
+def replay(
+    name: str, specs: EpisodeSpecs, max_views: int, seed: int, beliefs: bool = False
+) -> Trajectories:
+    """Run one entry through all episodes, to the last view; keep whole ``beliefs`` for a
+    stopping rule of your own.
+    """
     rng = np.random.default_rng([seed, *name.encode()])
     views = fixed_views(name, specs, rng)
     if views is None:
@@ -64,19 +80,33 @@ def replay(name: str, specs: EpisodeSpecs, max_views: int, seed: int, beliefs: b
     for start in range(0, len(views), PART):
         part = slice(start, start + PART)
         here = replace(specs, objects=specs.objects[part], starts=views[part, 0])
-        parts.append(replay_policy(name, ViewList(views[part]), here, FixedLength(max_views=views.shape[1]), rng))
+        parts.append(
+            replay_policy(
+                name, ViewList(views[part]), here, FixedLength(max_views=views.shape[1]), rng
+            )
+        )
     names = [f.name for f in fields(Trajectories) if f.name not in ("fixed", "beliefs")]
     whole = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     return replace(parts[0], **whole, fixed=True)
 
 
 def replay_policy(
-    name: str, policy: Policy, specs: EpisodeSpecs, stopping: Stopping, rng: np.random.Generator, beliefs: bool = False
+    name: str,
+    policy: Policy,
+    specs: EpisodeSpecs,
+    stopping: Stopping,
+    rng: np.random.Generator,
+    beliefs: bool = False,
 ) -> Trajectories:
-    """Run a policy of any kind through all episodes, until a rule ends them; ``name`` is for messages."""
-    p, objects = specs.predictions, specs.objects
+    """Run a policy of any kind through all episodes, until a rule ends them; ``name`` is for
+    messages.
+    """
+    p = specs.predictions
+    objects = specs.objects
     needs = maps_among(policy.needs)
-    maps = {m: true_map(p, m.removeprefix(TRUE)) if m.startswith(TRUE) else p.maps[m] for m in needs}
+    maps = {
+        m: true_map(p, m.removeprefix(TRUE)) if m.startswith(TRUE) else p.maps[m] for m in needs
+    }
     p = replace(p, maps=maps)
 
     def observe(which: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
@@ -84,12 +114,16 @@ def replay_policy(
 
     sight = sight_of(specs.scenes, objects)
     try:
-        done = run_episodes(observe, p.sphere, policy, specs.starts, stopping, rng, p.calibration, *sight)
+        done = run_episodes(
+            observe, p.sphere, policy, specs.starts, stopping, rng, p.calibration, *sight
+        )
     except PolicyError as error:
         where = "" if error.episode is None else f" (object {p.names[objects[error.episode]]})"
         raise EntryError(f"{name}: {error}{where}") from error
     shape = (len(objects), len(done.steps))
-    answers, confidences, seen = np.zeros(shape, np.int64), np.full(shape, -1.0), np.zeros(shape, np.int64)
+    answers = np.zeros(shape, np.int64)
+    confidences = np.full(shape, -1.0)
+    seen = np.zeros(shape, np.int64)
     kept = np.zeros((*shape, len(p.classes))) if beliefs else None
     for k, step in enumerate(done.steps):
         answers[step.episodes, k] = step.belief.argmax(1)
@@ -98,22 +132,34 @@ def replay_policy(
         if kept is not None:
             kept[step.episodes, k] = step.belief
     views = done.outcome.views
-    legs, going, still = (views[:, :-1], views[:, 1:]), views[:, 1:] >= 0, np.zeros((len(views), 1))
-    travel, arc = (np.hstack([still, np.cumsum(d[legs] * going, axis=1)]) for d in (p.sphere.travel, p.sphere.arc))
+    legs = (views[:, :-1], views[:, 1:])
+    going = views[:, 1:] >= 0
+    still = np.zeros((len(views), 1))
+    travel, arc = (
+        np.hstack([still, np.cumsum(d[legs] * going, axis=1)])
+        for d in (p.sphere.travel, p.sphere.arc)
+    )
     return Trajectories(views, answers, confidences, travel, arc, seen, fixed=False, beliefs=kept)
 
 
 def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcome:
-    """The episodes as a rule ends them, as it would in live use: never after a view in which nothing is seen."""
-    e, count = np.arange(len(paths.views)), (paths.views >= 0).sum(1)
+    """The episodes as a rule ends them, as it would in live use: never after a view in which
+    nothing is seen.
+    """
+    e = np.arange(len(paths.views))
+    count = (paths.views >= 0).sum(1)
     if stopping is None or paths.fixed:
-        confident, at = np.zeros(len(e), bool), count - 1
+        confident = np.zeros(len(e), bool)
+        at = count - 1
     else:
         last = min(paths.views.shape[1], stopping.max_views)
-        seen, beliefs = paths.seen[:, :last], paths.beliefs
+        seen = paths.seen[:, :last]
+        beliefs = paths.beliefs
         if beliefs is None:
             if type(stopping).reached is not Stopping.reached:
-                raise UsageError("a stopping rule of your own needs whole beliefs: replay with beliefs=True")
+                raise UsageError(
+                    "a stopping rule of your own needs whole beliefs: replay with beliefs=True"
+                )
             beliefs = paths.confidences[:, :, None]
         there = (np.diff(seen, prepend=0) > 0) & (paths.views[:, :last] >= 0)
         reached = stopping.reached(beliefs[:, :last], np.maximum(seen, 1)) & there
@@ -143,7 +189,11 @@ class Grid:
         if self.rule is not None:
             return own_stopping(self.rule, threshold, self.max_views)
         rule = Stopping.of(self.specs.predictions.calibration, threshold, max_views=self.max_views)
-        return rule if self.threshold_decay is None else replace(rule, threshold_decay=self.threshold_decay)
+        return (
+            rule
+            if self.threshold_decay is None
+            else replace(rule, threshold_decay=self.threshold_decay)
+        )
 
     def ends(self, name: str, threshold: float | None) -> Outcome:
         """The episodes of an entry under a threshold; None takes all views."""
@@ -161,10 +211,14 @@ class Grid:
 
 
 def run_grid(grid: Grid, names: Sequence[str]) -> Iterator[int]:
-    """Run the entries one after the other; one that fails leaves its sentence and takes nothing from the others."""
+    """Run the entries one after the other; one that fails leaves its sentence and takes nothing
+    from the others.
+    """
     for n, name in enumerate(names, 1):
         try:
-            grid.paths[name] = replay(name, grid.specs, grid.max_views, grid.seed, beliefs=grid.rule is not None)
+            grid.paths[name] = replay(
+                name, grid.specs, grid.max_views, grid.seed, beliefs=grid.rule is not None
+            )
         except NextviewError as error:
             grid.failures[name] = str(error)
         yield n

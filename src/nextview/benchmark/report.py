@@ -33,21 +33,28 @@ with extras():
     import pandas as pd
 
 PICTURE = 112  # side of a view's picture, pixels
-OWNERS = np.array([[255, 255, 255], [11, 95, 165], [209, 73, 91], [225, 225, 225]])  # nothing, target, others, table
+# nothing, target, others, table
+OWNERS = np.array([[255, 255, 255], [11, 95, 165], [209, 73, 91], [225, 225, 225]])
 
 
 def report(
-    results: Path,  # folder made by nextview benchmark
-    out: Path | None = None,  # the page; RESULTS/report.html by default
+    results: Path,
+    out: Path | None = None,
     /,
-    # take the pictures of the objects from this view store; by default from that of the predictions, if it still is
-    # where it was
     store: Path | None = None,
-    # write every figure of it as PDF and SVG too, and its tables as CSV and LaTeX, into this folder
     figures: Path | None = None,
-    overwrite: bool = False,  # replace an earlier page, and earlier figures
+    overwrite: bool = False,
 ) -> Path:
     """Write one self-contained HTML page: tables, curves, and the worst failures.
+
+    Args:
+        results: folder made by nextview benchmark.
+        out: the page; RESULTS/report.html by default.
+        store: take the pictures of the objects from this view store; by default from that of the
+            predictions, if it still is where it was.
+        figures: write every figure of it as PDF and SVG too, and its tables as CSV and LaTeX, into
+            this folder.
+        overwrite: replace an earlier page, and earlier figures.
 
     Raises:
         ResultsError: there are no results, or fixed views only; or the page cannot be written.
@@ -59,12 +66,15 @@ def report(
         check_new(figures, overwrite, folder=True)
     loaded = load(results)
     if loaded.tables.sweep.empty:
-        raise ResultsError(f"{results}: holds fixed views only; a report needs a policy that chooses")
+        raise ResultsError(
+            f"{results}: holds fixed views only; a report needs a policy that chooses"
+        )
     views, why_not = pictures_of(loaded.predictions, store)
     with new_file(path, overwrite) as part:
         part.write_text(page(loaded, views, why_not), encoding="utf-8")
     if figures is not None:
-        at, tables = board.headline_threshold(loaded.settings["thresholds"]), loaded.tables
+        at = board.headline_threshold(loaded.settings["thresholds"])
+        tables = loaded.tables
         shown = {"leaderboard": pd.DataFrame(board.leaderboard(tables, at)), "tests": tables.tests}
         shown |= {} if tables.views.empty else {"views": as_rows(tables.views)}
         write_figures(figures, _figures(loaded, headline_policy(loaded, at), at), shown, overwrite)
@@ -72,24 +82,49 @@ def report(
 
 
 def headline_policy(results: Results, threshold: float) -> str:
-    """The most accurate policy that a robot could follow, other than the reference; the reference if it is alone."""
-    found, reference = numbers(results.tables.summary, "policy", "threshold", "measure"), results.settings["reference"]
-    names = [n for n in results.tables.sweep["policy"].unique() if not is_oracle(n) and n != reference]
+    """The most accurate policy that a robot could follow, other than the reference; the
+    reference if it is alone.
+    """
+    found = numbers(results.tables.summary, "policy", "threshold", "measure")
+    reference = results.settings["reference"]
+    names = [
+        n for n in results.tables.sweep["policy"].unique() if not is_oracle(n) and n != reference
+    ]
     return max(names, key=lambda n: found[n, threshold, "accuracy"].value, default=reference)
 
 
 def page(results: Results, store: ViewStore | None, why_not: str) -> str:
     """The whole page as text."""
-    s, t, p = results.settings, results.tables, results.predictions
-    at, reference = board.headline_threshold(s["thresholds"]), s["reference"]
-    found, policies = numbers(t.summary, "policy", "threshold", "measure"), list(t.sweep["policy"].unique())
+    s = results.settings
+    t = results.tables
+    p = results.predictions
+    at = board.headline_threshold(s["thresholds"])
+    reference = s["reference"]
+    found = numbers(t.summary, "policy", "threshold", "measure")
+    policies = list(t.sweep["policy"].unique())
     best = headline_policy(results, at)
-    tests = t.tests.query("threshold == @at and measure == 'accuracy'").set_index("policy").to_dict("index")
-    shown = [n for n in dict.fromkeys((reference, best, DEFAULT, *draw.ceiling(results))) if n in policies]
+    tests = (
+        t.tests.query("threshold == @at and measure == 'accuracy'")
+        .set_index("policy")
+        .to_dict("index")
+    )
+    shown = [
+        n
+        for n in dict.fromkeys((reference, best, DEFAULT, *draw.ceiling(results)))
+        if n in policies
+    ]
 
     def spoken(measure: str) -> str:
-        known = [(name, found[name, at, measure]) for name in draw.compared(results) if (name, at, measure) in found]
-        return f"At threshold {at:g}: " + ", ".join(f"{name} {number.value:.3f}" for name, number in known) + "."
+        known = [
+            (name, found[name, at, measure])
+            for name in draw.compared(results)
+            if (name, at, measure) in found
+        ]
+        return (
+            f"At threshold {at:g}: "
+            + ", ".join(f"{name} {number.value:.3f}" for name, number in known)
+            + "."
+        )
 
     return render(
         "report.html",
@@ -113,7 +148,11 @@ def page(results: Results, store: ViewStore | None, why_not: str) -> str:
         level_differences=board.level_differences(t, reference),
         risks=board.promised_risks(t),
         by_class_at=_thresholds(results, at),
-        fixed_at={name: None for name, threshold, measure in found if threshold is None and measure == "accuracy"},
+        fixed_at={
+            name: None
+            for name, threshold, measure in found
+            if threshold is None and measure == "accuracy"
+        },
         spoken=spoken,
         figures={name: picture(figure) for name, figure in _figures(results, best, at).items()},
         confusions={
@@ -130,43 +169,69 @@ def _title(test: Mapping[Any, Any] | None, best: str, reference: str, at: float)
     if test is None:
         return f"{best} at threshold {at:g}"
     if test["p_holm"] >= board.SIGNIFICANT:
-        return f"No policy that a robot could follow is clearly more accurate than {reference} at threshold {at:g}"
+        return (
+            f"No policy that a robot could follow is clearly more accurate than {reference} at"
+            f" threshold {at:g}"
+        )
     more = "more" if test["difference"] > 0 else "less"
     return f"{best} is {100 * abs(test['difference']):.1f} points {more} accurate than {reference}"
 
 
 def _figures(results: Results, best: str, at: float) -> dict[str, Figure]:
-    sweep, reference = results.tables.sweep, results.settings["reference"]
+    sweep = results.tables.sweep
+    reference = results.settings["reference"]
     figures = {} if results.tables.tests.empty else {"differences": draw.differences(results, at)}
-    figures |= {measure: draw.threshold_curve(results, measure) for measure in ("class_accuracy", "accuracy")}
-    varying = [budget for budget in ("n_views", "travel_all") if sweep[budget].max() > sweep[budget].min()]
+    figures |= {
+        measure: draw.threshold_curve(results, measure)
+        for measure in ("class_accuracy", "accuracy")
+    }
+    varying = [
+        budget for budget in ("n_views", "travel_all") if sweep[budget].max() > sweep[budget].min()
+    ]
     figures |= {budget: draw.budget_curve(results, budget) for budget in varying}
-    ran = [n for n in dict.fromkeys((reference, best, *draw.ceiling(results))) if n in set(sweep["policy"])]
+    ran = [
+        n
+        for n in dict.fromkeys((reference, best, *draw.ceiling(results)))
+        if n in set(sweep["policy"])
+    ]
     return figures | {"reliability": draw.reliability_diagram(results, ran, at)}
 
 
 def _thresholds(results: Results, at: float) -> dict[str, float]:
-    """Policies by class (tables 8 to 11), each at its published threshold; for scenes nothing is published."""
+    """Policies by class (tables 8 to 11), each at its published threshold; for scenes nothing is
+    published.
+    """
     if not results.tables.levels.empty:
         return {name: at for name in draw.compared(results) if not is_oracle(name)}
-    ran, thresholds = set(results.tables.sweep["policy"]), results.settings["thresholds"]
+    ran = set(results.tables.sweep["policy"])
+    thresholds = results.settings["thresholds"]
     wanted = {name: published_threshold(name) or 0.99 for name in (LEM, *COLUMNS) if name in ran}
     return {name: t if t in thresholds else at for name, t in wanted.items()}
 
 
 def worst_failures(episodes: pd.DataFrame, most: int = 8) -> pd.DataFrame:
-    """Objects, and how often, how surely and in which run a policy gets them wrong, the most often first."""
+    """Objects, and how often, how surely and in which run a policy gets them wrong, the most
+    often first.
+    """
     wrong = episodes[episodes["answer"].astype(str) != episodes["label"].astype(str)]
-    wrong = wrong.assign(object=wrong["object"].astype(str)).sort_values("confidence", ascending=False, kind="stable")
+    wrong = wrong.assign(object=wrong["object"].astype(str)).sort_values(
+        "confidence", ascending=False, kind="stable"
+    )
     groups = wrong.groupby("object", sort=False)
-    table = groups.agg(wrong=("run", "size"), confidence=("confidence", "mean"), run=("run", "first")).reset_index()
+    table = groups.agg(
+        wrong=("run", "size"), confidence=("confidence", "mean"), run=("run", "first")
+    ).reset_index()
     return table.sort_values(["wrong", "confidence"], ascending=False, kind="stable").head(most)
 
 
-def _failures(results: Results, best: str, at: float, store: ViewStore | None) -> list[dict[Any, Any]]:
+def _failures(
+    results: Results, best: str, at: float, store: ViewStore | None
+) -> list[dict[Any, Any]]:
     """The worst failures of a policy, each with its most confident episode."""
-    p, episodes = results.predictions, results.episodes(best, at)
-    names, found = np.asarray(episodes["object"].astype(str)), []
+    p = results.predictions
+    episodes = results.episodes(best, at)
+    names = np.asarray(episodes["object"].astype(str))
+    found = []
     for failure in worst_failures(episodes).to_dict("records"):
         name = failure["object"]
         episode = episodes[(names == name) & (episodes["run"] == failure["run"])].iloc[0]
@@ -177,7 +242,9 @@ def _failures(results: Results, best: str, at: float, store: ViewStore | None) -
     return found
 
 
-def pictures_of(predictions: Predictions, store: Path | None = None) -> tuple[ViewStore | None, str]:
+def pictures_of(
+    predictions: Predictions, store: Path | None = None
+) -> tuple[ViewStore | None, str]:
     """The store of the objects' pictures, or None and why not."""
     if store is not None:
         given = ViewStore.open(store)
@@ -185,26 +252,35 @@ def pictures_of(predictions: Predictions, store: Path | None = None) -> tuple[Vi
             raise ResultsError(f"{store}: holds no views of these objects from these viewpoints")
         return given, ""
     try:
-        stored_rows(predictions, "measures/depth_entropy")  # which tells whether it is the same store
+        # which tells whether it is the same store
+        stored_rows(predictions, "measures/depth_entropy")
     except EntryError as error:
         return None, f"No pictures: {error}; give their view store with --store."
     return ViewStore.open(predictions.store), ""
 
 
 def _images(store: ViewStore, name: str, views: list[int]) -> dict[str, str]:
-    """Images of some views of an object, as data URIs; in a scene the target is told from all else by its colour."""
+    """Images of some views of an object, as data URIs; in a scene the target is told from all
+    else by its colour.
+    """
     row = store.names.index(name)
     images: NDArray = store.image(row)
     if store.attributes.scene:
         scene = scene_views(store, row)
-        shade = np.stack([headlight(depth, scene.intrinsics) for depth in scene.depth])[..., None] / 255
-        images = np.where(scene.owner[..., None] > 0, OWNERS[scene.owner] * (0.35 + 0.65 * shade), 255).astype(np.uint8)
+        shade = (
+            np.stack([headlight(depth, scene.intrinsics) for depth in scene.depth])[..., None] / 255
+        )
+        images = np.where(
+            scene.owner[..., None] > 0, OWNERS[scene.owner] * (0.35 + 0.65 * shade), 255
+        ).astype(np.uint8)
     found = {}
     for view in views:
         file = BytesIO()
         small = Image.fromarray(images[view]).resize((PICTURE, PICTURE), Image.Resampling.LANCZOS)
         small.save(file, "WEBP", quality=70)
-        found[f"{name} from view {view}"] = "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
+        found[f"{name} from view {view}"] = (
+            "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
+        )
     return found
 
 
@@ -213,8 +289,13 @@ def _made(results: Results, store: ViewStore | None, why_not: str) -> dict[str, 
     return {
         **origin(results.predictions, s),
         "valley classes": ", ".join(s["valley_classes"]) or "none",
-        "first views": f"{s['runs']} of each object, the same for every policy and threshold; seed {s['seed']}",
+        "first views": (
+            f"{s['runs']} of each object, the same for every policy and threshold; seed {s['seed']}"
+        ),
         "bootstrap": f"{s['samples']} samples of objects; p-values from its standard error",
-        "tests": "McNemar's for clustered pairs; Holm's correction is over all policies and thresholds of a measure",
+        "tests": (
+            "McNemar's for clustered pairs; Holm's correction is over all policies and thresholds"
+            " of a measure"
+        ),
         "pictures": store.path.name if store is not None else why_not,
     }

@@ -30,24 +30,40 @@ with extras():
 
 @dataclass(frozen=True)
 class BenchmarkSettings:
-    """What is run."""
+    """What is run.
 
-    policies: tuple[str, ...] = ()  # names, or MODULE:CLASS for your own; all that the predictions allow by default
-    models: str = "modelnet10"  # a folder with models of your own: the policies learned for them take part, by name
-    thresholds: tuple[float, ...] = THRESHOLDS  # of the belief
-    # error rates; the thresholds that promise them, by the recogniser's calibration, are run too. With them thresholds
-    # stay; else they come down with the views, by the recogniser's correlation
+    Attributes:
+        policies: names, or MODULE:CLASS for your own; all that the predictions allow by default.
+        models: a folder with models of your own: the policies learned for them take part, by name.
+        thresholds: of the belief.
+        risks: error rates; the thresholds that promise them, by the recogniser's calibration, are
+            run too. With them thresholds stay; else they come down with the views, by the
+            recogniser's correlation.
+        views: compare the policies after these fixed numbers of views too (1 2 3 5).
+        stopping: MODULE:NAME of a stopping rule of your own, asked with each threshold.
+        uncalibrated: believe the plain sum of the logits, as published, whatever the recogniser's
+            card says.
+        split: take only the objects of this one; needed where the predictions hold several.
+        runs: random first views of each object.
+        max_views: views at most.
+        reference: the policy that the others are compared with.
+        samples: of the bootstrap.
+        seed: decides first views, random policies and the bootstrap.
+    """
+
+    policies: tuple[str, ...] = ()
+    models: str = "modelnet10"
+    thresholds: tuple[float, ...] = THRESHOLDS
     risks: tuple[float, ...] = ()
-    views: tuple[int, ...] = ()  # compare the policies after these fixed numbers of views too (1 2 3 5)
-    stopping: str | None = None  # MODULE:NAME of a stopping rule of your own, asked with each threshold
-    uncalibrated: bool = False  # believe the plain sum of the logits, as published, whatever the recogniser's card says
-    # take only the objects of this one; needed where the predictions hold several
+    views: tuple[int, ...] = ()
+    stopping: str | None = None
+    uncalibrated: bool = False
     split: Literal["train", "test", "val"] | None = None
-    runs: int = 10  # random first views of each object
-    max_views: int = 5  # views at most
-    reference: str = "random"  # the policy that the others are compared with
-    samples: int = 2000  # of the bootstrap
-    seed: int = 0  # decides first views, random policies and the bootstrap
+    runs: int = 10
+    max_views: int = 5
+    reference: str = "random"
+    samples: int = 2000
+    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -60,26 +76,37 @@ class Results:
     tables: Tables
 
     def episodes(self, policy: str, threshold: float | None) -> pd.DataFrame:
-        """The episodes of one cell, one a row: run by run, in each the objects in the order of the predictions."""
-        cell = [("policy", "==", policy)] + ([] if threshold is None else [("threshold", "==", threshold)])
+        """The episodes of one cell, one a row: run by run, in each the objects in the order of
+        the predictions.
+        """
+        cell = [("policy", "==", policy)] + (
+            [] if threshold is None else [("threshold", "==", threshold)]
+        )
         return pq.read_table(self.folder / "episodes.parquet", filters=cell).to_pandas()
 
 
 def run_benchmark(
-    predictions: Path,  # made by nextview predict
-    out: Path,  # folder for the results
+    predictions: Path,
+    out: Path,
     settings: BenchmarkSettings = BenchmarkSettings(),
     *,
-    overwrite: bool = False,  # replace the files of earlier results
+    overwrite: bool = False,
     track: Track = silently,
 ) -> Results:
-    """Run every policy under every threshold from the same first views, and say which are better than the reference.
+    """Run every policy under every threshold from the same first views, and say which are better
+    than the reference.
 
-    Episodes, tables and tests are written; nextview report makes a page of them. Why a policy failed stands in the
-    settings of the results.
+    Episodes, tables and tests are written; nextview report makes a page of them. Why a policy
+    failed stands in the settings of the results.
+
+    Args:
+        predictions: made by nextview predict.
+        out: folder for the results.
+        overwrite: replace the files of earlier results.
 
     Raises:
-        UsageError, RiskError, EntryError: settings make no sense, nothing promises a risk, or no policy ends.
+        UsageError, RiskError, EntryError: settings make no sense, nothing promises a risk, or no
+            policy ends.
     """
     check_new(out, overwrite, folder=True)
     grid, names, promised = _prepare(predictions, settings)
@@ -87,7 +114,9 @@ def run_benchmark(
     if not grid.paths:
         raise EntryError("\n".join(grid.failures.values()))
     rng = np.random.default_rng([settings.seed, 1])
-    tables = summarise(grid, settings.reference, settings.samples, rng, promised, sorted(set(settings.views)))
+    tables = summarise(
+        grid, settings.reference, settings.samples, rng, promised, sorted(set(settings.views))
+    )
     table = grid.specs.predictions
     made = asdict(settings) | {
         "command": command(),
@@ -119,7 +148,9 @@ def _prepare(predictions: Path, s: BenchmarkSettings) -> tuple[Grid, list[str], 
         raise UsageError("at least one threshold is needed")
     if s.views and not 1 <= min(s.views) <= max(s.views) <= s.max_views:
         asked = " ".join(map(str, s.views))
-        raise UsageError(f"policies take 1 to {s.max_views} views (--max-views), and --views asks for {asked}")
+        raise UsageError(
+            f"policies take 1 to {s.max_views} views (--max-views), and --views asks for {asked}"
+        )
     table = Predictions.load(predictions)
     if s.uncalibrated:
         table = replace(table, calibration=PLAIN_SUM)
@@ -127,13 +158,19 @@ def _prepare(predictions: Path, s: BenchmarkSettings) -> tuple[Grid, list[str], 
     for threshold in s.thresholds:
         Stopping(threshold, s.max_views, decay)  # says what is wrong with it
     if s.stopping and s.risks:
-        raise UsageError("error rates are promised for the package's own stopping rule, not for yours")
+        raise UsageError(
+            "error rates are promised for the package's own stopping rule, not for yours"
+        )
     if s.stopping:
         own_stopping(s.stopping, s.thresholds[0], s.max_views)  # likewise
     promised = {risk: table.calibration.threshold(risk, s.max_views) for risk in s.risks}
     table = chosen_split(table, predictions, s.split)
-    specs, cards = make_specs(table, s.runs, s.seed), find_models(s.models).policies
-    names = [with_cards(name, cards) for name in s.policies] or [*default_entries(specs), *map(str, cards.values())]
+    specs = make_specs(table, s.runs, s.seed)
+    cards = find_models(s.models).policies
+    names = [with_cards(name, cards) for name in s.policies] or [
+        *default_entries(specs),
+        *map(str, cards.values()),
+    ]
     names = list(dict.fromkeys([*([s.reference] if s.policies else []), *names]))
     thresholds = tuple(sorted({*s.thresholds, *promised.values()}))
     return Grid(specs, s.runs, thresholds, s.max_views, s.seed, decay, s.stopping), names, promised
@@ -154,11 +191,14 @@ def load(folder: Path) -> Results:
     try:
         settings = json.loads((folder / "benchmark.json").read_text())
         files = {name: folder / f"{name}.csv" for name in Tables.__dataclass_fields__}
-        files = {name: file for name, file in files.items() if name != "views" or file.exists()}  # earlier results
+        # earlier results
+        files = {name: file for name, file in files.items() if name != "views" or file.exists()}
         tables = Tables(**{name: pd.read_csv(file) for name, file in files.items()})
         pq.read_schema(folder / "episodes.parquet")
     except (FileNotFoundError, NotADirectoryError):
-        raise ResultsError(f"{folder}: holds no benchmark results; make some with nextview benchmark") from None
+        raise ResultsError(
+            f"{folder}: holds no benchmark results; make some with nextview benchmark"
+        ) from None
     except (ValueError, RecursionError, pa.ArrowInvalid) as error:
         raise ResultsError(f"{folder}: these benchmark results are damaged ({error})") from None
     return Results(folder, settings, Predictions.load(folder / "predictions.npz"), tables)
@@ -168,12 +208,14 @@ STOPS = ("views ran out", "confident", "fixed views")
 
 
 def _write_episodes(path: Path, grid: Grid) -> None:
-    p, n = grid.specs.predictions, len(grid.specs.objects)
+    p = grid.specs.predictions
+    n = len(grid.specs.objects)
 
     def words(codes: Any, names: tuple[str, ...]) -> pa.DictionaryArray:
         return pa.DictionaryArray.from_arrays(pa.array(codes, pa.int32()), pa.array(names))
 
-    names, labels = words(grid.specs.objects, p.names), words(grid.specs.labels, p.classes)
+    names = words(grid.specs.objects, p.names)
+    labels = words(grid.specs.labels, p.classes)
     run = pa.array(np.repeat(np.arange(grid.runs, dtype=np.int32), len(p)))
     writer = None
     for policy, threshold, ends in grid.cells():

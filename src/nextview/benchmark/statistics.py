@@ -1,4 +1,7 @@
-"""Error bars and tests. What is drawn anew is the object: the views and runs of one object are not independent."""
+"""Error bars and tests.
+
+What is drawn anew is the object: the views and runs of one object are not independent.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +13,9 @@ Float = NDArray[np.float64]
 
 
 def resample(n: int, samples: int, rng: np.random.Generator) -> Float:
-    """Bootstrap weights: how often each of n objects is drawn in each sample, (samples, n); each row sums to n."""
+    """Bootstrap weights: how often each of n objects is drawn in each sample, (samples, n); each
+    row sums to n.
+    """
     return rng.multinomial(n, np.full(n, 1 / n), size=samples).astype(np.float64)
 
 
@@ -21,22 +26,32 @@ def interval(samples: Float) -> tuple[Float, Float]:
     return np.where(empty, np.nan, low), np.where(empty, np.nan, high)
 
 
-def estimate(top: Float, bottom: Float, weights: Float, labels: NDArray[np.int64] | None = None) -> tuple[Float, Float]:
-    """Ratios of sums over objects (N, M), with ``labels`` their means over classes: (M,), and samples, (S, M)."""
+def estimate(
+    top: Float, bottom: Float, weights: Float, labels: NDArray[np.int64] | None = None
+) -> tuple[Float, Float]:
+    """Ratios of sums over objects (N, M), with ``labels`` their means over classes: (M,), and
+    samples, (S, M).
+    """
     once = np.ones((1, len(top)))
     if labels is None:
         return metrics.ratio(top, bottom, once)[0], metrics.ratio(top, bottom, weights)
-    return metrics.class_mean(top, bottom, labels, once)[0], metrics.class_mean(top, bottom, labels, weights)
+    return metrics.class_mean(top, bottom, labels, once)[0], metrics.class_mean(
+        top, bottom, labels, weights
+    )
 
 
 def bootstrap_p(difference: Float, samples: Float) -> Float:
-    """Two-sided p-values of "no difference", (M,), from observed ones, (M,), and paired bootstrap samples, (S, M)."""
+    """Two-sided p-values of "no difference", (M,), from observed ones, (M,), and paired
+    bootstrap samples, (S, M).
+    """
     error = samples.std(0)
     return 2 * norm.sf(np.abs(difference) / np.where(error > 0, error, np.inf))
 
 
 def mcnemar(right: NDArray[np.bool_], reference: NDArray[np.bool_]) -> float:
-    """Two-sided p-value of McNemar's test for right answers of two policies, each (runs, N), clustered by object."""
+    """Two-sided p-value of McNemar's test for right answers of two policies, each (runs, N),
+    clustered by object.
+    """
     difference = (right.astype(np.float64) - reference).mean(0)
     spread = (difference**2).sum()
     return float(chi2.sf(difference.sum() ** 2 / spread, 1)) if spread > 0 else 1.0

@@ -24,30 +24,53 @@ Float = NDArray[np.float64]
 Drawn = dict[tuple, NDArray[np.float64]]  # what resampling gives, by policy, threshold and measure
 Cell = tuple[str, float | None, Outcome]
 TESTED = ("accuracy", "clean_accuracy", "n_views", "travel_all")
-SWEEP = (0.0, *(1 - np.logspace(np.log10(0.75), -9, 40)), 1.0)  # from the first view for all to the last for most
+# from the first view for all to the last for most
+SWEEP = (0.0, *(1 - np.logspace(np.log10(0.75), -9, 40)), 1.0)
 LEVEL_VIEWS = (2, 3, 5)  # after so many views the policies are compared
-LEVEL_COLUMNS = ["level", "scenes", "policy", "n_views", "accuracy", "low", "high", "travel", "difference"]
+LEVEL_COLUMNS = [
+    "level",
+    "scenes",
+    "policy",
+    "n_views",
+    "accuracy",
+    "low",
+    "high",
+    "travel",
+    "difference",
+]
 LEVEL_COLUMNS += ["difference_low", "difference_high", "p"]
 
 
 @dataclass(frozen=True)
 class Tables:
-    """The results as long tables; intervals are 95 % bootstrap intervals over objects, ``low`` to ``high``."""
+    """The results as long tables; intervals are 95 % bootstrap intervals over objects, ``low``
+    to ``high``.
 
-    # a row a policy, threshold and measure: ``accuracy``; ``clean_accuracy``, without the objects whose very mesh also
-    # has another label; ``n_views``; ``travel_moved``, over the episodes that moved, as published, and ``travel_all``,
-    # grid cells; ``arc_all``, radians; ``confident``, the share that reached the threshold, and ``confident_accuracy``,
-    # of these; ``calibration_error``; with ``class_`` before it the mean over classes
+    Attributes:
+        summary: a row a policy, threshold and measure: ``accuracy``; ``clean_accuracy``, without
+            the objects whose very mesh also has another label; ``n_views``; ``travel_moved``, over
+            the episodes that moved, as published, and ``travel_all``, grid cells; ``arc_all``,
+            radians; ``confident``, the share that reached the threshold, and
+            ``confident_accuracy``, of these; ``calibration_error``; with ``class_`` before it the
+            mean over classes.
+        per_class: the same of classes (accuracy, travel_moved).
+        tests: differences to the reference, p (paired bootstrap), for accuracy mcnemar, and both
+            after Holm's correction over all rows of a measure.
+        sweep: the points of the curves of accuracy against views and travel.
+        reliability: confidence and accuracy by bin.
+        risks: error rates promised, and those measured among the episodes that reached their
+            threshold.
+        levels: of scenes: accuracy after so many views by the level of clutter, see ``by_level``.
+        views: accuracy and travel after fixed numbers of views, see ``views.measured``.
+    """
+
     summary: pd.DataFrame
-    per_class: pd.DataFrame  # the same of classes (accuracy, travel_moved)
-    # differences to the reference, p (paired bootstrap), for accuracy mcnemar, and both after Holm's correction over
-    # all rows of a measure
+    per_class: pd.DataFrame
     tests: pd.DataFrame
-    sweep: pd.DataFrame  # the points of the curves of accuracy against views and travel
-    reliability: pd.DataFrame  # confidence and accuracy by bin
-    risks: pd.DataFrame  # error rates promised, and those measured among the episodes that reached their threshold
-    levels: pd.DataFrame  # of scenes: accuracy after so many views by the level of clutter, see ``by_level``
-    # accuracy and travel after fixed numbers of views, see ``views.measured``
+    sweep: pd.DataFrame
+    reliability: pd.DataFrame
+    risks: pd.DataFrame
+    levels: pd.DataFrame
     views: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=COLUMNS))
 
 
@@ -60,7 +83,8 @@ def summarise(
     n_views: Sequence[int] = (),
 ) -> Tables:
     """All tables of a grid."""
-    weights, cells = target_weights(grid.specs.predictions.names, samples, rng), list(grid.cells())
+    weights = target_weights(grid.specs.predictions.names, samples, rng)
+    cells = list(grid.cells())
     summary, drawn = _summary(grid, cells, weights)
     return Tables(
         summary,
@@ -83,7 +107,9 @@ def _measures(grid: Grid, ends: Outcome) -> dict[str, tuple[Float, Float]]:
     def of(values: NDArray) -> NDArray:
         return values.reshape(grid.runs, -1)
 
-    moved, confident, mean = of(ends.n_views > 1), of(ends.confident), right.mean(0)
+    moved = of(ends.n_views > 1)
+    confident = of(ends.confident)
+    mean = right.mean(0)
     return {
         "accuracy": (mean, one),
         "clean_accuracy": (mean * clean, clean),
@@ -96,8 +122,12 @@ def _measures(grid: Grid, ends: Outcome) -> dict[str, tuple[Float, Float]]:
     }
 
 
-def _columns(grid: Grid, cells: list[Cell], names: tuple[str, ...] | None = None) -> tuple[list, Float, Float]:
-    """The measures of all cells side by side: (policy, threshold, measure), tops (N, M), bottoms (N, M)."""
+def _columns(
+    grid: Grid, cells: list[Cell], names: tuple[str, ...] | None = None
+) -> tuple[list, Float, Float]:
+    """The measures of all cells side by side: (policy, threshold, measure), tops (N, M), bottoms
+    (N, M).
+    """
     found = {
         (policy, threshold, measure): sums
         for policy, threshold, ends in cells
@@ -108,14 +138,21 @@ def _columns(grid: Grid, cells: list[Cell], names: tuple[str, ...] | None = None
     return list(found), np.stack(tops, 1), np.stack(bottoms, 1)
 
 
-def _summary(grid: Grid, cells: list[Cell], weights: Float) -> tuple[pd.DataFrame, dict[tuple, Float]]:
-    labels, classes = grid.specs.predictions.labels, comparable_classes(grid.specs.predictions)
+def _summary(
+    grid: Grid, cells: list[Cell], weights: Float
+) -> tuple[pd.DataFrame, dict[tuple, Float]]:
+    labels = grid.specs.predictions.labels
+    classes = comparable_classes(grid.specs.predictions)
     keys, top, bottom = _columns(grid, cells)
-    of_class = [i for i, key in enumerate(keys) if key[2] in ("accuracy", "travel_moved", "n_views")]
+    of_class = [
+        i for i, key in enumerate(keys) if key[2] in ("accuracy", "travel_moved", "n_views")
+    ]
     keys += [(keys[i][0], keys[i][1], f"class_{keys[i][2]}") for i in of_class]
     over_objects = st.estimate(top, bottom, weights)
     over_classes = st.estimate(top[:, of_class], bottom[:, of_class], weights, labels)
-    value, drawn = (np.concatenate(both, -1) for both in zip(over_objects, over_classes, strict=True))
+    value, drawn = (
+        np.concatenate(both, -1) for both in zip(over_objects, over_classes, strict=True)
+    )
     numbers = zip(keys, value, *st.interval(drawn), strict=True)
     rows = [(*key, *number, published(key[0], key[1], key[2], classes)) for key, *number in numbers]
     for policy, threshold, ends in cells:
@@ -129,39 +166,58 @@ def _summary(grid: Grid, cells: list[Cell], weights: Float) -> tuple[pd.DataFram
 
 
 def _per_class(grid: Grid, cells: list[Cell], weights: Float) -> pd.DataFrame:
-    p, classes = grid.specs.predictions, comparable_classes(grid.specs.predictions)
+    p = grid.specs.predictions
+    classes = comparable_classes(grid.specs.predictions)
     keys, top, bottom = _columns(grid, cells, ("accuracy", "travel_moved"))
     rows = []
     for index in np.unique(p.labels):
-        here, label = p.labels == index, p.classes[index]
+        here = p.labels == index
+        label = p.classes[index]
         value, drawn = st.estimate(top[here], bottom[here], weights[:, here])
-        for (policy, threshold, measure), *number in zip(keys, value, *st.interval(drawn), strict=True):
+        for (policy, threshold, measure), *number in zip(
+            keys, value, *st.interval(drawn), strict=True
+        ):
             beside = published(policy, threshold, measure, classes, label)
             rows.append((policy, threshold, label, measure, *number, beside))
-    return _frame(rows, ["policy", "threshold", "label", "measure", "value", "low", "high", "published"])
+    return _frame(
+        rows, ["policy", "threshold", "label", "measure", "value", "low", "high", "published"]
+    )
 
 
-def _tests(grid: Grid, cells: list[Cell], summary: pd.DataFrame, drawn: Drawn, reference: str) -> pd.DataFrame:
+def _tests(
+    grid: Grid, cells: list[Cell], summary: pd.DataFrame, drawn: Drawn, reference: str
+) -> pd.DataFrame:
     value = summary.set_index(["policy", "threshold", "measure"])["value"].to_dict()
     right = {(policy, threshold): grid.right(ends.answer) for policy, threshold, ends in cells}
     rows = []
     for (policy, threshold), measure in product(right, TESTED):
         if policy == reference or (reference, threshold) not in right:
             continue
-        ours, theirs = (policy, threshold, measure), (reference, threshold, measure)
-        difference, samples = np.array([value[ours] - value[theirs]]), (drawn[ours] - drawn[theirs])[:, None]
-        found = np.stack([difference, *st.interval(samples), st.bootstrap_p(difference, samples)])[:, 0]
+        ours = (policy, threshold, measure)
+        theirs = (reference, threshold, measure)
+        difference = np.array([value[ours] - value[theirs]])
+        samples = (drawn[ours] - drawn[theirs])[:, None]
+        found = np.stack([difference, *st.interval(samples), st.bootstrap_p(difference, samples)])[
+            :, 0
+        ]
         tested = measure == "accuracy"
-        paired = st.mcnemar(right[policy, threshold], right[reference, threshold]) if tested else np.nan
+        paired = (
+            st.mcnemar(right[policy, threshold], right[reference, threshold]) if tested else np.nan
+        )
         rows.append((*ours, *found, paired))
-    table = _frame(rows, ["policy", "threshold", "measure", "difference", "low", "high", "p", "mcnemar"])
+    table = _frame(
+        rows, ["policy", "threshold", "measure", "difference", "low", "high", "p", "mcnemar"]
+    )
     for column in ("p", "mcnemar"):
-        table[f"{column}_holm"] = table.groupby("measure")[column].transform(lambda p: st.holm(p.to_numpy()))
+        table[f"{column}_holm"] = table.groupby("measure")[column].transform(
+            lambda p: st.holm(p.to_numpy())
+        )
     return table
 
 
 def _sweep(grid: Grid) -> pd.DataFrame:
-    measures, points = ("accuracy", "n_views", "travel_all", "arc_all"), []
+    measures = ("accuracy", "n_views", "travel_all", "arc_all")
+    points = []
     for name, paths in grid.paths.items():
         if not paths.fixed:
             _, top, _ = _columns(grid, [(name, t, grid.ends(name, t)) for t in SWEEP], measures)
@@ -173,8 +229,12 @@ def _sweep(grid: Grid) -> pd.DataFrame:
 def _reliability(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
     rows = []
     for policy, threshold, ends in cells:
-        sure, accuracy, count = metrics.reliability(ends.confidence, grid.right(ends.answer).ravel())
-        rows += [(policy, threshold, i, sure[i], accuracy[i], count[i]) for i in np.flatnonzero(count)]
+        sure, accuracy, count = metrics.reliability(
+            ends.confidence, grid.right(ends.answer).ravel()
+        )
+        rows += [
+            (policy, threshold, i, sure[i], accuracy[i], count[i]) for i in np.flatnonzero(count)
+        ]
     return _frame(rows, ["policy", "threshold", "bin", "confidence", "accuracy", "episodes"])
 
 
@@ -182,9 +242,14 @@ def _risks(summary: pd.DataFrame, promised: Mapping[float, float]) -> pd.DataFra
     rows = []
     for risk, threshold in promised.items():
         at = summary[summary["threshold"] == threshold]
-        right, share = (at[at["measure"] == measure] for measure in ("confident_accuracy", "confident"))
-        measured = right[["value", "high", "low"]].to_numpy(float)  # the upper end of accuracy is the lower of error
-        for policy, (mean, high, low), stopped in zip(right["policy"], measured, share["value"], strict=True):
+        right, share = (
+            at[at["measure"] == measure] for measure in ("confident_accuracy", "confident")
+        )
+        # the upper end of accuracy is the lower of error
+        measured = right[["value", "high", "low"]].to_numpy(float)
+        for policy, (mean, high, low), stopped in zip(
+            right["policy"], measured, share["value"], strict=True
+        ):
             if not is_oracle(policy):
                 rows.append((policy, risk, threshold, 1 - mean, 1 - high, 1 - low, stopped))
     return _frame(rows, ["policy", "risk", "threshold", "error", "low", "high", "confident"])
@@ -192,7 +257,9 @@ def _risks(summary: pd.DataFrame, promised: Mapping[float, float]) -> pd.DataFra
 
 def _frame(rows: list, columns: list[str]) -> pd.DataFrame:
     table = pd.DataFrame(rows, columns=columns)
-    return table.astype(dict.fromkeys([c for c in columns if c in ("threshold", "published")], "float64"))
+    return table.astype(
+        dict.fromkeys([c for c in columns if c in ("threshold", "published")], "float64")
+    )
 
 
 def levels_of(names: Sequence[str]) -> NDArray[np.str_]:
@@ -201,16 +268,22 @@ def levels_of(names: Sequence[str]) -> NDArray[np.str_]:
 
 
 def target_weights(names: Sequence[str], samples: int, rng: np.random.Generator) -> Float:
-    """Bootstrap weights, (samples, N); scenes around one target are drawn together, as they are not independent."""
+    """Bootstrap weights, (samples, N); scenes around one target are drawn together, as they are
+    not independent.
+    """
     targets = [name.rpartition("@")[0] if clutter_level(name) else name for name in names]
     place = {target: i for i, target in enumerate(dict.fromkeys(targets))}
     return st.resample(len(place), samples, rng)[:, [place[target] for target in targets]]
 
 
 def by_level(grid: Grid, reference: str, samples: int, rng: np.random.Generator) -> pd.DataFrame:
-    """Accuracy in scenes after 1 view and after LEVEL_VIEWS, by the level of clutter; no threshold ends an episode."""
+    """Accuracy in scenes after 1 view and after LEVEL_VIEWS, by the level of clutter; no
+    threshold ends an episode.
+    """
     names: tuple[str, ...] = grid.specs.predictions.names
-    level_of, order, rows = levels_of(names), list(LEVELS), []
+    level_of = levels_of(names)
+    order = list(LEVELS)
+    rows = []
     paths = {name: paths for name, paths in grid.paths.items() if not paths.fixed}
     counts = [k for k in (1, *LEVEL_VIEWS) if k <= grid.max_views]
     known = [level for level in order if level in level_of]
@@ -221,7 +294,9 @@ def by_level(grid: Grid, reference: str, samples: int, rng: np.random.Generator)
         right = {}
         for name, path in paths.items():
             answers = _after(path.answers, path.views, counts)
-            right[name] = grid_mean(grid, (answers == grid.specs.labels[:, None]).astype(np.float64))[mine]
+            right[name] = grid_mean(
+                grid, (answers == grid.specs.labels[:, None]).astype(np.float64)
+            )[mine]
         for name, path in paths.items():
             low, high = st.interval(weights @ right[name])
             travel = grid_mean(grid, _after(path.travel, path.views, counts))[mine].mean(0)
@@ -229,18 +304,37 @@ def by_level(grid: Grid, reference: str, samples: int, rng: np.random.Generator)
             if reference in right and name != reference:
                 against = right[name] - right[reference]
                 drawn = weights @ against
-                compared = np.stack([against.mean(0), *st.interval(drawn), st.bootstrap_p(against.mean(0), drawn)])
-                compared[3, np.array(counts) == 1] = np.nan  # there the policies have chosen nothing
+                compared = np.stack(
+                    [against.mean(0), *st.interval(drawn), st.bootstrap_p(against.mean(0), drawn)]
+                )
+                # there the policies have chosen nothing
+                compared[3, np.array(counts) == 1] = np.nan
             mean = right[name].mean(0)
             for i, k in enumerate(counts):
-                rows.append((level, len(mine), name, k, mean[i], low[i], high[i], travel[i], *compared[:, i]))
+                rows.append(
+                    (
+                        level,
+                        len(mine),
+                        name,
+                        k,
+                        mean[i],
+                        low[i],
+                        high[i],
+                        travel[i],
+                        *compared[:, i],
+                    )
+                )
     table = pd.DataFrame(rows, columns=LEVEL_COLUMNS)
     return table.assign(p_holm=st.holm(table["p"].to_numpy(np.float64)))
 
 
 def _after(values: NDArray, views: NDArray[np.int64], counts: list[int]) -> NDArray:
-    """Values after so many views, or after the last one where an episode ended before, (E, counts)."""
-    return values[np.arange(len(values))[:, None], np.minimum((views >= 0).sum(1)[:, None], counts) - 1]
+    """Values after so many views, or after the last one where an episode ended before, (E,
+    counts).
+    """
+    return values[
+        np.arange(len(values))[:, None], np.minimum((views >= 0).sum(1)[:, None], counts) - 1
+    ]
 
 
 def grid_mean(grid: Grid, values: NDArray) -> Float:

@@ -1,4 +1,6 @@
-"""What no model predicts: true measures and maps of every view, and plans, from predictions and their view store."""
+"""What no model predicts: true measures and maps of every view, and plans, from predictions and
+their view store.
+"""
 
 from collections.abc import Callable
 
@@ -14,7 +16,8 @@ from nextview.recognition.map_names import CONFIDENCE, map_name, measure_of
 TRUE = "true-"  # how the names of true maps begin
 IN_PREDICTIONS: dict[str, Callable[[Predictions], NDArray]] = {  # (N, V); others: in the store
     "depth_entropy": lambda p: normalise_per_object(p.depth_entropy),
-    CONFIDENCE: lambda p: confidence_maps(p.logits, p.labels),  # 0 where the recogniser is wrong (section 4.1.3)
+    # 0 where the recogniser is wrong (section 4.1.3)
+    CONFIDENCE: lambda p: confidence_maps(p.logits, p.labels),
 }
 
 
@@ -22,7 +25,9 @@ def true_map(p: Predictions, name: str) -> NDArray[np.float32]:
     """Local windows of the true map of that name, (N, V, R, 3), 0 .. 1."""
     measure = measure_of(name)
     known = IN_PREDICTIONS.get(measure)
-    values = normalise_per_object(stored_rows(p, f"measures/{measure}")) if known is None else known(p)
+    values = (
+        normalise_per_object(stored_rows(p, f"measures/{measure}")) if known is None else known(p)
+    )
     return values[:, p.sphere.windows]
 
 
@@ -43,15 +48,25 @@ def true_measure(p: Predictions, measure: str) -> NDArray[np.float32]:
 def stored_rows(p: Predictions, name: str) -> NDArray:
     """Rows of one of the store's arrays for the objects of predictions, (N, ...)."""
     if not p.store:
-        raise EntryError("these predictions do not say which view store they were made from, so they lack " + name)
+        raise EntryError(
+            "these predictions do not say which view store they were made from, so they lack "
+            + name
+        )
     try:
         store = ViewStore.open(p.store)
         store.array(name)
         objects = store.rows_of(p.names)
         if (objects < 0).any():
-            raise EntryError(f"{p.store}: holds no object {p.names[objects.argmin()]}, for which {name} is needed")
-        if not np.array_equal(np.array([store.read("measures/depth_entropy", i) for i in objects]), p.depth_entropy):
-            raise EntryError(f"{p.store}: holds other views than those that these predictions were made from")
+            raise EntryError(
+                f"{p.store}: holds no object {p.names[objects.argmin()]}, for which {name} is"
+                " needed"
+            )
+        if not np.array_equal(
+            np.array([store.read("measures/depth_entropy", i) for i in objects]), p.depth_entropy
+        ):
+            raise EntryError(
+                f"{p.store}: holds other views than those that these predictions were made from"
+            )
         return np.array([store.read(name, i) for i in objects])
     except DatasetError as error:
         raise EntryError(str(error)) from error

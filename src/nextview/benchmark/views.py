@@ -1,6 +1,8 @@
-"""Policies after fixed numbers of views: nobody stops early, and each view and each cell of travel is counted.
+"""Policies after fixed numbers of views: nobody stops early, and each view and each cell of travel
+is counted.
 
-A policy chooses without knowing how many views there will be, so it is run once and its path cut after each number.
+A policy chooses without knowing how many views there will be, so it is run once and its path cut
+after each number.
 """
 
 from collections.abc import Sequence
@@ -21,24 +23,35 @@ with extras():
 
 CEILING = "oracle-gain"
 COLUMNS = ["policy", "n_views", "measure", "value", "low", "high", "p", "p_holm"]
-Numbers = dict[tuple[str, int, str], tuple[float, float, float, float, float]]  # value, low, high, p, Holm's p
+# value, low, high, p, Holm's p
+Numbers = dict[tuple[str, int, str], tuple[float, float, float, float, float]]
 
 
 def after(paths: Trajectories, n_views: int) -> Outcome:
     """How the episodes stand after so many views."""
     fields = ("views", "answers", "confidences", "travel", "arc")
-    return truncate(replace(paths, **{name: getattr(paths, name)[:, :n_views] for name in fields}), None)
+    return truncate(
+        replace(paths, **{name: getattr(paths, name)[:, :n_views] for name in fields}), None
+    )
 
 
-def measured(grid: Grid, n_views: Sequence[int], samples: int, references: Sequence[str]) -> pd.DataFrame:
-    """Every number, by COLUMNS, of the policies that take so many views; their paths are as long, or end by themselves.
+def measured(
+    grid: Grid, n_views: Sequence[int], samples: int, references: Sequence[str]
+) -> pd.DataFrame:
+    """Every number, by COLUMNS, of the policies that take so many views; their paths are as long,
+    or end by themselves.
 
-    The measures: ``accuracy``; ``travel``, grid cells; ``to_random`` and so on, differences of accuracy to references;
-    ``share_of_gap``, how much of what ``oracle-gain`` has over the first reference the policy has too. The bootstrap
-    samples are those of the benchmark, the same for all policies, which pairs the differences. p is McNemar's test over
-    objects, corrected by Holm's method for every policy without the truth, reference and number of views.
+    The measures: ``accuracy``; ``travel``, grid cells; ``to_random`` and so on, differences of
+    accuracy to references; ``share_of_gap``, how much of what ``oracle-gain`` has over the first
+    reference the policy has too. The bootstrap samples are those of the benchmark, the same for all
+    policies, which pairs the differences. p is McNemar's test over objects, corrected by Holm's
+    method for every policy without the truth, reference and number of views.
     """
-    names = [name for name, paths in grid.paths.items() if not paths.fixed or paths.views.shape[1] >= max(n_views)]
+    names = [
+        name
+        for name, paths in grid.paths.items()
+        if not paths.fixed or paths.views.shape[1] >= max(n_views)
+    ]
     references = [name for name in references if name in names]
     weights = resample(len(grid.specs.predictions), samples, np.random.default_rng([grid.seed, 1]))
     rows: list[tuple] = []
@@ -49,31 +62,43 @@ def measured(grid: Grid, n_views: Sequence[int], samples: int, references: Seque
         travel = (e.travel.reshape(grid.runs, -1).mean(0) for e in ends)
         columns |= {(name, "travel"): mean for name, mean in zip(names, travel, strict=True)}
         for name, reference in product(names, references):
-            columns[name, f"to_{reference}"] = columns[name, "accuracy"] - columns[reference, "accuracy"]
+            columns[name, f"to_{reference}"] = (
+                columns[name, "accuracy"] - columns[reference, "accuracy"]
+            )
         top = np.stack(list(columns.values()), 1)
         low, high = interval(ratio(top, np.ones_like(top), weights))
         value = dict(zip(columns, top.mean(0), strict=True))
         for i, (name, measure) in enumerate(columns):
             reference = measure.removeprefix("to_")
-            p = mcnemar(right[name], right[reference]) if reference in references and name != reference else np.nan
+            p = (
+                mcnemar(right[name], right[reference])
+                if reference in references and name != reference
+                else np.nan
+            )
             rows.append((name, k, measure, value[name, measure], low[i], high[i], p))
         gap = value[CEILING, f"to_{references[0]}"] if CEILING in names and references else 0.0
         for name in names:
             share = value[name, f"to_{references[0]}"] / gap if gap > 0 else np.nan
             rows.append((name, k, "share_of_gap", share, np.nan, np.nan, np.nan))
     table = pd.DataFrame(rows, columns=COLUMNS[:-1])
-    table["p_holm"] = holm(np.where(~table["policy"].map(knows_truth).astype(bool), table["p"], np.nan))
+    table["p_holm"] = holm(
+        np.where(~table["policy"].map(knows_truth).astype(bool), table["p"], np.nan)
+    )
     return table
 
 
 def by_key(table: pd.DataFrame) -> Numbers:
     """The numbers of a table by policy, number of views and measure."""
-    return {(policy, k, measure): tuple(rest) for policy, k, measure, *rest in table.itertuples(index=False)}
+    return {
+        (policy, k, measure): tuple(rest)
+        for policy, k, measure, *rest in table.itertuples(index=False)
+    }
 
 
 def as_rows(table: pd.DataFrame) -> pd.DataFrame:
     """The table as it is read: a row a policy, its numbers as text."""
-    found, n_views = by_key(table), table["n_views"].unique().tolist()
+    found = by_key(table)
+    n_views = table["n_views"].unique().tolist()
     references = [m.removeprefix("to_") for m in table["measure"].unique() if m.startswith("to_")]
     at = " at " + ", ".join(map(str, n_views))
 
@@ -89,13 +114,21 @@ def as_rows(table: pd.DataFrame) -> pd.DataFrame:
     for name in table["policy"].unique():
         row = {"policy": name}
         for k in n_views:
-            row[f"{k} view{'s' * (k > 1)}"] = "{:.3f} ({:.3f}-{:.3f})".format(*found[name, k, "accuracy"][:3])
+            row[f"{k} view{'s' * (k > 1)}"] = "{:.3f} ({:.3f}-{:.3f})".format(
+                *found[name, k, "accuracy"][:3]
+            )
         row[f"travel{at}"] = ", ".join(f"{found[name, k, 'travel'][0]:.2f}" for k in n_views)
         for reference in references:
-            over = "" if name == reference else ", ".join(difference(name, k, reference) for k in n_views)
+            over = (
+                ""
+                if name == reference
+                else ", ".join(difference(name, k, reference) for k in n_views)
+            )
             row[f"points over {reference}{at}"] = over
         shares = [found[name, k, "share_of_gap"][0] for k in n_views]
-        row[f"of the gap{at}"] = ", ".join("-" if np.isnan(s) else f"{100 * s:.0f} %" for s in shares)
+        row[f"of the gap{at}"] = ", ".join(
+            "-" if np.isnan(s) else f"{100 * s:.0f} %" for s in shares
+        )
         rows.append(row)
     return pd.DataFrame(rows)
 

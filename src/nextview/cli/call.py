@@ -1,4 +1,6 @@
-"""Call a function with the arguments of a command line: tyro reads its parameters, their comments and its docstring."""
+"""Call a function with the arguments of a command line: tyro reads its parameters, their
+comments and its docstring.
+"""
 
 import inspect
 import re
@@ -26,7 +28,9 @@ def find(path: str) -> Any:
     return getattr(import_module(module), name)
 
 
-def call(name: str, command: Command, arguments: Sequence[str], track: Callable[..., None]) -> tuple[Any, dict]:
+def call(
+    name: str, command: Command, arguments: Sequence[str], track: Callable[..., None]
+) -> tuple[Any, dict]:
     """What the function of a command returns, and its arguments by their names."""
     run, called = entry(command, arguments, track)
     returned = tyro.cli(run, prog=f"nextview {name}", args=arguments, config=CONFIG)
@@ -36,10 +40,12 @@ def call(name: str, command: Command, arguments: Sequence[str], track: Callable[
 def entry(
     command: Command, arguments: Sequence[str] = (), track: Callable[..., None] | None = None
 ) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """A function that tyro can ask for on a command line, and a dictionary of the arguments that it is called with.
+    """A function that tyro can ask for on a command line, and a dictionary of the arguments that it
+    is called with.
 
-    Parameters without a default, and those that are positional only, are arguments; all others are options. A parameter
-    ``track`` is given, and is not asked for. ``arguments`` tell whether the defaults are those of another preset.
+    Parameters without a default, and those that are positional only, are arguments; all others are
+    options. A parameter ``track`` is given, and is not asked for. ``arguments`` tell whether the
+    defaults are those of another preset.
     """
     function = find(command.function)
     signature = inspect.signature(function)
@@ -54,7 +60,10 @@ def entry(
             parameters.append(parameter.replace(annotation=kind))
     if command.thesis:
         if re.search(r"(^| )--preset[ =]thesis( |$)", " ".join(arguments)):
-            parameters = [p.replace(default=find(command.thesis)) if p.name == "recipe" else p for p in parameters]
+            parameters = [
+                p.replace(default=find(command.thesis)) if p.name == "recipe" else p
+                for p in parameters
+            ]
         kind = Annotated[Literal["default", "thesis"], tyro.conf.arg(help=PRESET)]
         keyword = inspect.Parameter.KEYWORD_ONLY
         parameters.append(inspect.Parameter("preset", keyword, default="default", annotation=kind))

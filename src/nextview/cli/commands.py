@@ -1,36 +1,61 @@
-"""The commands of ``nextview``: a table from each name to the function that it calls, which is imported when called."""
+"""The commands of ``nextview``: a table from each name to the function that it calls, which is
+imported when called.
+"""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Command:
-    """A command: the function whose parameters are its options and whose docstring is its help."""
+    """A command: the function whose parameters are its options and whose docstring is its help.
+
+    Attributes:
+        line: in the list of all commands.
+        then: printed at the end; names in braces are arguments, ``found`` is what the function
+            returns.
+        show: the function that shows what it returns.
+        thesis: the recipe that --preset thesis names.
+    """
 
     function: str
-    line: str  # in the list of all commands
-    then: str = ""  # printed at the end; names in braces are arguments, ``found`` is what the function returns
-    show: str = ""  # the function that shows what it returns
-    thesis: str = ""  # the recipe that --preset thesis names
+    line: str
+    then: str = ""
+    show: str = ""
+    thesis: str = ""
 
 
-CLI, LEARNING = "nextview.cli", "nextview.learning"
-THESIS, EXPORT = f"{LEARNING}.recipes:THESIS", f"{LEARNING}.export:export"
-EXPORTED = "{found.card}: largest difference between torch and ONNX on real views {found.difference:.2g}"
+CLI = "nextview.cli"
+LEARNING = "nextview.learning"
+THESIS = f"{LEARNING}.recipes:THESIS"
+EXPORT = f"{LEARNING}.export:export"
+EXPORTED = (
+    "{found.card}: largest difference between torch and ONNX on real views {found.difference:.2g}"
+)
 COMMANDS = {  # by name, in the order in which they are listed
-    "recognise": Command(f"{CLI}.recognise:recognise", "say what an object is: a mesh file, or captured views"),
+    "recognise": Command(
+        f"{CLI}.recognise:recognise", "say what an object is: a mesh file, or captured views"
+    ),
     "demo": Command(f"{CLI}.recognise:demo", "recognise a sample object, and draw the episode"),
     "learn": Command(
         f"{LEARNING}.learn:learn_things",
         "teach it your things: scans, or depth frames; minutes",
-        "{found}\nnext: nextview recognise MESH --models {out}; what was learned is drawn in {out}/learned.png",
+        "{found}\nnext: nextview recognise MESH --models {out}; what was learned is drawn in"
+        " {out}/learned.png",
     ),
-    "explore": Command(f"{CLI}.explore:explore", "choose views in the browser, and see what is believed"),
-    "capture": Command(f"{CLI}.scenes:capture", "write depth images of a mesh, as a camera would take them"),
-    "completion": Command(f"{CLI}.completion:completion", "print what a shell completes: bash, zsh or fish"),
+    "explore": Command(
+        f"{CLI}.explore:explore", "choose views in the browser, and see what is believed"
+    ),
+    "capture": Command(
+        f"{CLI}.scenes:capture", "write depth images of a mesh, as a camera would take them"
+    ),
+    "completion": Command(
+        f"{CLI}.completion:completion", "print what a shell completes: bash, zsh or fish"
+    ),
     "list": Command(f"{CLI}.listing:show", "list the bundled models, or the view measures"),
     "download": Command(f"{CLI}.listing:download", "download ModelNet10 or ModelNet40"),
-    "scenes": Command(f"{CLI}.scenes:scenes", "draw cluttered scenes, a target half hidden in each"),
+    "scenes": Command(
+        f"{CLI}.scenes:scenes", "draw cluttered scenes, a target half hidden in each"
+    ),
     "render": Command(f"{CLI}.stores:render", "render every view of a dataset into a view store"),
     "check": Command(f"{CLI}.stores:check", "check that a view store is sound"),
     "measure": Command(f"{CLI}.stores:measure", "compute view measures, into the store"),
@@ -49,26 +74,29 @@ COMMANDS = {  # by name, in the order in which they are listed
     "train gain": Command(
         f"{LEARNING}.gain_training:train_gain",
         "train the policy that predicts the gain of a view",
-        "learned from {found.objects} objects; on {found.validated_on} the {recipe.objective} after 2, 3, ... views is "
-        "{found.value} at travel weight 0; travel weight {found.travel_weight:g}: {found.card}; in {found.states} "
-        "states its answers differ from the networks' by {found.difference:.1g} at most",
+        "learned from {found.objects} objects; on {found.validated_on} the {recipe.objective} after"
+        " 2, 3, ... views is {found.value} at travel weight 0; travel weight"
+        " {found.travel_weight:g}: {found.card}; in {found.states} states its answers differ from"
+        " the networks' by {found.difference:.1g} at most",
     ),
-    "export recogniser": Command(f"{EXPORT}_recogniser", "turn a trained recogniser into a model", EXPORTED),
+    "export recogniser": Command(
+        f"{EXPORT}_recogniser", "turn a trained recogniser into a model", EXPORTED
+    ),
     "export map": Command(f"{EXPORT}_map", "turn a trained map network into a model", EXPORTED),
     "predict": Command(f"{CLI}.predict:predict", "run the models over every view of a store, once"),
     "fit calibration": Command(
         f"{LEARNING}.card_fits:fit_calibration",
         "calibrate a recogniser's belief",
-        "{found.objects} objects: temperature of one view {found.calibration.temperature}, correlation of two views "
-        "{found.calibration.correlation}; negative log-likelihood over 1 to 5 views {found.before:.3f} before, "
-        "{found.after:.3f} after",
+        "{found.objects} objects: temperature of one view {found.calibration.temperature},"
+        " correlation of two views {found.calibration.correlation}; negative log-likelihood over 1"
+        " to 5 views {found.before:.3f} before, {found.after:.3f} after",
     ),
     "fit size": Command(
         f"{LEARNING}.card_fits:fit_size",
         "learn how large the objects of each class are",
-        "sizes of {found.objects} objects; by {found.weighed_on} others, weight beside the logits "
-        "{found.size.weight:.2f}; negative log-likelihood of single views {found.before:.3f} by shape alone, "
-        "{found.after:.3f} with the size",
+        "sizes of {found.objects} objects; by {found.weighed_on} others, weight beside the logits"
+        " {found.size.weight:.2f}; negative log-likelihood of single views {found.before:.3f} by"
+        " shape alone, {found.after:.3f} with the size",
     ),
     "fit unknown": Command(
         f"{LEARNING}.unknown:fit_unknown",
@@ -93,6 +121,11 @@ COMMANDS = {  # by name, in the order in which they are listed
         "next: nextview report {out}",
         f"{CLI}.leaderboard_table:print_results",
     ),
-    "report": Command("nextview.benchmark.report:report", "write one HTML page of a benchmark's results", "{found}"),
+    "report": Command(
+        "nextview.benchmark.report:report",
+        "write one HTML page of a benchmark's results",
+        "{found}",
+    ),
 }
-RESUMES = ("render", "measure", "predict", "train recogniser", "train map", "learn", "scenes")  # resumable
+# resumable
+RESUMES = ("render", "measure", "predict", "train recogniser", "train map", "learn", "scenes")

@@ -9,12 +9,15 @@ from nextview.cli.stand_ins import stand_ins
 
 
 def completion(
-    shell: Literal["bash", "zsh", "fish"],  # which shell
+    shell: Literal["bash", "zsh", "fish"],
     /,
 ) -> None:
     """Print the script by which a shell completes commands, options and their values.
 
     For bash: nextview completion bash > ~/.local/share/bash-completion/completions/nextview
+
+    Args:
+        shell: which shell.
     """
     from nextview.cli.commands import COMMANDS
 

@@ -1,4 +1,6 @@
-"""How a command ends, whatever happens: a mistake of the user's in one sentence, a bug with its traceback."""
+"""How a command ends, whatever happens: a mistake of the user's in one sentence, a bug with its
+traceback.
+"""
 
 import io
 import os
@@ -19,7 +21,9 @@ def printable(text: str) -> str:
     >>> print(printable("a\x1b[31mb"))
     a\x1b[31mb
     """
-    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
+    return "".join(
+        c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text
+    )
 
 
 @contextmanager
@@ -42,15 +46,20 @@ def orderly_end(after_ctrl_c: str) -> Iterator[None]:
             raise
         _end(f"{error.filename}: {error.strerror}", 2)
     except (KeyboardInterrupt, SystemExit) as ended:
-        if not isinstance(ended.__context__ if isinstance(ended, SystemExit) else ended, KeyboardInterrupt):
+        if not isinstance(
+            ended.__context__ if isinstance(ended, SystemExit) else ended, KeyboardInterrupt
+        ):
             raise  # an exit; Lightning makes one of a KeyboardInterrupt
         warnings.simplefilter("ignore")
-        sys.unraisablehook = lambda unraisable: None  # reads that zarr has begun complain of being left
+        # reads that zarr has begun complain of being left
+        sys.unraisablehook = lambda unraisable: None
         _end(f"stopped; {after_ctrl_c}", 130)
 
 
 def _print_anything() -> None:
-    """Print what an output of another encoding than UTF-8 lacks as codes: ASCII has no degrees, cp1252 no Chinese."""
+    """Print what an output of another encoding than UTF-8 lacks as codes: ASCII has no degrees,
+    cp1252 no Chinese.
+    """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -61,7 +70,9 @@ def _end(sentence: str, status: int) -> Any:
     sys.exit(status)
 
 
-def require(extra: str, packages: Mapping[str, tuple[str, ...]] = EXTRAS, project: str = "nextview") -> None:
+def require(
+    extra: str, packages: Mapping[str, tuple[str, ...]] = EXTRAS, project: str = "nextview"
+) -> None:
     """End a script, before its imports fail, with the sentence that says what to install.
 
     With --help it goes on: stand-ins are imported for what is missing, and its help is shown.

@@ -1,4 +1,6 @@
-"""``nextview explore``: an object, the views of it and what policies value them at, in the browser."""
+"""``nextview explore``: an object, the views of it and what policies value them at, in the
+browser.
+"""
 
 import os
 import sys
@@ -11,26 +13,41 @@ from nextview.cli.sources import Looking, Unit
 
 
 def explore(
-    # a mesh file; a folder of meshes, or of class folders of them; a view store. The sample objects if not given
     path: Path | None = None,
     /,
-    looking: Looking = Looking(),  # who looks; exploring goes on where an episode would end
-    compare: str | None = None,  # another policy, to walk beside it
-    # look through a sensor with all its errors: kinect, stereo, setup, wrist or none, or NAME:STRENGTH
+    looking: Looking = Looking(),
+    compare: str | None = None,
     sensor: str | None = None,
-    start: int | None = None,  # where policies look first; drawn by the seed if not given
-    up: Literal["y", "z"] | None = None,  # the up axis of mesh files; z if not given, but y for GLB
-    unit: Unit | None = None,  # the unit of length of mesh files: the size of an object says something of its class
-    seed: int = 0,  # decides the first view, whatever a policy draws and the errors of a sensor
-    # address to serve the page at; 0.0.0.0 lets every machine that reaches this one see and drive the page
+    start: int | None = None,
+    up: Literal["y", "z"] | None = None,
+    unit: Unit | None = None,
+    seed: int = 0,
     host: str = "127.0.0.1",
-    port: int = 8080,  # of the page; the next free one if it is taken
-    browser: bool = True,  # by default the page opens in this machine's browser, where it has a screen
+    port: int = 8080,
+    browser: bool = True,
 ) -> None:
-    """Look at objects in the browser: click where to look from, or let a policy walk, and see what it believes.
+    """Look at objects in the browser: click where to look from, or let a policy walk, and see what
+    it believes.
 
-    Candidate views are coloured by what the policy values them at. Images, local maps and belief follow at once. Two
-    policies walk side by side, with clean renders or through a sensor with its errors.
+    Candidate views are coloured by what the policy values them at. Images, local maps and belief
+    follow at once. Two policies walk side by side, with clean renders or through a sensor with its
+    errors.
+
+    Args:
+        path: a mesh file; a folder of meshes, or of class folders of them; a view store. The sample
+            objects if not given.
+        looking: who looks; exploring goes on where an episode would end.
+        compare: another policy, to walk beside it.
+        sensor: look through a sensor with all its errors: kinect, stereo, setup, wrist or none, or
+            NAME:STRENGTH.
+        start: where policies look first; drawn by the seed if not given.
+        up: the up axis of mesh files; z if not given, but y for GLB.
+        unit: the unit of length of mesh files: the size of an object says something of its class.
+        seed: decides the first view, whatever a policy draws and the errors of a sensor.
+        host: address to serve the page at; 0.0.0.0 lets every machine that reaches this one see and
+            drive the page.
+        port: of the page; the next free one if it is taken.
+        browser: by default the page opens in this machine's browser, where it has a screen.
     """
     with extras():
         import viser  # noqa: F401  # a missing extra is named before models are opened
@@ -40,11 +57,19 @@ def explore(
 
     options = dict(vars(looking))
     policies = [options.pop("policy"), *([] if compare is None else [compare])]
-    page = Page(Exploration(shown_objects(path, up, unit), policies, sensor, start, seed, **options), host, port)
+    page = Page(
+        Exploration(shown_objects(path, up, unit), policies, sensor, start, seed, **options),
+        host,
+        port,
+    )
     console.print(f"{page.address} shows {len(page.exploration.objects)} objects; Ctrl-C ends it")
     if host not in ("127.0.0.1", "localhost", "::1"):
         console.print("Everybody who reaches this address may drive the page.", style="yellow")
-    screen = sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    screen = (
+        sys.platform in ("darwin", "win32")
+        or os.environ.get("DISPLAY")
+        or os.environ.get("WAYLAND_DISPLAY")
+    )
     if browser and screen:  # else a browser would open in the terminal
         import webbrowser
 

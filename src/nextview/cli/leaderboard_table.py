@@ -25,13 +25,19 @@ def print_results(found: Results) -> None:
 
 
 def print_leaderboard(results: Results) -> None:
-    """Print the policies under the headline threshold, what may be concluded from them, and what was promised."""
-    tables, reference = results.tables, results.settings["reference"]
+    """Print the policies under the headline threshold, what may be concluded from them, and what
+    was promised.
+    """
+    tables = results.tables
+    reference = results.settings["reference"]
     console = Terminal()
     if not tables.sweep.empty:
         at = board.headline_threshold(results.settings["thresholds"])
         console.print(_policies(board.leaderboard(tables, at), at, reference))
-        console.print(f"* differs from {reference} in accuracy: p after Holm's correction is below {board.SIGNIFICANT}")
+        console.print(
+            f"* differs from {reference} in accuracy: p after Holm's correction is below"
+            f" {board.SIGNIFICANT}"
+        )
         few = board.too_few(tables, at, len(results.predictions))
         for sentence in (board.nothing_differs(tables, at, reference), few):
             if sentence:
@@ -42,7 +48,10 @@ def print_leaderboard(results: Results) -> None:
         console.print(sentence)
     for r in board.promised_risks(tables):
         if r.broken:
-            wrong = f"of the episodes that stopped at {r.threshold:.4g}, {100 * r.error:.1f} % are wrong"
+            wrong = (
+                f"of the episodes that stopped at {r.threshold:.4g}, {100 * r.error:.1f} % are"
+                " wrong"
+            )
             console.print(f"{r.policy}: {wrong}; at most {100 * r.risk:g} % was promised.")
 
 
@@ -54,35 +63,57 @@ def _policies(rows: list[Any], threshold: float, reference: str) -> Table:
     for column in ("accuracy", "class\nmean", "views", "travel\ncells", f"over\n{reference}", "p"):
         table.add_column(column, justify="right", no_wrap=True)
     for i, s in enumerate(rows):
-        oracle, over, p = is_oracle(s.policy), "", ""
+        oracle = is_oracle(s.policy)
+        over = ""
+        p = ""
         if oracle and i > 0 and not is_oracle(rows[i - 1].policy):
             table.add_section()
             table.add_row("oracles:", style="dim")
         if s.p_holm == s.p_holm:  # not the reference
             over = f"{round(100 * s.difference, 1) + 0.0:+.1f}"
-            p = ("< 0.001" if s.p_holm < 0.001 else f"{s.p_holm:.3f}") + (" *" if s.differs else "  ")
+            p = ("< 0.001" if s.p_holm < 0.001 else f"{s.p_holm:.3f}") + (
+                " *" if s.differs else "  "
+            )
         accuracy = f"{s.accuracy:.3f} ({s.low:.3f}-{s.high:.3f})", f"{s.class_accuracy:.3f}"
         style = "dim" if oracle else "bold" if s.differs else None
-        table.add_row(s.policy, *accuracy, f"{s.n_views:.2f}", f"{s.travel:.2f}", over, p, style=style)
+        table.add_row(
+            s.policy, *accuracy, f"{s.n_views:.2f}", f"{s.travel:.2f}", over, p, style=style
+        )
     return table
 
 
 def print_evaluation(found: Evaluation) -> None:
     """Print how often the recogniser is right, and how good each map is; its page says more."""
-    console, right = Terminal(), numbers(found.accuracy, "n_views", "label", "measure")
+    console = Terminal()
+    right = numbers(found.accuracy, "n_views", "label", "measure")
     views = int(found.accuracy["n_views"].max())
-    lines = {"mean of objects": "accuracy", "without duplicates": "clean_accuracy", "size not known": "shape_accuracy"}
+    lines = {
+        "mean of objects": "accuracy",
+        "without duplicates": "clean_accuracy",
+        "size not known": "shape_accuracy",
+    }
     shown = Table("share of right answers", "one view", f"all {views} views")
     for heading, measure in (lines | {"mean of classes": "class_accuracy"}).items():
         if (1, "", measure) in right:
-            shown.add_row(heading, *(_cell(right[n_views, "", measure], 3) for n_views in (1, views)))
+            shown.add_row(
+                heading, *(_cell(right[n_views, "", measure], 3) for n_views in (1, views))
+            )
     console.print(shown)
-    headings = {"mse": "MSE", "d0": "d = 0", "d_le_1": "d <= 1", "d_lt_2": "d < 2", "regret": "regret"}
+    headings = {
+        "mse": "MSE",
+        "d0": "d = 0",
+        "d_le_1": "d <= 1",
+        "d_lt_2": "d < 2",
+        "regret": "regret",
+    }
     maps = found.maps[(found.maps["by"] == "network") & (found.maps["label"] == "")]
-    scores, names = numbers(maps, "map", "measure"), maps["map"].unique()
+    scores = numbers(maps, "map", "measure")
+    names = maps["map"].unique()
     shown = Table("mean of objects", *(name.upper() for name in names))
     for measure, heading in headings.items():
-        shown.add_row(heading, *(_cell(scores[name, measure], 4 if measure == "mse" else 3) for name in names))
+        shown.add_row(
+            heading, *(_cell(scores[name, measure], 4 if measure == "mse" else 3) for name in names)
+        )
     if len(names):
         console.print(shown)
     for name, why in found.left_out.items():
@@ -92,5 +123,7 @@ def print_evaluation(found: Evaluation) -> None:
 def _cell(number: Number, digits: int) -> Text:
     if not isfinite(number.value):
         return Text("-")
-    interval = f" {number.low:.{digits}f}-{number.high:.{digits}f}" if number.high > number.low else ""
+    interval = (
+        f" {number.low:.{digits}f}-{number.high:.{digits}f}" if number.high > number.low else ""
+    )
     return Text.assemble(f"{number.value:.{digits}f}", (interval, "dim"))

@@ -1,4 +1,6 @@
-"""``nextview list`` and ``nextview download``: what ships with the package, and published datasets."""
+"""``nextview list`` and ``nextview download``: what ships with the package, and published
+datasets.
+"""
 
 from functools import partial
 from pathlib import Path
@@ -13,21 +15,27 @@ from nextview.recognition.model_card import bundled_cards, find_card
 
 
 def show(
-    what: Literal["models", "measures"],  # models or measures
-    name: str | None = None,  # of a model: print its whole card
+    what: Literal["models", "measures"],
+    name: str | None = None,
     /,
 ) -> None:
     """List the bundled models, or the view measures: what makes a view good.
 
-    A measure that needs the depth is computed from a view store alone. Of those that need the mesh, and of measures of
-    your own, docs/add_a_measure.md tells.
+    A measure that needs the depth is computed from a view store alone. Of those that need the mesh,
+    and of measures of your own, docs/add_a_measure.md tells.
+
+    Args:
+        what: models or measures.
+        name: of a model: print its whole card.
     """
     if what == "measures":
         from nextview.data.measures import all_measures
 
         table = Table("measure", "needs", "better views", "source")
         for key, measure in all_measures().items():
-            table.add_row(key, measure.needs, "high" if measure.good == "peak" else "low", measure.source)
+            table.add_row(
+                key, measure.needs, "high" if measure.good == "peak" else "low", measure.source
+            )
         return Terminal().print(table)
     if name:
         return print(find_card(name).card_path.read_text(encoding="utf-8"))
@@ -39,20 +47,38 @@ def show(
             if split.startswith("test"):
                 tested.append(split)
                 for score, value in scores.items():
-                    mean = f"{value['instance']}\n    class mean {value['class']}" if isinstance(value, dict) else value
+                    mean = (
+                        f"{value['instance']}\n    class mean {value['class']}"
+                        if isinstance(value, dict)
+                        else value
+                    )
                     tested.append(f"  {score.replace('_', ' ')} {mean}")
         intact = "intact" if sha256_of(card.path) == card.sha256 else "DAMAGED"
-        table.add_row(card.name, card.kind, f"{card.path.stat().st_size / 1e6:.1f}", "\n".join(tested), intact)
+        table.add_row(
+            card.name, card.kind, f"{card.path.stat().st_size / 1e6:.1f}", "\n".join(tested), intact
+        )
     return Terminal().print(table)
 
 
 def download(
-    name: Literal["modelnet10", "modelnet40"],  # which one
-    out: Path,  # folder to put it into, as OUT/ModelNet10
+    name: Literal["modelnet10", "modelnet40"],
+    out: Path,
     /,
 ) -> None:
-    """Download ModelNet10 (473 MB) or ModelNet40 (2 GB), verify and unpack it."""
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+    """Download ModelNet10 (473 MB) or ModelNet40 (2 GB), verify and unpack it.
+
+    Args:
+        name: which one.
+        out: folder to put it into, as OUT/ModelNet10.
+    """
+    from rich.progress import (
+        BarColumn,
+        DownloadColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+        TransferSpeedColumn,
+    )
 
     from nextview.data.downloading import ARCHIVES
     from nextview.data.downloading import download as fetch
@@ -60,7 +86,10 @@ def download(
     archive = ARCHIVES[name]
     columns = BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()
     with Progress(TextColumn("{task.description}"), *columns, console=console) as progress:
-        move = partial(progress.update, progress.add_task(f"downloading {archive.folder}", total=None))
-        bar = SimpleNamespace(total=0, reset=partial(move, completed=0), close=lambda: None)  # as pooch wants it
+        move = partial(
+            progress.update, progress.add_task(f"downloading {archive.folder}", total=None)
+        )
+        # as pooch wants it
+        bar = SimpleNamespace(total=0, reset=partial(move, completed=0), close=lambda: None)
         bar.update = lambda advance: move(advance=advance, total=bar.total)
         console.print(f"{fetch(archive, out, bar=bar)}")

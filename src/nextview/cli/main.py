@@ -18,8 +18,11 @@ def main(arguments: list[str] | None = None) -> None:
     """Run a command; see ``orderly_end`` for how it may end."""
     arguments = sys.argv[1:] if arguments is None else arguments
     resumes = " ".join(arguments[:2]).startswith(RESUMES)
-    os.environ["COLUMNS"] = str(min(max(shutil.get_terminal_size().columns, 20), 500))  # tyro hangs in fewer
-    with orderly_end("run the same command again; it resumes" if resumes else "nothing was written"):
+    # tyro hangs in fewer
+    os.environ["COLUMNS"] = str(min(max(shutil.get_terminal_size().columns, 20), 500))
+    with orderly_end(
+        "run the same command again; it resumes" if resumes else "nothing was written"
+    ):
         _run(arguments)
 
 
@@ -31,7 +34,11 @@ def _run(arguments: list[str]) -> None:
         if (name := " ".join(words[:count])) in COMMANDS:
             return _call(name, arguments[count:])
     group = words[0] if words else ""
-    listed = {name: command.line for name, command in COMMANDS.items() if f"{name} ".startswith(f"{group} ".lstrip())}
+    listed = {
+        name: command.line
+        for name, command in COMMANDS.items()
+        if f"{name} ".startswith(f"{group} ".lstrip())
+    }
     if len(words) == 2 or not listed:
         name = " ".join(words) if listed else group
         near = did_you_mean(name, [*COMMANDS, *(name.split()[0] for name in COMMANDS)])

@@ -13,48 +13,77 @@ from nextview.recognition.model_card import find_card, find_models
 
 
 def predict(
-    store: Path,  # view store made by nextview render
-    out: Path,  # predictions to make (.npz), from which nextview benchmark replays policies
+    store: Path,
+    out: Path,
     /,
-    split: Split | None = None,  # only this split
-    models: str = "modelnet10",  # bundled models by name, or a folder with models of your own
-    recogniser: str | None = None,  # instead, name of a bundled model or path of a card
-    held_out: str | None = None,  # only the objects that this model (its name or card) held out of its training
-    # maps to predict with those models, or NAME=CARD for others; all that those models predict by default
+    split: Split | None = None,
+    models: str = "modelnet10",
+    recogniser: str | None = None,
+    held_out: str | None = None,
     maps: tuple[str, ...] | None = None,
-    # recognise by shape alone. By default the size of the objects counts too, where the store knows it (nextview render
-    # --unit) and the card of the recogniser says what sizes mean (nextview fit size)
     by_shape: bool = False,
     workers: Workers = Workers(),
-    overwrite: bool = False,  # replace the predictions that are there
+    overwrite: bool = False,
 ) -> None:
-    """Run the recogniser and the map networks over every view of a store, once. Resumes where it was."""
+    """Run the recogniser and the map networks over every view of a store, once.
+
+    Resumes where it was.
+
+    Args:
+        store: view store made by nextview render.
+        out: predictions to make (.npz), from which nextview benchmark replays policies.
+        split: only this split.
+        models: bundled models by name, or a folder with models of your own.
+        recogniser: instead, name of a bundled model or path of a card.
+        held_out: only the objects that this model (its name or card) held out of its training.
+        maps: maps to predict with those models, or NAME=CARD for others; all that those models
+            predict by default.
+        by_shape: recognise by shape alone. By default the size of the objects counts too, where the
+            store knows it (nextview render --unit) and the card of the recogniser says what sizes
+            mean (nextview fit size).
+        overwrite: replace the predictions that are there.
+    """
     if out.suffix != ".npz":
         raise UsageError(f"{out}: predictions are one .npz file; end the name in .npz")
-    found, cards = find_models(models), {}
+    found = find_models(models)
+    cards = {}
     for item in found.maps if maps is None else maps:
         name, _, card = item.partition("=")
         if not card and name not in found.maps:
-            raise ModelError(f"no network of {models} predicts the map {name!r}; there are {', '.join(found.maps)}")
+            raise ModelError(
+                f"no network of {models} predicts the map {name!r}; there are"
+                f" {', '.join(found.maps)}"
+            )
         cards[name] = find_card(card or found.maps[name])
     what = find_card(recogniser or found.recogniser), cards, split, held_out, not by_shape
-    follow(predicting.predict(store, out, *what, **vars(workers), overwrite=overwrite), f"predicting {store.name}")
+    follow(
+        predicting.predict(store, out, *what, **vars(workers), overwrite=overwrite),
+        f"predicting {store.name}",
+    )
     for line in summed_up(Predictions.load(out)):
         console.print(line)
-    console.print(f"predictions in {out}; compare policies with: nextview benchmark {out} RESULTS", soft_wrap=True)
+    console.print(
+        f"predictions in {out}; compare policies with: nextview benchmark {out} RESULTS",
+        soft_wrap=True,
+    )
 
 
 def summed_up(p: Predictions) -> list[str]:
     """How often the recogniser is right in each split, from single views and from all of them."""
     lines: list[str] = []
-    answers, of_all = p.logits.argmax(2), p.logits.sum(1).argmax(1)
+    answers = p.logits.argmax(2)
+    of_all = p.logits.sum(1).argmax(1)
     if p.calibration.hypotheses:  # taught things: what is said of azimuths tells
         classes = len(p.classes)
         answers = p.calibration.log_belief(p.log_evidence, 1, classes).argmax(2)
         of_all = p.calibration.log_belief(p.log_evidence.sum(1), len(p.sphere), classes).argmax(1)
-    right, fused = answers == p.labels[:, None], of_all == p.labels
+    right = answers == p.labels[:, None]
+    fused = of_all == p.labels
     for split in np.unique(p.splits):
         here = p.splits == split
-        shares = f"right from one view {right[here].mean():.3f}, from all {len(p.sphere)} {fused[here].mean():.3f}"
+        shares = (
+            f"right from one view {right[here].mean():.3f}, from all {len(p.sphere)}"
+            f" {fused[here].mean():.3f}"
+        )
         lines.append(f"{here.sum()} {split} objects: {shares}".replace("  ", " "))
     return lines

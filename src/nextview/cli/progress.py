@@ -15,7 +15,9 @@ EVERY = 30.0  # seconds between two lines where the output is no terminal
 
 
 class Terminal(Console):
-    """Prints text as it is: brackets and colons in names are no markup, and control characters are shown, not sent."""
+    """Prints text as it is: brackets and colons in names are no markup, and control characters
+    are shown, not sent.
+    """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, **options)
@@ -34,19 +36,28 @@ def track(done: Iterable[int], total: int, what: str, /) -> None:
 
 
 def follow(steps: Iterator[tuple[int, int]], what: str) -> tuple[int, int]:
-    """Track a stage that yields how many are done, of how many; return how many were done before, of how many."""
+    """Track a stage that yields how many are done, of how many; return how many were done
+    before, of how many.
+    """
     before, total = next(steps)
     track((done for done, _ in steps), total, what)
     return before, total
 
 
 def say_done(where: Path, done: str, before: int, total: int) -> None:
-    """Say at the end of a stage that resumes what this run did: ``done`` is a participle ("measured", "planned")."""
+    """Say at the end of a stage that resumes what this run did: ``done`` is a participle
+    ("measured", "planned").
+    """
     if before == total:
-        console.print(f"{where}: nothing was left to do; all {total} objects were {done} before", soft_wrap=True)
+        console.print(
+            f"{where}: nothing was left to do; all {total} objects were {done} before",
+            soft_wrap=True,
+        )
         return
     earlier = f", {before} were before" if before else ""
-    console.print(f"{where}: {total - before} of {total} objects {done} now{earlier}", soft_wrap=True)
+    console.print(
+        f"{where}: {total - before} of {total} objects {done} now{earlier}", soft_wrap=True
+    )
 
 
 def _show_bar(done: Iterable[int], total: int, what: str) -> None:

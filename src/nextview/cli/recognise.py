@@ -17,36 +17,54 @@ DEMO_PICTURE = Path("nextview_demo.png")
 
 @dataclass(frozen=True)
 class Output:
-    """What is made of it."""
+    """What is made of it.
 
-    figure: Path | None = None  # write a picture of the episode to this file (PNG, PDF or SVG)
-    record: Path | None = None  # write the episode to this file (.rrd), for the Rerun viewer
-    json: bool = False  # print JSON instead of a table
-    overwrite: bool = False  # replace these files if they exist
+    Attributes:
+        figure: write a picture of the episode to this file (PNG, PDF or SVG).
+        record: write the episode to this file (.rrd), for the Rerun viewer.
+        json: print JSON instead of a table.
+        overwrite: replace these files if they exist.
+    """
+
+    figure: Path | None = None
+    record: Path | None = None
+    json: bool = False
+    overwrite: bool = False
 
 
 def recognise(
-    path: Path,  # OFF, OBJ, PLY, STL or GLB file of one object that stands upright; or a folder of captured views
-    more: tuple[Path, ...] = (),  # further ones; with --json each is a line
+    path: Path,
+    more: tuple[Path, ...] = (),
     /,
     source: Source = Source(),
     looking: Looking = Looking(),
     output: Output = Output(),
-    # first view; of the 40, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not given
     start: int | None = None,
-    seed: int = 0,  # decides the first view, whatever the policy draws and the errors of a sensor
+    seed: int = 0,
 ) -> None:
     """Recognise an object by next best views, and show where it looked and why.
 
-    The object is in a mesh file, or in a folder of captured depth images with poses in the layout of BOP, TUM RGB-D or
-    7-Scenes. Of these the view nearest to the one asked for answers. The object is what the masks show; else what lies
-    in the box; else the thing on the support plane that is nearest to the point, or at which the first camera is aimed.
+    The object is in a mesh file, or in a folder of captured depth images with poses in the layout
+    of BOP, TUM RGB-D or 7-Scenes. Of these the view nearest to the one asked for answers. The
+    object is what the masks show; else what lies in the box; else the thing on the support plane
+    that is nearest to the point, or at which the first camera is aimed.
+
+    Args:
+        path: OFF, OBJ, PLY, STL or GLB file of one object that stands upright; or a folder of
+            captured views.
+        more: further ones; with --json each is a line.
+        start: first view; of the 40, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not
+            given.
+        seed: decides the first view, whatever the policy draws and the errors of a sensor.
     """
     if more and (output.figure or output.record):
-        raise UsageError("--figure and --record are of one object; give them with one file or folder")
+        raise UsageError(
+            "--figure and --record are of one object; give them with one file or folder"
+        )
     check_file(output.figure, output.overwrite)
     check_file(output.record, output.overwrite, (".rrd",))
-    system, failed = load(**vars(looking)), []
+    system = load(**vars(looking))
+    failed = []
     for one in (path, *more):
         name = one.name if source.sensor is None else f"{one.name} through {source.sensor}"
         try:
@@ -61,12 +79,19 @@ def recognise(
 
 
 def demo(
-    shape: Literal["table", "chair", "monitor"] = "table",  # which one
-    start: int = 33,  # first view, 0 to 39
-    figure: Path | None = None,  # where to write the picture; nextview_demo.png, that of the last demo, if not given
-    overwrite: bool = False,  # replace a picture of another name if it exists
+    shape: Literal["table", "chair", "monitor"] = "table",
+    start: int = 33,
+    figure: Path | None = None,
+    overwrite: bool = False,
 ) -> None:
-    """Recognise a sample object that ships with nextview, and draw the episode."""
+    """Recognise a sample object that ships with nextview, and draw the episode.
+
+    Args:
+        shape: which one.
+        start: first view, 0 to 39.
+        figure: where to write the picture; nextview_demo.png, that of the last demo, if not given.
+        overwrite: replace a picture of another name if it exists.
+    """
     from nextview.data.samples import sample_mesh
 
     output = Output(figure, overwrite=overwrite)
@@ -78,7 +103,13 @@ def demo(
 
 
 def show(
-    camera: Any, name: str, system: System, output: Output, start: int | None, seed: int = 0, indent: int | None = 1
+    camera: Any,
+    name: str,
+    system: System,
+    output: Output,
+    start: int | None,
+    seed: int = 0,
+    indent: int | None = 1,
 ) -> None:
     """Recognise what a camera sees, print the episode and write what is asked for."""
     session = system.session_with(camera, start, seed)
@@ -92,7 +123,9 @@ def show(
         result = session.run(camera)
     if not result.seen:
         why = "is it made of a few small parts far apart, or are a sensor's errors too strong?"
-        nothing = f"there is no answer, for nothing of it is seen from any of {len(result.views)} views"
+        nothing = (
+            f"there is no answer, for nothing of it is seen from any of {len(result.views)} views"
+        )
         raise ObservationError(f"{name}: {nothing}; {why}")
     frames = [taken.frame.name for taken in getattr(camera, "taken", ())]
     if output.json:

@@ -1,4 +1,6 @@
-"""``nextview scenes`` draws cluttered scenes; ``capture`` writes depth images as a camera would take them."""
+"""``nextview scenes`` draws cluttered scenes; ``capture`` writes depth images as a camera would
+take them.
+"""
 
 from pathlib import Path
 from typing import Literal
@@ -16,53 +18,85 @@ Level = Literal["light", "medium", "heavy"]
 
 
 def scenes(
-    meshes: Path,  # dataset folder, CLASS/train|test/MESH or CLASS/MESH
-    out: Path,  # folder for the scenes; those that are there are kept
+    meshes: Path,
+    out: Path,
     /,
-    # how much of the target shows, on the average over the 40 views: light 85 %, medium 65 %, heavy 45 %
     levels: tuple[Level, ...] = ("light", "medium", "heavy"),
-    scenes: int | None = None,  # how many at each level, of each split; by default one around each object
-    split: Split | None = None,  # only this one
-    # only around objects that this model (its name or card) held out of its training, for learning policies
+    scenes: int | None = None,
+    split: Split | None = None,
     held_out: str | None = None,
-    seed: int = 0,  # decides which objects are targets, and all that stands around them
+    seed: int = 0,
     workers: Workers = Workers(),
 ) -> None:
-    """Draw cluttered scenes: a target on a table among other objects, boxes and walls that hide parts of it.
+    """Draw cluttered scenes: a target on a table among other objects, boxes and walls that hide
+    parts of it.
 
-    Each scene is a small JSON file that names meshes and says where they stand; the same seed draws the same files.
-    Resumes where it was. Objects of one split stand only among objects of that split. Render them with nextview render
-    OUT STORE --meshes MESHES, and go on as with any other store.
+    Each scene is a small JSON file that names meshes and says where they stand; the same seed draws
+    the same files. Resumes where it was. Objects of one split stand only among objects of that
+    split. Render them with nextview render OUT STORE --meshes MESHES, and go on as with any other
+    store.
+
+    Args:
+        meshes: dataset folder, CLASS/train|test/MESH or CLASS/MESH.
+        out: folder for the scenes; those that are there are kept.
+        levels: how much of the target shows, on the average over the 40 views: light 85 %, medium
+            65 %, heavy 45 %.
+        scenes: how many at each level, of each split; by default one around each object.
+        split: only this one.
+        held_out: only around objects that this model (its name or card) held out of its training,
+            for learning policies.
+        seed: decides which objects are targets, and all that stands around them.
     """
     total = len(scene_drawing.tasks(meshes, out, levels, scenes, seed, split, held_out))
-    drawn = scene_drawing.draw_scenes(meshes, out, levels, scenes, seed, split, **vars(workers), held_out=held_out)
+    drawn = scene_drawing.draw_scenes(
+        meshes, out, levels, scenes, seed, split, **vars(workers), held_out=held_out
+    )
     failed = track_all(drawn, total, f"drawing {out.name}")
     if len(failed) == total:
         raise DatasetError(f"{out}: none of the {total} scenes can be drawn; see the reasons above")
-    console.print(f"{out}: {total - len(failed)} scenes; next: nextview render {out} STORE --meshes {meshes}")
+    console.print(
+        f"{out}: {total - len(failed)} scenes; next: nextview render {out} STORE --meshes {meshes}"
+    )
 
 
 def capture(
-    mesh: Path,  # OFF, OBJ, PLY, STL or GLB file of one object that stands upright
-    out: Path,  # folder to write, in the layout of the BOP challenge; whole or not there at all
+    mesh: Path,
+    out: Path,
     /,
-    viewpoints: Literal["40", "12"] = "40",  # from where it is captured, as in nextview recognise
-    table: bool = False,  # the object stands on a table, which is seen too; without one, masks are written
-    radius: float | None = None,  # object radius, metres, if the file's unit does not tell
-    up: Literal["y", "z"] | None = None,  # the file's up axis; z if not given, but y for GLB
-    unit: Unit | None = None,  # the file's unit of length
-    max_faces: int = MAX_FACES,  # refuse a mesh of more triangles, or a file of more than 60 bytes for each of these
-    largest_part: bool = False,  # leave out all that is not connected to the largest part of the mesh
-    overwrite: bool = False,  # replace the files of an earlier capture
+    viewpoints: Literal["40", "12"] = "40",
+    table: bool = False,
+    radius: float | None = None,
+    up: Literal["y", "z"] | None = None,
+    unit: Unit | None = None,
+    max_faces: int = MAX_FACES,
+    largest_part: bool = False,
+    overwrite: bool = False,
 ) -> None:
-    """Write captured views of a mesh: depth images, poses, intrinsics, as ``nextview recognise FOLDER`` reads them."""
+    """Write captured views of a mesh: depth images, poses, intrinsics, as ``nextview recognise
+    FOLDER`` reads them.
+
+    Args:
+        mesh: OFF, OBJ, PLY, STL or GLB file of one object that stands upright.
+        out: folder to write, in the layout of the BOP challenge; whole or not there at all.
+        viewpoints: from where it is captured, as in nextview recognise.
+        table: the object stands on a table, which is seen too; without one, masks are written.
+        radius: object radius, metres, if the file's unit does not tell.
+        up: the file's up axis; z if not given, but y for GLB.
+        unit: the file's unit of length.
+        max_faces: refuse a mesh of more triangles, or a file of more than 60 bytes for each of
+            these.
+        largest_part: leave out all that is not connected to the largest part of the mesh.
+        overwrite: replace the files of an earlier capture.
+    """
     from nextview.simulation.capturing import write_capture
 
     check_new(out, overwrite, folder=True)
     loaded = load_mesh(mesh, up, unit, max_faces, largest_part)
     metres = loaded.metres if radius is None else radius
     if metres is None:
-        raise UsageError(f"{mesh}: how large is it? Give the file's --unit or the object's --radius in metres")
+        raise UsageError(
+            f"{mesh}: how large is it? Give the file's --unit or the object's --radius in metres"
+        )
     sphere = ViewSphere.named(viewpoints)
     frames = write_capture(loaded, out, sphere, metres, table, not table, overwrite)
     track(frames, len(sphere), f"capturing {mesh.name}")

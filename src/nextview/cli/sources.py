@@ -21,57 +21,83 @@ PICTURES = (".png", ".pdf", ".svg")
 
 @dataclass(frozen=True)
 class Looking:
-    """Who looks, and when it ends."""
+    """Who looks, and when it ends.
 
-    models: str = "modelnet10"  # bundled models by name, or a folder with models of your own
-    # chooses the next view: gain (the predicted gain of a view less its weighted travel; the default), MAP, MAP-peak or
-    # MAP-sphere-peak for a map of the models (lem, lcm), discriminate (the default of taught things), random,
-    # random-all, furthest, unidirectional, spread, spread-local, the card of a learned one (.json), or MODULE:CLASS
+    Attributes:
+        models: bundled models by name, or a folder with models of your own.
+        policy: chooses the next view: gain (the predicted gain of a view less its weighted travel;
+            the default), MAP, MAP-peak or MAP-sphere-peak for a map of the models (lem, lcm),
+            discriminate (the default of taught things), random, random-all, furthest,
+            unidirectional, spread, spread-local, the card of a learned one (.json), or
+            MODULE:CLASS.
+        threshold: stop when the belief in one class reaches this after one view, less after
+            several.
+        risk: instead, stop at the lowest threshold at which at most this share of those who stop
+            early is wrong.
+        max_views: stop after so many views.
+        stopping: MODULE:NAME of a stopping rule of your own, docs/add_a_policy.md.
+        recogniser: MODULE:NAME of a recogniser of your own, docs/add_a_recogniser.md.
+        viewpoints: where the camera may look from: 40 or 12 views, rings:0,30,60x12 (elevations in
+            degrees by views on each ring), or fibonacci:60 (spread evenly over the upper half).
+        unknown: say "none of these" of an object that is as novel as at most this share of the
+            objects of known classes (0.02, the default: one in 50 of these is called unknown), or
+            of a size that the class never has; 0 always names a class.
+    """
+
+    models: str = "modelnet10"
     policy: str | None = None
-    threshold: float = 0.97  # stop when the belief in one class reaches this after one view, less after several
-    # instead, stop at the lowest threshold at which at most this share of those who stop early is wrong
+    threshold: float = 0.97
     risk: float | None = None
-    max_views: int = 5  # stop after so many views
-    stopping: str | None = None  # MODULE:NAME of a stopping rule of your own, docs/add_a_policy.md
-    recogniser: str | None = None  # MODULE:NAME of a recogniser of your own, docs/add_a_recogniser.md
-    # where the camera may look from: 40 or 12 views, rings:0,30,60x12 (elevations in degrees by views on each ring), or
-    # fibonacci:60 (spread evenly over the upper half)
+    max_views: int = 5
+    stopping: str | None = None
+    recogniser: str | None = None
     viewpoints: str = "40"
-    # say "none of these" of an object that is as novel as at most this share of the objects of known classes (0.02, the
-    # default: one in 50 of these is called unknown), or of a size that the class never has; 0 always names a class
     unknown: float | None = None
 
 
 @dataclass(frozen=True)
 class Source:
-    """What is looked at."""
+    """What is looked at.
 
-    # a mesh file's up axis; z if not given, but y for GLB. Of a folder, also a direction in its world; z if not given,
-    # but the normal of the support plane for 7-Scenes
+    Attributes:
+        up: a mesh file's up axis; z if not given, but y for GLB. Of a folder, also a direction in
+            its world; z if not given, but the normal of the support plane for 7-Scenes.
+        unit: a mesh file's unit of length: the size of an object says something of its class.
+        sensor: look at a mesh through a sensor with all its errors: kinect, stereo, setup, wrist or
+            none, or NAME:STRENGTH (docs/your_camera.md); clean renders if not given.
+        max_faces: refuse a mesh of more triangles, or a file of more than 60 bytes for each of
+            these.
+        largest_part: of a mesh file, leave out all that is not connected to its largest part, such
+            as a plate or loose pieces of a scan.
+        point: of a folder: near the object that is meant, metres, in the capture's world.
+        box: of a folder: the upright box into which the object just fits, its low and its high
+            corner, metres (heights along --up), or a JSON file with low, high and axes.
+        object_id: of a BOP folder with several objects: the one that is meant.
+        intrinsics: of a folder: FX FY CX CY, pixels, or a file with the pinhole matrix.
+        raw: of a folder: take the depth as it is, without denoising.
+        by_shape: of a folder: the object's size says nothing of its class, as with toys.
+    """
+
     up: Literal["y", "z"] | Three | None = None
-    unit: Unit | None = None  # a mesh file's unit of length: the size of an object says something of its class
-    # look at a mesh through a sensor with all its errors: kinect, stereo, setup, wrist or none, or
-    # NAME:STRENGTH (docs/your_camera.md); clean renders if not given
+    unit: Unit | None = None
     sensor: str | None = None
-    max_faces: int = MAX_FACES  # refuse a mesh of more triangles, or a file of more than 60 bytes for each of these
-    # of a mesh file, leave out all that is not connected to its largest part, such as a plate or loose pieces of a scan
+    max_faces: int = MAX_FACES
     largest_part: bool = False
-    point: Three | None = None  # of a folder: near the object that is meant, metres, in the capture's world
-    # of a folder: the upright box into which the object just fits, its low and its high corner, metres (heights
-    # along --up), or a JSON file with low, high and axes
+    point: Three | None = None
     box: tuple[float, float, float, float, float, float] | Path | None = None
-    object_id: int | None = None  # of a BOP folder with several objects: the one that is meant
-    # of a folder: FX FY CX CY, pixels, or a file with the pinhole matrix
+    object_id: int | None = None
     intrinsics: tuple[float, float, float, float] | Path | None = None
-    raw: bool = False  # of a folder: take the depth as it is, without denoising
-    by_shape: bool = False  # of a folder: the object's size says nothing of its class, as with toys
+    raw: bool = False
+    by_shape: bool = False
 
     def camera(self, path: Path, seed: int) -> Camera | FrameCamera:
         """A camera before the object of a mesh file or of a folder."""
-        folder, of_meshes = path.is_dir(), ("unit", "sensor", "max_faces", "largest_part")
+        folder = path.is_dir()
+        of_meshes = ("unit", "sensor", "max_faces", "largest_part")
         for field in fields(self)[1:]:
             if (field.name in of_meshes) == folder and getattr(self, field.name) != field.default:
-                option, kind = field.name.replace("_", "-"), "mesh files" if folder else "folders of captured views"
+                option = field.name.replace("_", "-")
+                kind = "mesh files" if folder else "folders of captured views"
                 raise UsageError(f"{path}: --{option} is for {kind}, and this is none")
         if folder:
             return self._captured(path)
@@ -94,7 +120,10 @@ class Source:
         if isinstance(self.box, tuple):
             upwards = up or capture.up
             if upwards is None:
-                raise UsageError(f"{folder}: a box is upright, and in this layout nothing tells where up is: give --up")
+                raise UsageError(
+                    f"{folder}: a box is upright, and in this layout nothing tells where up is:"
+                    " give --up"
+                )
             box = Box(np.array(self.box[:3]), np.array(self.box[3:]), upright_axes(upwards))
         return CapturedCamera(capture, up, self.point, box, not self.raw, not self.by_shape)
 

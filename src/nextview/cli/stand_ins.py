@@ -1,8 +1,10 @@
-"""The help of a command whose packages are not installed: its module is imported with stand-ins for them.
+"""The help of a command whose packages are not installed: its module is imported with stand-ins for
+them.
 
-A command's help is made from the parameters of its function, and the module of that function imports torch or pandas.
-As Sphinx does for its pages (``autodoc_mock_imports``), what is missing is replaced by objects that can be called,
-subclassed and annotated with. The process ends once the help is shown: nothing is ever run with them.
+A command's help is made from the parameters of its function, and the module of that function
+imports torch or pandas. As Sphinx does for its pages (``autodoc_mock_imports``), what is missing is
+replaced by objects that can be called, subclassed and annotated with. The process ends once the
+help is shown: nothing is ever run with them.
 """
 
 import sys
@@ -21,7 +23,8 @@ from nextview.checks import EXTRAS
 class _StandIn(ABCMeta):
     """The kind of all classes that stand for what a package would hold.
 
-    They are classes, because other libraries ask for subclasses of ``torch.Tensor`` once torch seems to be there.
+    They are classes, because other libraries ask for subclasses of ``torch.Tensor`` once torch
+    seems to be there.
     """
 
     def __getattr__(cls, name: str) -> type:
@@ -46,7 +49,9 @@ def _stand_in(name: str) -> type:
 
 
 class _Finder(MetaPathFinder, Loader):
-    """Finds packages that are missing; it stands behind all others, so that what is installed is taken."""
+    """Finds packages that are missing; it stands behind all others, so that what is installed is
+    taken.
+    """
 
     def __init__(self, missing: Iterable[str]) -> None:
         self.missing = frozenset(missing)
@@ -68,7 +73,9 @@ class _Finder(MetaPathFinder, Loader):
 
 @contextmanager
 def stand_ins() -> Iterator[None]:
-    """Import with stand-ins for what is missing of all extras; only for a process that ends afterwards."""
+    """Import with stand-ins for what is missing of all extras; only for a process that ends
+    afterwards.
+    """
     named = {package for packages in EXTRAS.values() for package in packages}
     finder = import_stand_ins(package for package in named if find_spec(package) is None)
     try:
@@ -78,7 +85,9 @@ def stand_ins() -> Iterator[None]:
 
 
 def import_stand_ins(missing: Iterable[str]) -> MetaPathFinder:
-    """From now on, import stand-ins for packages that are missing; only for a process that ends with its help."""
+    """From now on, import stand-ins for packages that are missing; only for a process that ends
+    with its help.
+    """
     finder = _Finder(missing)
     sys.meta_path.append(finder)
     return finder

@@ -20,31 +20,49 @@ Split = Literal["train", "test", "val"]
 
 @dataclass(frozen=True)
 class Workers:
-    """Who does the work."""
+    """Who does the work.
 
-    workers: int | None = None  # processes; one for each core by default
-    scheduler: str | None = None  # address of a dask.distributed scheduler to use instead, as tcp://HOST:8786
+    Attributes:
+        workers: processes; one for each core by default.
+        scheduler: address of a dask.distributed scheduler to use instead, as tcp://HOST:8786.
+    """
+
+    workers: int | None = None
+    scheduler: str | None = None
 
 
 def render(
-    dataset: Path,  # folder of meshes, or of scenes
-    store: Path,  # the store to make or to complete
+    dataset: Path,
+    store: Path,
     /,
-    viewpoints: Literal["40", "12"] = "40",  # from where it is seen
-    azimuths: int | None = None,  # views on each ring, if not 8 of the 40 and 12 of the 12
-    size: int = 224,  # side of the images, pixels
+    viewpoints: Literal["40", "12"] = "40",
+    azimuths: int | None = None,
+    size: int = 224,
     how: rendering.RenderOptions = rendering.RenderOptions(),
     workers: Workers = Workers(),
-    overwrite: bool = False,  # replace a store of other objects or settings
+    overwrite: bool = False,
 ) -> None:
-    """Render a dataset folder (CLASS/SPLIT/MESH, SPLIT/CLASS/MESH or CLASS/MESH) into a view store; resumes.
+    """Render a dataset folder (CLASS/SPLIT/MESH, SPLIT/CLASS/MESH or CLASS/MESH) into a view store;
+    resumes.
 
-    A folder of scenes (nextview scenes) makes a store too: of what shows of each target, and of the scene around it.
+    A folder of scenes (nextview scenes) makes a store too: of what shows of each target, and of the
+    scene around it.
+
+    Args:
+        dataset: folder of meshes, or of scenes.
+        store: the store to make or to complete.
+        viewpoints: from where it is seen.
+        azimuths: views on each ring, if not 8 of the 40 and 12 of the 12.
+        size: side of the images, pixels.
+        overwrite: replace a store of other objects or settings.
     """
     sphere = ViewSphere.named(viewpoints)
     sphere = sphere if azimuths is None else replace(sphere, azimuths=azimuths)
     if size % (side := find_card(RECOGNISER).input.size):
-        takes = f"the bundled networks take images whose side is a multiple of {side} pixels, such as {2 * side}"
+        takes = (
+            f"the bundled networks take images whose side is a multiple of {side} pixels, such as"
+            f" {2 * side}"
+        )
         console.print(f"{takes}; those of {size} are for models of your own", style="yellow")
     found = rendering.listing(dataset, how)
     console.print(found.summary())
@@ -55,54 +73,88 @@ def render(
     jobs = rendering.render(dataset, store, sphere, size, how, **vars(workers), overwrite=overwrite)
     track_all(jobs, len(found.entries), f"rendering {store.name}", before)
     made = ViewStore.open(store)
-    done, copies = int(made.done.sum()), made.duplicates
+    done = int(made.done.sum())
+    copies = made.duplicates
     if copies:
-        console.print(f"{sum(map(len, copies)) - len(copies)} meshes are byte-identical copies of another one")
+        console.print(
+            f"{sum(map(len, copies)) - len(copies)} meshes are byte-identical copies of another one"
+        )
     for group in copies:
         if len(set(made.labels[group])) > 1:
             same = " = ".join(f"{made.names[i]} ({made.classes[made.labels[i]]})" for i in group)
             console.print(f"one mesh, several labels: {same}", style="yellow")
     if not done:
-        raise DatasetError(f"{store}: none of the {len(made)} meshes can be used; see the reasons above")
-    console.print(f"{store}: {done} of {len(made)} objects, {len(sphere)} views each", soft_wrap=True)
+        raise DatasetError(
+            f"{store}: none of the {len(made)} meshes can be used; see the reasons above"
+        )
+    console.print(
+        f"{store}: {done} of {len(made)} objects, {len(sphere)} views each", soft_wrap=True
+    )
 
 
 def check(
-    store: Path,  # view store made by nextview render
+    store: Path,
     /,
     workers: Workers = Workers(),
 ) -> None:
-    """Read every object of a view store, against its checksums. Ends with status 2 if one is damaged."""
+    """Read every object of a view store, against its checksums.
+
+    Ends with status 2 if one is damaged.
+
+    Args:
+        store: view store made by nextview render.
+    """
     views = ViewStore.open(store)
     done = int(views.done.sum())
     damaged = track_all(view_store.check(store, **vars(workers)), done, f"checking {store.name}")
     for reason in views.attributes.failures.values():
         console.print(f"left out: {reason}", style="yellow")
     missing = len(views) - done - len(views.attributes.failures)
-    console.print(f"{store}: {done - len(damaged)} objects are sound, {len(damaged)} damaged, {missing} not rendered")
+    console.print(
+        f"{store}: {done - len(damaged)} objects are sound, {len(damaged)} damaged, {missing} not"
+        " rendered"
+    )
     if damaged:
-        raise DatasetError(f"{store}: {len(damaged)} of {done} objects are damaged; remove the store and render again")
+        raise DatasetError(
+            f"{store}: {len(damaged)} of {done} objects are damaged; remove the store and render"
+            " again"
+        )
 
 
 def measure(
-    store: Path,  # view store made by nextview render
+    store: Path,
     /,
-    # names (see nextview list measures), or MODULE:FUNCTION of your own; by default all that need the depth alone
     measures: tuple[str, ...] = (),
-    split: Split | None = None,  # only this split
-    held_out: str | None = None,  # only the objects that this model (its name or card) held out of its training
-    objects: int | None = None,  # only so many of these, spread evenly; twice as many later hold the same
+    split: Split | None = None,
+    held_out: str | None = None,
+    objects: int | None = None,
     workers: Workers = Workers(),
-    overwrite: bool = False,  # measure anew what is there
+    overwrite: bool = False,
 ) -> None:
-    """Compute view measures of every rendered object and keep them in the store. Resumes where it was."""
+    """Compute view measures of every rendered object and keep them in the store.
+
+    Resumes where it was.
+
+    Args:
+        store: view store made by nextview render.
+        measures: names (see nextview list measures), or MODULE:FUNCTION of your own; by default all
+            that need the depth alone.
+        split: only this split.
+        held_out: only the objects that this model (its name or card) held out of its training.
+        objects: only so many of these, spread evenly; twice as many later hold the same.
+        overwrite: measure anew what is there.
+    """
     select = some_objects(ViewStore.open(store), split, held_out, objects)
-    steps = view_measures.measure(store, measures, **vars(workers), objects=select, overwrite=overwrite)
+    steps = view_measures.measure(
+        store, measures, **vars(workers), objects=select, overwrite=overwrite
+    )
     before, total = follow(steps, f"measuring {store.name}")
     say_done(store, "measured", before, total)
 
 
-def track_all(done: Iterable[tuple[str, str | None]], total: int, what: str, before: int = 0) -> list[str]:
+def track_all(
+    done: Iterable[tuple[str, str | None]], total: int, what: str, before: int = 0
+) -> list[str]:
     """Follow a job that yields what is done, and why it failed; return and print the reasons."""
     failed: list[str] = []
 

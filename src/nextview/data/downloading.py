@@ -15,7 +15,9 @@ LONGEST = 200  # letters of what a server says of itself
 
 @dataclass(frozen=True)
 class Archive:
-    """A published zip file: where it is, its SHA-256, and the only folder in it that is unpacked."""
+    """A published zip file: where it is, its SHA-256, and the only folder in it that is
+    unpacked.
+    """
 
     url: str
     sha256: str
@@ -37,10 +39,11 @@ ARCHIVES = {
 
 
 def download(archive: Archive, destination: Path, timeout: float = 60, bar: Any = False) -> Path:
-    """Fetch an archive and unpack it as ``destination / archive.folder``; nothing to do if that is there.
+    """Fetch an archive and unpack it as ``destination / archive.folder``; nothing to do if that is
+    there.
 
-    ``timeout`` is of a silent connection, seconds; ``bar`` shows the progress. DatasetError if it cannot be fetched, is
-    not the published file, or cannot be unpacked.
+    ``timeout`` is of a silent connection, seconds; ``bar`` shows the progress. DatasetError if it
+    cannot be fetched, is not the published file, or cannot be unpacked.
     """
     import pooch
     import requests
@@ -49,15 +52,27 @@ def download(archive: Archive, destination: Path, timeout: float = 60, bar: Any 
     with only_one(folder):
         if folder.is_dir() and any(folder.iterdir()):
             return folder
-        with new_folder(folder) as part, tempfile.TemporaryDirectory(dir=folder.parent, prefix=".zip-") as place:
+        with (
+            new_folder(folder) as part,
+            tempfile.TemporaryDirectory(dir=folder.parent, prefix=".zip-") as place,
+        ):
             fetch = pooch.HTTPDownloader(progressbar=bar, timeout=timeout)
             pooch.get_logger().setLevel("ERROR")
             try:
-                file = pooch.retrieve(archive.url, f"sha256:{archive.sha256}", "archive.zip", place, downloader=fetch)
+                file = pooch.retrieve(
+                    archive.url, f"sha256:{archive.sha256}", "archive.zip", place, downloader=fetch
+                )
                 with zipfile.ZipFile(file) as content:
-                    inside = [m for m in content.infolist() if m.filename.startswith(f"{archive.folder}/")]
+                    inside = [
+                        m for m in content.infolist() if m.filename.startswith(f"{archive.folder}/")
+                    ]
                     content.extractall(place, inside)
-            except (requests.RequestException, ValueError, zipfile.BadZipFile, NotImplementedError) as error:
+            except (
+                requests.RequestException,
+                ValueError,
+                zipfile.BadZipFile,
+                NotImplementedError,
+            ) as error:
                 raise DatasetError(f"{archive.url}: {one_line(str(error), LONGEST)}") from None
             if not inside:
                 raise DatasetError(f"{archive.url}: holds no folder {archive.folder}")

@@ -9,8 +9,8 @@ Understood are, with MESH for a file:
   A SPLIT is a folder called as in SPLIT_NAMES, in capitals or not.
 - NAME/google_16k/nontextured.ply, the download of the YCB object set: each NAME is one object.
 
-Files of one name beside each other, in several formats, are one model, of which the best is taken. Links
-are followed. ``read_folder`` does all that, and leaves nothing out without saying so.
+Files of one name beside each other, in several formats, are one model, of which the best is taken.
+Links are followed. ``read_folder`` does all that, and leaves nothing out without saying so.
 """
 
 import logging
@@ -40,14 +40,47 @@ LONGEST_PATH = 200  # letters of a path in a sentence
 
 # The best first: STL knows no corners that faces share, and the axes of a GLB file are often wrong.
 BEST_FORMATS = (".ply", ".off", ".obj", ".glb", ".stl")
-# Formats of shapes that are not read; other files beside the meshes are pictures, materials and notes.
+# Formats of shapes that are not read; other files beside the meshes are pictures, materials and
+# notes.
 OTHER_SHAPES = (
-    ".3ds", ".3mf", ".abc", ".blend", ".brep", ".ctm", ".dae", ".dwg", ".dxf", ".fbx", ".gltf",
-    ".iges", ".igs", ".jt", ".ma", ".max", ".mb", ".nif", ".pcd", ".prt", ".skp", ".sldprt",
-    ".step", ".stp", ".usd", ".usda", ".usdc", ".usdz", ".vrml", ".vtk", ".vtp", ".wrl", ".x3d",
-    ".x_t", ".xyz",
-)  # fmt: skip
-YCB_SCANS = ("google_16k", "google_64k", "google_512k", "poisson", "tsdf", "clouds")  # of one object, the best first
+    ".3ds",
+    ".3mf",
+    ".abc",
+    ".blend",
+    ".brep",
+    ".ctm",
+    ".dae",
+    ".dwg",
+    ".dxf",
+    ".fbx",
+    ".gltf",
+    ".iges",
+    ".igs",
+    ".jt",
+    ".ma",
+    ".max",
+    ".mb",
+    ".nif",
+    ".pcd",
+    ".prt",
+    ".skp",
+    ".sldprt",
+    ".step",
+    ".stp",
+    ".usd",
+    ".usda",
+    ".usdc",
+    ".usdz",
+    ".vrml",
+    ".vtk",
+    ".vtp",
+    ".wrl",
+    ".x3d",
+    ".x_t",
+    ".xyz",
+)
+# of one object, the best first
+YCB_SCANS = ("google_16k", "google_64k", "google_512k", "poisson", "tsdf", "clouds")
 METADATA_FOLDERS = ("__MACOSX",)
 
 _log = logging.getLogger("nextview")
@@ -137,11 +170,14 @@ def list_dataset(root: str | Path, loose: bool = False) -> list[Entry]:
     return listing.entries
 
 
-def scan_dataset(root: str | Path, suffixes: tuple[str, ...] = FORMATS, loose: bool = False) -> Listing:
+def scan_dataset(
+    root: str | Path, suffixes: tuple[str, ...] = FORMATS, loose: bool = False
+) -> Listing:
     """List the objects of a dataset folder, and what was left out; see ``read_folder``.
 
     Raises:
-        DatasetError: there is no such folder, it holds no object, or two of them would have one name.
+        DatasetError: there is no such folder, it holds no object, or two of them would have one
+            name.
     """
     listing = read_folder(Path(root), suffixes, loose)
     if listing.entries:
@@ -164,9 +200,10 @@ def read_folder(
     Args:
         root: the folder.
         suffixes: of the files that are objects, in lower case.
-        loose: whether a mesh in the folder itself is a class of its own also beside class folders; else it is left out
-            there.
-        skip: folders below it that are left out, with the reason of each; where that is empty, nothing is said.
+        loose: whether a mesh in the folder itself is a class of its own also beside class folders;
+            else it is left out there.
+        skip: folders below it that are left out, with the reason of each; where that is empty,
+            nothing is said.
 
     Returns:
         What it holds; there may be no object.
@@ -178,7 +215,11 @@ def read_folder(
         raise DatasetError(f"{root}: there is no such folder")
     content = _walk(root, suffixes, skip)
     models, left_out = _best_files(content.files)
-    left_out = content.left_out + left_out + content.without_objects("mesh" if suffixes == FORMATS else "scene")
+    left_out = (
+        content.left_out
+        + left_out
+        + content.without_objects("mesh" if suffixes == FORMATS else "scene")
+    )
 
     in_folders = [model for model in models if len(model.parts) > 1]
     split_first = _split_first(in_folders)
@@ -203,8 +244,12 @@ def read_folder(
     return Listing(entries, left_out, _notes(root, entries))
 
 
-def select(entries: list[Entry], dataset: Path, split: str | None, held_out: str | Path | None) -> list[Entry]:
-    """Those of one split, and those (meshes, or scenes by their target) that a card calls held out of its training."""
+def select(
+    entries: list[Entry], dataset: Path, split: str | None, held_out: str | Path | None
+) -> list[Entry]:
+    """Those of one split, and those (meshes, or scenes by their target) that a card calls held
+    out of its training.
+    """
     entries = [entry for entry in entries if split in (None, entry.split)]
     if not entries:
         raise DatasetError(f"{dataset}: nothing in CLASS/{split}/NAME below it")
@@ -233,7 +278,9 @@ class _Content:
     folders: list[Path] = field(default_factory=list)
 
     def without_objects(self, kind: str) -> list[tuple[Path, str]]:
-        """The files that are no objects, and, instead of all that is in them, the folders that hold none."""
+        """The files that are no objects, and, instead of all that is in them, the folders that
+        hold none.
+        """
         told = [*self.files, *(place for place, _ in self.left_out)]
         worth_entering = {Path(), *(folder for place in told for folder in place.parents)}
         found: dict[Path, str] = {}
@@ -246,7 +293,9 @@ class _Content:
 
 
 def _walk(root: Path, suffixes: tuple[str, ...], skip: Mapping[Path, str]) -> _Content:
-    """All that lies below a folder; each folder once, also where links lead to it twice or in a circle."""
+    """All that lies below a folder; each folder once, also where links lead to it twice or in a
+    circle.
+    """
     content = _Content()
     unreadable: list[OSError] = []
     top = _real(root)
@@ -328,7 +377,9 @@ def _best_files(files: list[Path]) -> tuple[dict[Path, Path], list[tuple[Path, s
 
 
 def _model_of(place: Path) -> Path:
-    """What the files of one model have in common: the path without a suffix; in a YCB download, the object's folder."""
+    """What the files of one model have in common: the path without a suffix; in a YCB download,
+    the object's folder.
+    """
     return place.parent.parent if place.parent.name in YCB_SCANS else place.with_suffix("")
 
 
@@ -359,7 +410,8 @@ def _split_of(folder: str) -> str:
 
 def _entry(root: Path, model: Path, path: Path, split_first: bool, own_class: bool) -> Entry | None:
     """What the place of a model says of it; None if it names no class."""
-    *folders, stem = model.parts or (_real(root).name,)  # the folder may be that of one object of a YCB download
+    # the folder may be that of one object of a YCB download
+    *folders, stem = model.parts or (_real(root).name,)
     split = ""
     layout = ""
     if split_first and folders:
@@ -377,9 +429,12 @@ def _entry(root: Path, model: Path, path: Path, split_first: bool, own_class: bo
 
 
 def _uniquely_named(found: Mapping[Path, Entry]) -> list[Entry]:
-    """Entries, by their models' places, with unique names: their file's, or as much of the path as it takes."""
+    """Entries, by their models' places, with unique names: their file's, or as much of the path
+    as it takes.
+    """
 
-    def below(model: Path, entry: Entry) -> tuple[str, ...]:  # CLASS/ID/models/MESH: ID, models, MESH
+    # CLASS/ID/models/MESH: ID, models, MESH
+    def below(model: Path, entry: Entry) -> tuple[str, ...]:
         return model.parts[1 + bool(entry.split) :]
 
     def whole(model: Path, entry: Entry) -> str:
@@ -405,10 +460,16 @@ def _uniquely_named(found: Mapping[Path, Entry]) -> list[Entry]:
 def _notes(root: Path, entries: list[Entry]) -> list[str]:
     """What was decided about folders that may be meant otherwise, a sentence each."""
     labels = sorted({entry.label for entry in entries})
-    notes = [f"the folder {label} is taken for a class, not for a split" for label in labels if _split_of(label)]
+    notes = [
+        f"the folder {label} is taken for a class, not for a split"
+        for label in labels
+        if _split_of(label)
+    ]
     if len(labels) == 1 and any(count > 1 for count in _deep_folders(entries).values()):
         inside = one_line(str(root / labels[0]), LONGEST_PATH)
-        notes.append(f"all are of the class {labels[0]}; if the folders in it are the classes, give {inside}")
+        notes.append(
+            f"all are of the class {labels[0]}; if the folders in it are the classes, give {inside}"
+        )
     return notes
 
 

@@ -1,4 +1,6 @@
-"""View measures: what they are handed, users' own by import path, and their values of a whole store; resumable."""
+"""View measures: what they are handed, users' own by import path, and their values of a whole
+store; resumable.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
@@ -25,11 +27,19 @@ QUANTUM = 1e-3  # depth values closer than this count as equal, object radii
 
 @dataclass(frozen=True)
 class MeasuredView:
-    """One view of an object. What several measures ask for is computed once, when the first one asks."""
+    """One view of an object.
 
-    depth: NDArray[np.floating]  # along the optical axis, (H, W) float, object radii, 0 where there is no object
-    pose: NDArray[np.float64]  # camera-to-world, (4, 4), OpenCV axes; the world is the object frame, z up
-    intrinsics: NDArray[np.float64]  # pinhole matrix, (3, 3), pixels, the first pixel's centre at 0.5
+    What several measures ask for is computed once, when the first one asks.
+
+    Attributes:
+        depth: along the optical axis, (H, W) float, object radii, 0 where there is no object.
+        pose: camera-to-world, (4, 4), OpenCV axes; the world is the object frame, z up.
+        intrinsics: pinhole matrix, (3, 3), pixels, the first pixel's centre at 0.5.
+    """
+
+    depth: NDArray[np.floating]
+    pose: NDArray[np.float64]
+    intrinsics: NDArray[np.float64]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "depth", object_depth(depth_image(self.depth)))
@@ -42,7 +52,9 @@ class MeasuredView:
 
     @cached_property
     def near(self) -> NDArray[np.floating]:
-        """The depth in the box, (H', W'): most of an image is background, and so most of the work is saved."""
+        """The depth in the box, (H', W'): most of an image is background, and so most of the
+        work is saved.
+        """
         return self.depth[self.box]
 
     @cached_property
@@ -56,12 +68,15 @@ class MeasuredView:
         return self.near[self.seen]
 
 
-Views = Callable[[ViewStore, int], Iterator[MeasuredView]]  # gives an object of a store, from all its views
+# gives an object of a store, from all its views
+Views = Callable[[ViewStore, int], Iterator[MeasuredView]]
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A function of a view, of its depth alone or of the mesh too; good views have high or low values of it."""
+    """A function of a view, of its depth alone or of the mesh too; good views have high or low
+    values of it.
+    """
 
     function: Callable[[MeasuredView], float]
     needs: Literal["depth", "mesh"] = "depth"
@@ -74,7 +89,9 @@ class Measure:
 
 
 MEASURES: dict[str, Measure] = {  # the thesis's own; packages add theirs by entry points of GROUP
-    "depth_entropy": Measure(lambda view: depth_entropy(view.depth), "depth", "Parisotto et al.; eq. 3")
+    "depth_entropy": Measure(
+        lambda view: depth_entropy(view.depth), "depth", "Parisotto et al.; eq. 3"
+    )
 }
 GROUP = "nextview.measures"
 
@@ -85,7 +102,9 @@ def all_measures() -> dict[str, Measure]:
 
 
 def find_measure(name: str) -> Measure:
-    """A measure by name: one of ``all_measures``, or "MODULE:FUNCTION" for a function or a ``Measure`` of your own."""
+    """A measure by name: one of ``all_measures``, or "MODULE:FUNCTION" for a function or a
+    ``Measure`` of your own.
+    """
     if name in MEASURES:
         return MEASURES[name]
     path = plugins(GROUP).get(name, name)
@@ -102,16 +121,26 @@ def find_measure(name: str) -> Measure:
 def names_of(names: Sequence[str], meshes: bool) -> tuple[str, ...]:
     """The measures that are meant."""
     if not names:
-        return tuple(name for name, measure in all_measures().items() if meshes or measure.needs == "depth")
-    names = tuple(dict.fromkeys(each for name in names for each in (all_measures() if name == "all" else (name,))))
+        return tuple(
+            name for name, measure in all_measures().items() if meshes or measure.needs == "depth"
+        )
+    names = tuple(
+        dict.fromkeys(
+            each for name in names for each in (all_measures() if name == "all" else (name,))
+        )
+    )
     for name in names:
         if find_measure(name).needs == "mesh" and not meshes:
-            raise MeasureError(f"the measure {name} needs the meshes, not the depth alone (docs/add_a_measure.md)")
+            raise MeasureError(
+                f"the measure {name} needs the meshes, not the depth alone (docs/add_a_measure.md)"
+            )
     return names
 
 
 def depth_entropy(depth: NDArray[np.floating]) -> float:
-    """Shannon entropy, bits, of the values in a depth image (H, W), object radii, 0 where there is no object."""
+    """Shannon entropy, bits, of the values in a depth image (H, W), object radii, 0 where there
+    is no object.
+    """
     depth = object_depth(depth_image(depth).astype(np.float64, copy=False))
     seen = depth[depth > 0]
     counts = np.bincount(np.rint(seen / QUANTUM).astype(np.int64), minlength=1)
@@ -121,15 +150,21 @@ def depth_entropy(depth: NDArray[np.floating]) -> float:
 
 
 def normalise_per_object(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Scale (..., V) over an object's views to [0, 1] float32; all 0 where the views do not differ."""
+    """Scale (..., V) over an object's views to [0, 1] float32; all 0 where the views do not
+    differ.
+    """
     values = np.asarray(values)
     low = values.min(-1, keepdims=True)
     span = values.max(-1, keepdims=True) - low
     return np.where(span > 0, (values - low) / np.where(span > 0, span, 1), 0).astype(np.float32)
 
 
-def confidence_maps(logits: NDArray[np.floating], labels: NDArray[np.integer]) -> NDArray[np.float32]:
-    """Confidence in each view alone where it is right, the first of equal classes counting, else 0: (N, V) float32."""
+def confidence_maps(
+    logits: NDArray[np.floating], labels: NDArray[np.integer]
+) -> NDArray[np.float32]:
+    """Confidence in each view alone where it is right, the first of equal classes counting, else
+    0: (N, V) float32.
+    """
     from scipy.special import softmax
 
     logits = np.asarray(logits, np.float64)
@@ -140,7 +175,8 @@ def confidence_maps(logits: NDArray[np.floating], labels: NDArray[np.integer]) -
 def depth_views(store: ViewStore, i: int) -> Iterator[MeasuredView]:
     """Object i of a store as measures see it, from all its views."""
     for depth, pose in zip(store.read("depth", i), store.sphere.poses, strict=True):
-        yield MeasuredView(depth * DEPTH_UNIT, pose, store.intrinsics)  # float64, as when it was rendered
+        # float64, as when it was rendered
+        yield MeasuredView(depth * DEPTH_UNIT, pose, store.intrinsics)
 
 
 def measure(
@@ -152,20 +188,30 @@ def measure(
     overwrite: bool = False,
     views: Views = depth_views,
 ) -> Iterator[tuple[int, int]]:
-    """Put view measures of rendered objects, or of some rows, into a store: ``measures/NAME`` (N, V) float32.
+    """Put view measures of rendered objects, or of some rows, into a store: ``measures/NAME`` (N,
+    V) float32.
 
-    ``names`` as ``find_measure`` takes them, or "all"; by default all that can be had from what ``views`` hands them.
-    ``workers`` and ``scheduler`` as of ``pool.each``; ``overwrite`` measures anew what is there. Yields objects done so
-    far, and how many there are.
+    ``names`` as ``find_measure`` takes them, or "all"; by default all that can be had from what
+    ``views`` hands them. ``workers`` and ``scheduler`` as of ``pool.each``; ``overwrite`` measures
+    anew what is there. Yields objects done so far, and how many there are.
     """
     names = names_of(names, views is not depth_views)
     ViewStore.open(path).array("depth")  # says if it is missing, before anything is begun
     function = partial(_measure, names, views)
-    yield from keep(path, [f"measures/{name}" for name in names], function, workers, scheduler, objects, overwrite)
+    yield from keep(
+        path,
+        [f"measures/{name}" for name in names],
+        function,
+        workers,
+        scheduler,
+        objects,
+        overwrite,
+    )
 
 
 def _measure(names: tuple[str, ...], views: Views, store: ViewStore, i: int) -> Made:
-    object_name, functions = store.names[i], {name: find_measure(name) for name in names}
+    object_name = store.names[i]
+    functions = {name: find_measure(name) for name in names}
     values = {name: np.empty(len(store.sphere), np.float32) for name in names}
 
     def failed(name: str, said: str) -> MeasureError:
@@ -178,7 +224,10 @@ def _measure(names: tuple[str, ...], views: Views, store: ViewStore, i: int) -> 
                 values[name][k] = function(view)
     for name, found in values.items():
         if not np.isfinite(found).all():
-            raise MeasureError(f"measure {name} of {object_name}, view {np.isfinite(found).argmin()}, is not finite")
+            raise MeasureError(
+                f"measure {name} of {object_name}, view {np.isfinite(found).argmin()}, is not"
+                " finite"
+            )
     return {f"measures/{name}": found for name, found in values.items()}
 
 
@@ -191,7 +240,9 @@ def keep(
     objects: NDArray[np.int64] | None = None,
     overwrite: bool = False,
 ) -> Iterator[tuple[int, int]]:
-    """Call ``function(store, i)`` for the objects that lack values in the arrays, and keep what it returns."""
+    """Call ``function(store, i)`` for the objects that lack values in the arrays, and keep what
+    it returns.
+    """
     with writing(path):
         store = ViewStore.open(Path(path).absolute())
         wanted = store.done & (True if objects is None else np.isin(np.arange(len(store)), objects))
@@ -200,10 +251,13 @@ def keep(
                 store.remove(name)
             store.add(name)
         held = np.all([store.held(name) for name in names], axis=0)
-        items, total = np.flatnonzero(wanted & ~held).tolist(), int(wanted.sum())
+        items = np.flatnonzero(wanted & ~held).tolist()
+        total = int(wanted.sum())
         work = partial(_keep_object, store.path, function)
         try:
-            yield from counted(work, items, total, lambda i: f"{path}: {store.names[i]}", workers, scheduler)
+            yield from counted(
+                work, items, total, lambda i: f"{path}: {store.names[i]}", workers, scheduler
+            )
         finally:  # nothing is left of what failed at once
             for name in names:
                 if not store.held(name).any():

@@ -1,4 +1,6 @@
-"""Run one function on many items: on this machine's cores, or on a cluster through dask.distributed."""
+"""Run one function on many items: on this machine's cores, or on a cluster through
+dask.distributed.
+"""
 
 import multiprocessing
 import os
@@ -29,7 +31,8 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class WorkerDied:
-    """The process that worked on an item was killed, or crashed, again when it worked on that item alone.
+    """The process that worked on an item was killed, or crashed, again when it worked on that item
+    alone.
 
     Attributes:
         reason: What happened, in words. ``str`` gives it, too.
@@ -43,18 +46,25 @@ class WorkerDied:
 
 def count(workers: int | None) -> int:
     """The number of processes: one for each core by default."""
-    return os.cpu_count() or 1 if workers is None else whole(workers, "the number of workers", 0, MOST)
+    return (
+        os.cpu_count() or 1 if workers is None else whole(workers, "the number of workers", 0, MOST)
+    )
 
 
 def each(
-    function: Callable[[Item], Result], items: Sequence[Item], workers: int | None = None, scheduler: str | None = None
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    workers: int | None = None,
+    scheduler: str | None = None,
 ) -> Iterator[tuple[Item, Result | WorkerDied]]:
-    """Call ``function(item)`` for every item, side by side; yields (item, result) as they come, in any order.
+    """Call ``function(item)`` for every item, side by side; yields (item, result) as they come, in
+    any order.
 
-    Function and items are picklable, items hashable. A script that hands in functions or classes of its own has to
-    guard what it does by ``if __name__ == "__main__"``; any other need not. A process that dies costs its item, if it
-    dies again with that alone. What the function raises ends the run. ``workers`` are processes, one for each core by
-    default, 0 to work in this one; ``scheduler`` is the address of a dask.distributed scheduler to use instead.
+    Function and items are picklable, items hashable. A script that hands in functions or classes of
+    its own has to guard what it does by ``if __name__ == "__main__"``; any other need not. A
+    process that dies costs its item, if it dies again with that alone. What the function raises
+    ends the run. ``workers`` are processes, one for each core by default, 0 to work in this one;
+    ``scheduler`` is the address of a dask.distributed scheduler to use instead.
     """
     if scheduler is not None:
         yield from _on_cluster(function, items, scheduler)
@@ -73,8 +83,10 @@ def each(
             return
         except BrokenProcessPool:
             waiting = [item for item in waiting if item not in finished]
-            # Items are begun in order, so the first that are not finished were being worked on. Try each alone.
-            suspects, waiting = waiting[:workers], waiting[workers:]
+            # Items are begun in order, so the first that are not finished were being worked on. Try
+            # each alone.
+            suspects = waiting[:workers]
+            waiting = waiting[workers:]
             for item in suspects:
                 try:
                     yield from _in_pool(function, [item], 1)
@@ -90,17 +102,25 @@ def counted(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> Iterator[tuple[int, int]]:
-    """Call a function for the items left of ``total``, see ``each``; yields how many are done, and the total."""
+    """Call a function for the items left of ``total``, see ``each``; yields how many are done,
+    and the total.
+    """
     before = total - len(items)
     yield before, total
-    for finished, (item, result) in enumerate(each(function, items, workers, scheduler), before + 1):
+    for finished, (item, result) in enumerate(
+        each(function, items, workers, scheduler), before + 1
+    ):
         if isinstance(result, WorkerDied):
             raise DatasetError(f"{name(item)} cannot be computed: {result}")
         yield finished, total
 
 
-def _in_pool(function: Callable[[Item], Result], items: Sequence[Item], workers: int) -> Iterator[tuple[Item, Result]]:
-    start = multiprocessing.get_context("spawn") if _of_script(function, items) else _OwnMainContext()
+def _in_pool(
+    function: Callable[[Item], Result], items: Sequence[Item], workers: int
+) -> Iterator[tuple[Item, Result]]:
+    start = (
+        multiprocessing.get_context("spawn") if _of_script(function, items) else _OwnMainContext()
+    )
     pool = ProcessPoolExecutor(min(workers, len(items)), start, _begin_worker)
     try:
         jobs = {pool.submit(function, item): item for item in items}
@@ -111,15 +131,17 @@ def _in_pool(function: Callable[[Item], Result], items: Sequence[Item], workers:
 
 
 def _of_script(function: Callable, items: Sequence[Any]) -> bool:
-    """Whether a worker needs the script that runs: the function, or what it is called with, is defined there."""
+    """Whether a worker needs the script that runs: the function, or what it is called with, is
+    defined there.
+    """
     return b"__main__" in pickle.dumps((function, items))
 
 
 class _OwnMain(SpawnProcess):
     """A worker that does not run the caller's script.
 
-    A process of multiprocessing imports it, so a script that calls a function of this package would have to stand below
-    ``if __name__ == "__main__"``: else each worker calls that function again.
+    A process of multiprocessing imports it, so a script that calls a function of this package would
+    have to stand below ``if __name__ == "__main__"``: else each worker calls that function again.
     """
 
     @staticmethod
@@ -128,7 +150,9 @@ class _OwnMain(SpawnProcess):
             told = usual(name)
             if name != process_obj.name:  # another thread starts a process of its own meanwhile
                 return told
-            return {key: value for key, value in told.items() if not key.startswith("init_main_from")}
+            return {
+                key: value for key, value in told.items() if not key.startswith("init_main_from")
+            }
 
         with _starting:
             usual = spawn.get_preparation_data
@@ -146,7 +170,9 @@ class _OwnMainContext(SpawnContext):
 
 
 def _begin_worker() -> None:
-    """Use one core, end at once and silently with Ctrl-C, and end with the parent: a worker would wait for ever."""
+    """Use one core, end at once and silently with Ctrl-C, and end with the parent: a worker
+    would wait for ever.
+    """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     threadpool_limits(1, "blas")
     parent = multiprocessing.parent_process()
@@ -159,7 +185,9 @@ def _begin_worker() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _on_cluster(function: Callable, items: Sequence[Item], scheduler: str) -> Iterator[tuple[Item, Any]]:
+def _on_cluster(
+    function: Callable, items: Sequence[Item], scheduler: str
+) -> Iterator[tuple[Item, Any]]:
     with extras():
         from distributed import Client, KilledWorker, as_completed
     try:

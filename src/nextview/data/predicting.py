@@ -39,42 +39,73 @@ def predict(
     scheduler: str | None = None,
     overwrite: bool = False,
 ) -> Iterator[tuple[int, int]]:
-    """Write the predictions of a store's rendered objects into an .npz file; options as of ``nextview predict``.
+    """Write the predictions of a store's rendered objects into an .npz file; options as of
+    ``nextview predict``.
 
-    ``size`` lets the recogniser know how large the objects are, where store and card tell. What is done is kept beside
-    ``out``: a run that was killed goes on from there. Yields objects done so far, and how many there are.
-    DatasetError: no such objects, a class that the recogniser does not know, or an object that kills its process.
+    ``size`` lets the recogniser know how large the objects are, where store and card tell. What is
+    done is kept beside
+    ``out``: a run that was killed goes on from there. Yields objects done so far, and how many
+        there are.
+    DatasetError: no such objects, a class that the recogniser does not know, or an object that
+        kills its process.
     ResultsError: ``out`` exists, or cannot be written.
     """
-    path, out = Path(path), Path(out)
+    path = Path(path)
+    out = Path(out)
     check_new(out, overwrite)
     store = ViewStore.open(path)
     objects = some_objects(store, split, held_out)
-    plan, radii, of_size = _plan(store, objects, recogniser, maps), store.radii[objects], None
+    plan = _plan(store, objects, recogniser, maps)
+    radii = store.radii[objects]
+    of_size = None
     if size and recogniser.size is not None and not np.isnan(radii).all():
         of_size = recogniser.size.logits(radii).astype(np.float32)
-    key = hashlib.sha256(repr((plan.names, plan.models)).encode() + plan.depth_entropy.tobytes()).hexdigest()
+    key = hashlib.sha256(
+        repr((plan.names, plan.models)).encode() + plan.depth_entropy.tobytes()
+    ).hexdigest()
     with writing(out), unfinished(out, key) as place:
         files = [place / f"{i}.npz" for i in objects]
         items = [item for item in zip(objects.tolist(), files, strict=True) if not item[1].exists()]
         networks = tuple((name, _card_file(card)) for name, card in maps.items())
         work = partial(_predict_object, (store.path.absolute(), _card_file(recogniser), networks))
-        yield from counted(work, items, len(objects), lambda it: f"{path}: {store.names[it[0]]}", workers, scheduler)
+        yield from counted(
+            work,
+            items,
+            len(objects),
+            lambda it: f"{path}: {store.names[it[0]]}",
+            workers,
+            scheduler,
+        )
 
         arrays = _together(files)
-        maps_found = {name.removeprefix("map/"): found for name, found in arrays.items() if name.startswith("map/")}
+        maps_found = {
+            name.removeprefix("map/"): found
+            for name, found in arrays.items()
+            if name.startswith("map/")
+        }
         logits = arrays["logits"] if of_size is None else arrays["logits"] + of_size[:, None]
         bins = arrays.get("azimuth_bins")
-        replace(plan, logits=logits, of_size=of_size, azimuth_bins=bins, maps=maps_found).save(out, overwrite)
+        replace(plan, logits=logits, of_size=of_size, azimuth_bins=bins, maps=maps_found).save(
+            out, overwrite
+        )
 
 
-def _plan(store: ViewStore, objects: NDArray[np.int64], recogniser: ModelCard, maps: Cards) -> Predictions:
+def _plan(
+    store: ViewStore, objects: NDArray[np.int64], recogniser: ModelCard, maps: Cards
+) -> Predictions:
     """What store and cards say of the objects; what the networks say is still to come."""
     own = [card for card in (recogniser, *maps.values()) if card.path.parent != BUNDLED]
-    made_by = [*store.commands, *(line for card in own for line in card.training.commands), command()]
+    made_by = [
+        *store.commands,
+        *(line for card in own for line in card.training.commands),
+        command(),
+    ]
     return replace(
         Predictions.of_objects_in(store, objects, recogniser.classes),
-        models={name: (card.name, card.sha256) for name, card in ({"recogniser": recogniser} | maps).items()},
+        models={
+            name: (card.name, card.sha256)
+            for name, card in ({"recogniser": recogniser} | maps).items()
+        },
         valley_classes={name: card.valleys(recogniser.classes) for name, card in maps.items()},
         calibration=recogniser.calibration,
         commands=tuple(dict.fromkeys(made_by)),
@@ -86,14 +117,20 @@ def _card_file(card: ModelCard) -> Path:
 
 
 @lru_cache(maxsize=1)
-def _open(store: Path, recogniser: Path, maps: Files) -> tuple[ViewStore, NetworkRecogniser, dict[str, MapNetwork]]:
-    """Each process has its own store and networks, and one thread: objects are what runs side by side."""
+def _open(
+    store: Path, recogniser: Path, maps: Files
+) -> tuple[ViewStore, NetworkRecogniser, dict[str, MapNetwork]]:
+    """Each process has its own store and networks, and one thread: objects are what runs side by
+    side.
+    """
     networks = {name: MapNetwork(card, threads=1) for name, card in maps}
     return ViewStore.open(store), open_recogniser(recogniser, threads=1), networks
 
 
 def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> None:
-    """Write maps, azimuth bins and logits of all views of one object, whole or not at all; zeros if nothing is seen."""
+    """Write maps, azimuth bins and logits of all views of one object, whole or not at all; zeros
+    if nothing is seen.
+    """
     (i, file), (store, recogniser, maps) = item, _open(*files)
     specs = {recogniser.card.input} | {network.card.input for network in maps.values()}
     inputs = {spec: from_store(spec, store, i) for spec in specs}
@@ -105,7 +142,10 @@ def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> 
         for kind in answers[0]:
             values = np.concatenate([answer[kind] for answer in answers])
             found[f"map/{name}{kind.removeprefix(network.card.kind)}"] = values
-    evidence = [recogniser.from_inputs(inputs[recogniser.card.input][batch], elevation[batch]) for batch in batches]
+    evidence = [
+        recogniser.from_inputs(inputs[recogniser.card.input][batch], elevation[batch])
+        for batch in batches
+    ]
     found["logits"] = np.concatenate([e.logits for e in evidence])
     bins = [e.azimuth_bins for e in evidence if e.azimuth_bins is not None]
     if bins:
@@ -119,12 +159,16 @@ def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> 
 
 
 def _together(files: Sequence[Path]) -> dict[str, NDArray[np.float32]]:
-    """The arrays of all objects, (N, ...), from one file for each: "logits", "azimuth_bins" and "map/NAME"."""
+    """The arrays of all objects, (N, ...), from one file for each: "logits", "azimuth_bins" and
+    "map/NAME".
+    """
     objects = []
     for file in files:
         try:
             with np.load(file, allow_pickle=False) as arrays:
                 objects.append(dict(arrays))
         except DAMAGED as error:
-            raise PredictionsError(f"{file}: is damaged ({error}); delete it and run again") from None
+            raise PredictionsError(
+                f"{file}: is damaged ({error}); delete it and run again"
+            ) from None
     return {name: np.stack([arrays[name] for arrays in objects]) for name in objects[0]}

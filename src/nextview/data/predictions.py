@@ -22,36 +22,58 @@ from nextview.policies.base import Evidence
 from nextview.recognition.belief import PLAIN_SUM, Calibration, log_evidence_of
 
 FORMAT = 1
-PACKED, SPARE = 100, 64 * 2**20  # a file holds at most this many times its size, and so many bytes more
+# a file holds at most this many times its size, and so many bytes more
+PACKED = 100
+SPARE = 64 * 2**20
 SAME = 1e-5  # difference between logits that are the same, but for rounding
-KINDS = {"labels": "iu", "splits": "U", "conflicting": "b"}  # of numpy's types; all other arrays are of floats
+# of numpy's types; all other arrays are of floats
+KINDS = {"labels": "iu", "splits": "U", "conflicting": "b"}
 
 
 @dataclass(frozen=True)
 class Predictions:
-    """What the models say of N objects from the V views of a sphere; C classes, R rings."""
+    """What the models say of N objects from the V views of a sphere; C classes, R rings.
 
-    logits: NDArray[np.float32]  # of the recogniser for each view alone, (N, V, C)
-    # predicted local maps around each view by name ("lem"), each (N, V, R, 3); those of the whole sphere ("lem-sphere")
-    # are (N, V, R, azimuths), once round from the view
+    Attributes:
+        logits: of the recogniser for each view alone, (N, V, C).
+        maps: predicted local maps around each view by name ("lem"), each (N, V, R, 3); those of the
+            whole sphere ("lem-sphere") are (N, V, R, azimuths), once round from the view.
+        depth_entropy: the true measure, bits, (N, V).
+        names: of the objects, unique.
+        labels: true class of each as an index into ``classes``, (N,).
+        classes: their names, in the order of the logits.
+        splits: "train", "test" or "" for each object, (N,).
+        conflicting: objects that are the very mesh of another one with another label, (N,).
+        models: name and SHA-256 of the "recogniser" and of each map network ("lem").
+        valley_classes: of each map: those for which the valley is the better view.
+        calibration: how far a sum of the recogniser's logits is to be trusted.
+        azimuth_bins: see ``Evidence``, (N, V, hypotheses, bins); None if not known.
+        of_size: what the size added to the logits, (N, C); None if not known.
+        store: absolute path of the view store they were made from; empty if it is not known.
+        commands: all that made them, in order, from the meshes on; () if that is not known.
+    """
+
+    logits: NDArray[np.float32]
     maps: dict[str, NDArray[np.float32]]
-    depth_entropy: NDArray[np.float32]  # the true measure, bits, (N, V)
-    names: tuple[str, ...]  # of the objects, unique
-    labels: NDArray[np.int64]  # true class of each as an index into ``classes``, (N,)
-    classes: tuple[str, ...]  # their names, in the order of the logits
-    splits: NDArray[np.str_]  # "train", "test" or "" for each object, (N,)
-    conflicting: NDArray[np.bool_]  # objects that are the very mesh of another one with another label, (N,)
+    depth_entropy: NDArray[np.float32]
+    names: tuple[str, ...]
+    labels: NDArray[np.int64]
+    classes: tuple[str, ...]
+    splits: NDArray[np.str_]
+    conflicting: NDArray[np.bool_]
     sphere: ViewSphere
-    models: dict[str, tuple[str, str]]  # name and SHA-256 of the "recogniser" and of each map network ("lem")
-    valley_classes: dict[str, tuple[str, ...]]  # of each map: those for which the valley is the better view
-    calibration: Calibration = PLAIN_SUM  # how far a sum of the recogniser's logits is to be trusted
-    azimuth_bins: NDArray[np.float32] | None = None  # see ``Evidence``, (N, V, hypotheses, bins); None if not known
-    of_size: NDArray[np.float32] | None = None  # what the size added to the logits, (N, C); None if not known
-    store: str = ""  # absolute path of the view store they were made from; empty if it is not known
-    commands: tuple[str, ...] = ()  # all that made them, in order, from the meshes on; () if that is not known
+    models: dict[str, tuple[str, str]]
+    valley_classes: dict[str, tuple[str, ...]]
+    calibration: Calibration = PLAIN_SUM
+    azimuth_bins: NDArray[np.float32] | None = None
+    of_size: NDArray[np.float32] | None = None
+    store: str = ""
+    commands: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        n, v, c = len(self.names), len(self.sphere), len(self.classes)
+        n = len(self.names)
+        v = len(self.sphere)
+        c = len(self.classes)
         h = len(self.calibration.hypotheses) or c
         if n == 0:
             raise PredictionsError("these predictions hold no objects")
@@ -59,15 +81,29 @@ class Predictions:
             raise PredictionsError("these predictions name no classes")
         bins = () if self.azimuth_bins is None else self.azimuth_bins.shape[-1:]
         shapes: dict[str, tuple[int, ...]] = {
-            "logits": (n, v, c), "depth_entropy": (n, v), "labels": (n,), "splits": (n,), "conflicting": (n,),
-            "azimuth_bins": (n, v, h, *bins), "of_size": (n, c),
-        }  # fmt: skip
-        for name, values in (self._arrays() | {f"map {name}": values for name, values in self.maps.items()}).items():
-            shape = shapes.get(name, (n, v, self.sphere.rings, self.sphere.azimuths if name.endswith("-sphere") else 3))
+            "logits": (n, v, c),
+            "depth_entropy": (n, v),
+            "labels": (n,),
+            "splits": (n,),
+            "conflicting": (n,),
+            "azimuth_bins": (n, v, h, *bins),
+            "of_size": (n, c),
+        }
+        for name, values in (
+            self._arrays() | {f"map {name}": values for name, values in self.maps.items()}
+        ).items():
+            shape = shapes.get(
+                name,
+                (n, v, self.sphere.rings, self.sphere.azimuths if name.endswith("-sphere") else 3),
+            )
             if values.shape != shape:
-                raise PredictionsError(f"{name} of these predictions has the shape {values.shape}, not {shape}")
+                raise PredictionsError(
+                    f"{name} of these predictions has the shape {values.shape}, not {shape}"
+                )
             if values.dtype.kind not in KINDS.get(name, "f"):
-                raise PredictionsError(f"{name} of these predictions is of the wrong type, {values.dtype}")
+                raise PredictionsError(
+                    f"{name} of these predictions is of the wrong type, {values.dtype}"
+                )
             if values.dtype.kind == "f" and not np.isfinite(values).all():
                 bad = self.names[int(np.isfinite(values.reshape(n, -1)).all(1).argmin())]
                 raise PredictionsError(f"{name} of object {bad} is not a finite number")
@@ -83,18 +119,30 @@ class Predictions:
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays that have a row for each object, without the maps."""
-        return {f.name: values for f in fields(self) if isinstance(values := getattr(self, f.name), np.ndarray)}
+        return {
+            f.name: values
+            for f in fields(self)
+            if isinstance(values := getattr(self, f.name), np.ndarray)
+        }
 
     @cached_property
     def log_evidence(self) -> NDArray[np.float32]:
-        """What the recogniser says of each view, so that views can be summed, (N, V, D); see ``log_evidence_of``."""
+        """What the recogniser says of each view, so that views can be summed, (N, V, D); see
+        ``log_evidence_of``.
+        """
         return log_evidence_of(self.logits, self.azimuth_bins, self.sphere.azimuth)
 
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
-        """Whether enough of the object shows in each view to say anything of it, (N, V): else all classes are alike."""
+        """Whether enough of the object shows in each view to say anything of it, (N, V): else
+        all classes are alike.
+        """
         seen = np.ptp(self.by_shape().logits, axis=2) > (SAME if len(self.classes) > 1 else -1)
-        return seen if self.azimuth_bins is None else seen | (np.ptp(self.azimuth_bins, axis=(2, 3)) > SAME)
+        return (
+            seen
+            if self.azimuth_bins is None
+            else seen | (np.ptp(self.azimuth_bins, axis=(2, 3)) > SAME)
+        )
 
     @property
     def weights(self) -> NDArray[np.float64]:
@@ -116,13 +164,19 @@ class Predictions:
         kept = self.splits == split
         if not kept.any():
             if not self.splits.any():
-                raise PredictionsError(f"these predictions name no splits, so no objects of {split!r}: take them all")
+                raise PredictionsError(
+                    f"these predictions name no splits, so no objects of {split!r}: take them all"
+                )
             there = ", ".join(repr(str(name)) for name in np.unique(self.splits))
-            raise PredictionsError(f"these predictions hold no objects of the split {split!r}, only of {there}")
+            raise PredictionsError(
+                f"these predictions hold no objects of the split {split!r}, only of {there}"
+            )
         return self.of_objects(np.flatnonzero(kept))
 
     def deduplicate(self) -> "Predictions":
-        """One object of each shape and label: without the copies that look the same from every view."""
+        """One object of each shape and label: without the copies that look the same from every
+        view.
+        """
         return self.of_objects(deduplicated(self.labels, self.depth_entropy))
 
     def of_objects(self, kept: NDArray[np.int64]) -> "Predictions":
@@ -133,14 +187,20 @@ class Predictions:
 
     @classmethod
     def joined(cls, parts: Sequence["Predictions"]) -> "Predictions":
-        """All objects of predictions by the same models, one after the other: in part K their names end in #K."""
+        """All objects of predictions by the same models, one after the other: in part K their
+        names end in #K.
+        """
         found = [part._arrays() for part in parts]
         arrays: dict[str, Any] = {
-            name: np.concatenate([own[name] for own in found]) if all(name in own for own in found) else None
+            name: np.concatenate([own[name] for own in found])
+            if all(name in own for own in found)
+            else None
             for name in found[0]
         }
         maps = {name: np.concatenate([part.maps[name] for part in parts]) for name in parts[0].maps}
-        names = (f"{name}#{k}" if k else name for k, part in enumerate(parts) for name in part.names)
+        names = (
+            f"{name}#{k}" if k else name for k, part in enumerate(parts) for name in part.names
+        )
         return replace(parts[0], **arrays, maps=maps, names=tuple(names))
 
     def by_shape(self) -> "Predictions":
@@ -161,8 +221,8 @@ class Predictions:
 
         Args:
             store: view store, or its path.
-            logits: of each view of the rendered objects of the split, in the store's order, (N, V, C). Those of views
-                in which nothing is seen are set to 0: no evidence.
+            logits: of each view of the rendered objects of the split, in the store's order, (N, V,
+                C). Those of views in which nothing is seen are set to 0: no evidence.
             classes: their names; those of the store by default.
             split: "train", "test" or "val"; all objects by default.
 
@@ -174,17 +234,23 @@ class Predictions:
         logits = np.array(logits, np.float32)
         made = replace(cls.of_objects_in(store, objects, classes or store.classes), logits=logits)
         if (logits >= 0).all() and np.allclose(logits.sum(2), 1, atol=1e-3):
-            raise PredictionsError("these are probabilities where logits are expected; hand in their logarithms")
+            raise PredictionsError(
+                "these are probabilities where logits are expected; hand in their logarithms"
+            )
         for row, i in enumerate(objects):
             logits[row, [not enough_shows(depth > 0) for depth in store.read("depth", i)]] = 0
         return made
 
     @classmethod
-    def of_objects_in(cls, store: ViewStore, objects: NDArray[np.int64], classes: Sequence[str]) -> "Predictions":
+    def of_objects_in(
+        cls, store: ViewStore, objects: NDArray[np.int64], classes: Sequence[str]
+    ) -> "Predictions":
         """What a store says of objects, by index; all logits are 0."""
         labels = [store.classes[label] for label in store.labels[objects]]
         if unknown := sorted(set(labels) - set(classes)):
-            raise DatasetError(f"{store.path}: the recogniser does not know the class {unknown[0]!r}")
+            raise DatasetError(
+                f"{store.path}: the recogniser does not know the class {unknown[0]!r}"
+            )
         group = duplicate_groups(store.measure())
         several = np.zeros((group.max() + 1, len(store.classes)), bool)
         several[group, store.labels] = True
@@ -208,7 +274,10 @@ class Predictions:
         """Write one .npz file, whole or not at all; ResultsError if that cannot be."""
         arrays: dict[str, Any] = self._arrays()
         arrays |= {f"map/{name}": values for name, values in self.maps.items()}
-        arrays |= {f"valley/{name}": np.array(classes, np.str_) for name, classes in self.valley_classes.items()}
+        arrays |= {
+            f"valley/{name}": np.array(classes, np.str_)
+            for name, classes in self.valley_classes.items()
+        }
         arrays |= {
             "format": FORMAT,
             "names": np.array(self.names),
@@ -218,7 +287,9 @@ class Predictions:
             "distance": self.sphere.distance,
             "calibration": np.array(msgspec.json.encode(self.calibration).decode()),
             "store": np.array(self.store),
-            "models": np.array([(kind, *model) for kind, model in self.models.items()]).reshape(-1, 3),
+            "models": np.array([(kind, *model) for kind, model in self.models.items()]).reshape(
+                -1, 3
+            ),
             "commands": np.array(self.commands, np.str_),
         }
         with new_file(Path(path), overwrite) as part, part.open("wb") as file:
@@ -226,7 +297,10 @@ class Predictions:
 
     @classmethod
     def load(cls, path: str | Path) -> "Predictions":
-        """Read what ``save`` wrote; PredictionsError if it is missing or damaged. Nothing is unpickled."""
+        """Read what ``save`` wrote; PredictionsError if it is missing or damaged.
+
+        Nothing is unpickled.
+        """
         path = Path(path)
         if not path.exists():
             raise PredictionsError(f"{path}: there is no such file; make one with nextview predict")
@@ -244,7 +318,11 @@ class Predictions:
     @classmethod
     def _from(cls, f: dict[str, NDArray]) -> "Predictions":
         def group(prefix: str) -> dict[str, NDArray]:
-            return {name.removeprefix(prefix): values for name, values in f.items() if name.startswith(prefix)}
+            return {
+                name.removeprefix(prefix): values
+                for name, values in f.items()
+                if name.startswith(prefix)
+            }
 
         if "format" not in f or f["format"].tolist() != FORMAT:
             raise PredictionsError(f"not a predictions file of format {FORMAT}; make it again")
@@ -258,9 +336,13 @@ class Predictions:
             maps=group("map/"),
             names=tuple(f["names"].tolist()),
             classes=tuple(f["classes"].tolist()),
-            sphere=ViewSphere(tuple(f["elevations"].tolist()), int(f["azimuths"]), float(f["distance"])),
+            sphere=ViewSphere(
+                tuple(f["elevations"].tolist()), int(f["azimuths"]), float(f["distance"])
+            ),
             models={kind: (name, sha) for kind, name, sha in f["models"].tolist()},
-            valley_classes={name: tuple(classes.tolist()) for name, classes in group("valley/").items()},
+            valley_classes={
+                name: tuple(classes.tolist()) for name, classes in group("valley/").items()
+            },
             calibration=decode_record(trust, Calibration, "not a calibration", PredictionsError),
             store=str(f.get("store", "")),
             commands=tuple(f["commands"].tolist()) if "commands" in f else (),
@@ -268,7 +350,9 @@ class Predictions:
 
 
 def _read(path: Path) -> dict[str, NDArray]:
-    """The arrays of a file by name, after the sizes that they announce were held against the file's."""
+    """The arrays of a file by name, after the sizes that they announce were held against the
+    file's.
+    """
     with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
         members = file.zip.infolist()
         if sum(member.file_size for member in members) > PACKED * path.stat().st_size + SPARE:

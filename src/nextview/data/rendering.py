@@ -16,11 +16,29 @@ from nextview.data.folders import Entry, Listing, scan_dataset, select
 from nextview.data.measures import depth_entropy
 from nextview.data.pool import WorkerDied, count, each
 from nextview.data.scene_views import SIDE, render_scene
-from nextview.data.store import DEPTH_UNIT, DONE, FAILED, POINT_UNIT, Attributes, ViewStore, describe, opened, writing
+from nextview.data.store import (
+    DEPTH_UNIT,
+    DONE,
+    FAILED,
+    POINT_UNIT,
+    Attributes,
+    ViewStore,
+    describe,
+    opened,
+    writing,
+)
 from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.files import command, sha256_of
 from nextview.geometry.depth import POINTS
-from nextview.geometry.mesh import FORMATS, MAX_FACES, UNITS, Mesh, load_mesh, make_mesh, mesh_warnings
+from nextview.geometry.mesh import (
+    FORMATS,
+    MAX_FACES,
+    UNITS,
+    Mesh,
+    load_mesh,
+    make_mesh,
+    mesh_warnings,
+)
 from nextview.geometry.observation import Camera
 from nextview.geometry.viewsphere import DISTANCE, ViewSphere, rotation_z
 from nextview.sensing.observed_object import SIZE
@@ -35,23 +53,34 @@ AnySensor = Sensor | SensorMix | None
 LARGEST_CHUNK = 2**31 - 2**20  # bytes that may be compressed at once, the compressor's own included
 ODD_MESHES = 10  # that are named
 FARTHEST = np.iinfo(np.uint16).max * DEPTH_UNIT  # depth that can be stored, object radii
-SENSING = 256  # sets the draws of a sensor apart from those of a deformation: no byte of a name is as large
+# sets the draws of a sensor apart from those of a deformation: no byte of a name is as large
+SENSING = 256
 
 _log = logging.getLogger("nextview")
 
 
 @dataclass(frozen=True)
 class Deform:
-    """Make a new object of a mesh."""
+    """Make a new object of a mesh.
 
-    stretch: float = 0.0  # scale each axis by a factor from 1/(1 + stretch) to 1 + stretch, drawn log-uniformly
-    rotated: bool = False  # rotate about the vertical by any angle
+    Attributes:
+        stretch: scale each axis by a factor from 1/(1 + stretch) to 1 + stretch, drawn
+            log-uniformly.
+        rotated: rotate about the vertical by any angle.
+    """
+
+    stretch: float = 0.0
+    rotated: bool = False
 
     def draw(self, seed: int, name: str) -> tuple[NDArray[np.float64], float]:
-        """The factors of the three axes, (3,), and the angle, radians, of the object of that name."""
+        """The factors of the three axes, (3,), and the angle, radians, of the object of that
+        name.
+        """
         rng = np.random.default_rng([seed, *name.encode()])
         reach = np.log1p(self.stretch)
-        return np.exp(rng.uniform(-reach, reach, 3)), rng.uniform(0, 2 * np.pi) if self.rotated else 0.0
+        return np.exp(rng.uniform(-reach, reach, 3)), (
+            rng.uniform(0, 2 * np.pi) if self.rotated else 0.0
+        )
 
     def __call__(self, mesh: Mesh, seed: int, name: str) -> Mesh:
         """The new object, normalised again."""
@@ -73,26 +102,42 @@ def render_object(camera: Camera, sphere: ViewSphere, size: int) -> dict[str, np
         "image": image,
         "depth": depth,
         "points": np.rint(points / POINT_UNIT).clip(-32767, 32767).astype(np.int16),
-        "measures/depth_entropy": np.array([depth_entropy(d * DEPTH_UNIT) for d in depth], np.float32),
+        "measures/depth_entropy": np.array(
+            [depth_entropy(d * DEPTH_UNIT) for d in depth], np.float32
+        ),
     }
 
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """What is rendered, and how."""
+    """What is rendered, and how.
 
-    seed: int = 0  # decides deformations and errors of a sensor: those of an object by its name alone
-    deform: Deform = Deform()  # how to make a new object of each mesh
-    noise_seed: int | None = None  # decides the errors of a sensor instead: the same objects, with other errors
-    # look through it with all its errors: NAME or NAME:STRENGTH (docs/your_camera.md); clean by default
+    Attributes:
+        seed: decides deformations and errors of a sensor: those of an object by its name alone.
+        deform: how to make a new object of each mesh.
+        noise_seed: decides the errors of a sensor instead: the same objects, with other errors.
+        sensor: look through it with all its errors: NAME or NAME:STRENGTH (docs/your_camera.md);
+            clean by default.
+        unit: of length in the mesh files (mm, cm, inch, foot, m), so that sizes are known
+            (ModelNet: inch).
+        split: only this split of the dataset.
+        held_out: only the objects that this model (its name or card) held out of its training.
+        meshes: of scenes: the folder of the meshes that they are made of.
+        max_faces: leave out a mesh of more triangles, or a file of more than 60 bytes for each of
+            these.
+        largest_part: leave out all that is not connected to the largest part of each mesh.
+    """
+
+    seed: int = 0
+    deform: Deform = Deform()
+    noise_seed: int | None = None
     sensor: str | None = None
-    # of length in the mesh files (mm, cm, inch, foot, m), so that sizes are known (ModelNet: inch)
     unit: str | None = None
-    split: str | None = None  # only this split of the dataset
-    held_out: str | None = None  # only the objects that this model (its name or card) held out of its training
-    meshes: Path | None = None  # of scenes: the folder of the meshes that they are made of
-    max_faces: int = MAX_FACES  # leave out a mesh of more triangles, or a file of more than 60 bytes for each of these
-    largest_part: bool = False  # leave out all that is not connected to the largest part of each mesh
+    split: str | None = None
+    held_out: str | None = None
+    meshes: Path | None = None
+    max_faces: int = MAX_FACES
+    largest_part: bool = False
 
 
 def render(
@@ -105,42 +150,52 @@ def render(
     scheduler: str | None = None,
     overwrite: bool = False,
 ) -> Iterator[tuple[str, str | None]]:
-    """Render every mesh, or the target of every scene, that the store lacks; one that failed before is tried again.
+    """Render every mesh, or the target of every scene, that the store lacks; one that failed before
+    is tried again.
 
-    It may end at any moment, by a kill or a full disk; the next run goes on. ``size`` is the side of the images,
-    pixels; ``overwrite`` replaces a store of other objects or settings; workers as of ``pool.each`` see the same files.
-    Yields (name, None) for each object done, (name, reason) for one that cannot be rendered. DatasetError: dataset or
-    store cannot be used, or another run is writing it. UsageError: a setting that makes no sense.
+    It may end at any moment, by a kill or a full disk; the next run goes on. ``size`` is the side
+    of the images, pixels; ``overwrite`` replaces a store of other objects or settings; workers as
+    of ``pool.each`` see the same files. Yields (name, None) for each object done, (name, reason)
+    for one that cannot be rendered. DatasetError: dataset or store cannot be used, or another run
+    is writing it. UsageError: a setting that makes no sense.
     """
-    dataset, path = Path(dataset).absolute(), Path(path).absolute()
+    dataset = Path(dataset).absolute()
+    path = Path(path).absolute()
     sensor = _check(path, sphere, size, options)
     count(workers)
     entries = listing(dataset, options).entries
     with writing(path):
         with ThreadPoolExecutor() as pool:
             hashes = list(pool.map(_hash, [e.path for e in entries]))
-        recipe = {name: getattr(options, name) for name in ("seed", "noise_seed", "unit", "largest_part")} | vars(
-            options.deform
-        )
+        recipe = {
+            name: getattr(options, name) for name in ("seed", "noise_seed", "unit", "largest_part")
+        } | vars(options.deform)
         recipe |= {"sha256": hashes, "sensor": None if sensor is None else sensor.to_dict()}
         recipe |= {"scene": None if options.meshes is None else SIDE, "dataset": dataset.name}
         store = _begin(path, describe(entries, sphere, size, recipe), overwrite)
         if (made_by := command()) not in store.commands:
             store.note(commands=[*store.commands, made_by])
         # Largest files first, so that no worker is left with a long one at the end.
-        todo = sorted(np.flatnonzero(~store.done).tolist(), key=lambda i: -entries[i].path.stat().st_size)
+        todo = sorted(
+            np.flatnonzero(~store.done).tolist(), key=lambda i: -entries[i].path.stat().st_size
+        )
         items = [(i, entries[i]) for i in todo]
         odd: list[str] = []
-        for (i, entry), result in each(partial(_render_entry, path, options, sensor), items, workers, scheduler):
+        for (i, entry), result in each(
+            partial(_render_entry, path, options, sensor), items, workers, scheduler
+        ):
             reason: str | None
             if isinstance(result, WorkerDied):
                 reason = f"{entry.path}: {result}"
             else:
                 reason, doubts = result
                 odd += [f"{entry.path}: {'; '.join(doubts)}"] if doubts else []
-            others = {name: said for name, said in store.attributes.failures.items() if name != entry.name}
+            others = {
+                name: said for name, said in store.attributes.failures.items() if name != entry.name
+            }
             if reason is not None:
-                # Only this process writes reasons; the status comes last, as for an object that is done.
+                # Only this process writes reasons; the status comes last, as for an object that is
+                # done.
                 store.note(failures=others | {entry.name: reason})
                 store.write(i, {"status": np.array(FAILED, np.uint8)})
             elif len(others) < len(store.attributes.failures):
@@ -154,44 +209,63 @@ def _warn(odd: list[str]) -> None:
     for sentence in sorted(odd)[:ODD_MESHES]:
         _log.warning("%s", sentence)
     if len(odd) > ODD_MESHES:
-        _log.warning("and %d more meshes look odd; nextview recognise says it of each", len(odd) - ODD_MESHES)
+        _log.warning(
+            "and %d more meshes look odd; nextview recognise says it of each", len(odd) - ODD_MESHES
+        )
 
 
 def _check(path: Path, sphere: ViewSphere, size: int, options: RenderOptions) -> AnySensor:
     """Refuse settings that make no views; the sensor, if there is one."""
-    whole(size, f"the size of {len(sphere)} views in pixels", 1, int(np.sqrt((LARGEST_CHUNK - 1) / 2 / len(sphere))))
+    whole(
+        size,
+        f"the size of {len(sphere)} views in pixels",
+        1,
+        int(np.sqrt((LARGEST_CHUNK - 1) / 2 / len(sphere))),
+    )
     whole(options.seed, "the seed", 0, 2**63 - 1)
     whole(options.noise_seed or 0, "the seed of the noise", 0, 2**63 - 1)
     number(options.deform.stretch, "a stretch", 0)
     if options.unit not in (None, *UNITS):
         raise UsageError(f"the unit is one of {', '.join(UNITS)}, not {options.unit}")
     if options.meshes is not None and options.deform != Deform():
-        raise UsageError("scenes are rendered as they are: objects in them are neither stretched nor rotated")
+        raise UsageError(
+            "scenes are rendered as they are: objects in them are neither stretched nor rotated"
+        )
     if options.meshes is not None and options.largest_part:
-        raise UsageError("scenes are rendered as they are: the largest part is of a folder of meshes")
+        raise UsageError(
+            "scenes are rendered as they are: the largest part is of a folder of meshes"
+        )
     if sphere.distance + 1 > FARTHEST:
         most = f"{FARTHEST:.2f} object radii, so the distance can be {FARTHEST - 1:.2f} at most"
         raise DatasetError(f"{path}: depth is stored up to {most}, not {sphere.distance:g}")
     if options.sensor is None:
         return None
     if (size, sphere.distance) != (SIZE, DISTANCE):
-        raise UsageError(f"a sensor's views are of {SIZE} pixels, from {DISTANCE:g} object radii; give no other")
+        raise UsageError(
+            f"a sensor's views are of {SIZE} pixels, from {DISTANCE:g} object radii; give no other"
+        )
     return sensor_named(options.sensor)
 
 
 def listing(dataset: Path, options: RenderOptions) -> Listing:
-    """The meshes, or the scenes, of a dataset folder that are asked for, and what is left out beside them."""
+    """The meshes, or the scenes, of a dataset folder that are asked for, and what is left out
+    beside them.
+    """
     try:
         found = scan_dataset(dataset, FORMATS if options.meshes is None else (SUFFIX,))
     except DatasetError:
         if options.meshes is None and any(dataset.glob(f"*/**/*@*{SUFFIX}")):
-            raise DatasetError(f"{dataset}: holds scenes; say with --meshes where the meshes are in them") from None
+            raise DatasetError(
+                f"{dataset}: holds scenes; say with --meshes where the meshes are in them"
+            ) from None
         raise
     return replace(found, entries=select(found.entries, dataset, options.split, options.held_out))
 
 
 def rotations(store: ViewStore) -> NDArray[np.float64]:
-    """By how much each object of a store was rotated about z when it was rendered, radians, (N,)."""
+    """By how much each object of a store was rotated about z when it was rendered, radians,
+    (N,).
+    """
     deform = Deform(store.attributes.stretch, store.attributes.rotated)
     return np.array([deform.draw(store.attributes.seed, name)[1] for name in store.names])
 
@@ -209,21 +283,29 @@ def _hash(path: Path) -> str:
 
 
 def _begin(path: Path, wanted: Attributes, overwrite: bool) -> ViewStore:
-    """The store as an earlier run left it, if that had the same meshes and settings, or a new one."""
+    """The store as an earlier run left it, if that had the same meshes and settings, or a new
+    one.
+    """
     if not path.exists():
         return ViewStore.create(path, wanted)
     if not (path / "zarr.json").exists():
         raise DatasetError(f"{path}: is there, and is no view store; give another name")
     store = ViewStore.open(path)
     there = store.attributes
-    noted = ["unit"] if wanted.sensor is None or wanted.scene is not None else []  # what decides no view
+    # what decides no view
+    noted = ["unit"] if wanted.sensor is None or wanted.scene is not None else []
     for key in wanted.__struct_fields__:
-        if key in (*noted, "dataset", "failures", "commands") or (key == "sha256" and there.sha256 is None):
+        if key in (*noted, "dataset", "failures", "commands") or (
+            key == "sha256" and there.sha256 is None
+        ):
             continue
         if getattr(there, key) != getattr(wanted, key):
             if overwrite:
                 return ViewStore.create(path, wanted, overwrite)
-            raise DatasetError(f"{path}: was begun with other {key}; give another store, or --overwrite to replace it")
+            raise DatasetError(
+                f"{path}: was begun with other {key}; give another store, or --overwrite to"
+                " replace it"
+            )
     if wanted.unit is not None and there.unit is None:
         store.note(unit=wanted.unit)
     if wanted.unit not in (None, there.unit):
@@ -250,7 +332,8 @@ def _render_entry(
         return str(error), ()
     except MemoryError:
         return f"{entry.path}: too large for this machine's memory", ()
-    store.write(i, rendered | {"status": np.array(DONE, np.uint8)})  # last: an object counts only when it is whole
+    # last: an object counts only when it is whole
+    store.write(i, rendered | {"status": np.array(DONE, np.uint8)})
     return None, doubts
 
 
@@ -264,14 +347,27 @@ def _rendered(
     rng = np.random.default_rng([seed, SENSING, *entry.name.encode()])
     camera: Camera
     if options.meshes is None:
-        unit = None if sensor is None else options.unit  # a sensor looks at a mesh of known unit in its true size
-        read = load_mesh(entry.path, unit=unit, max_faces=options.max_faces, largest_part=options.largest_part)
+        # a sensor looks at a mesh of known unit in its true size
+        unit = None if sensor is None else options.unit
+        read = load_mesh(
+            entry.path, unit=unit, max_faces=options.max_faces, largest_part=options.largest_part
+        )
         doubts = mesh_warnings(replace(read, unit=options.unit))
         mesh = deformed(store, read, entry.name)
-        camera = SimulatedCamera(mesh, size, sphere.distance) if sensor is None else SensedCamera(mesh, sensor, rng)
+        camera = (
+            SimulatedCamera(mesh, size, sphere.distance)
+            if sensor is None
+            else SensedCamera(mesh, sensor, rng)
+        )
         return render_object(camera, sphere, size) | {"radius": np.array(mesh.radius)}, doubts
 
-    scene = build_scene(SceneLayout.load(entry.path), Path(options.meshes).absolute(), options.max_faces)
-    camera = OccludedCamera(scene, size, sphere.distance) if sensor is None else sensed_camera(scene, sensor, rng)
+    scene = build_scene(
+        SceneLayout.load(entry.path), Path(options.meshes).absolute(), options.max_faces
+    )
+    camera = (
+        OccludedCamera(scene, size, sphere.distance)
+        if sensor is None
+        else sensed_camera(scene, sensor, rng)
+    )
     rendered = render_object(camera, sphere, size) | render_scene(scene, sphere)
     return rendered | {"radius": np.array(scene.target.radius)}, ()

@@ -7,18 +7,32 @@ import numpy as np
 from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh, make_mesh
 
-Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # two opposite corners, centimetres, z up
+# two opposite corners, centimetres, z up
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 def _legs(x: float, y: float, thick: float, height: float) -> list[Box]:
-    return [((i * x, j * y, 0), (i * (x - thick), j * (y - thick), height)) for i in (-1, 1) for j in (-1, 1)]
+    return [
+        ((i * x, j * y, 0), (i * (x - thick), j * (y - thick), height))
+        for i in (-1, 1)
+        for j in (-1, 1)
+    ]
 
 
 def chair() -> list[Box]:
     """A chair with four legs and a slatted back; it faces +x."""
-    x, y, seat, back, leg = 21.0, 22.0, 45.0, 48.0, 4.0
-    posts: list[Box] = [((-x, s * y, seat), (-x + leg, s * (y - leg), seat + back)) for s in (-1, 1)]
-    slats: list[Box] = [((-x, -y, seat + h * back), (-x + 2, y, seat + (h + 0.16) * back)) for h in (0.3, 0.56, 0.84)]
+    x = 21.0
+    y = 22.0
+    seat = 45.0
+    back = 48.0
+    leg = 4.0
+    posts: list[Box] = [
+        ((-x, s * y, seat), (-x + leg, s * (y - leg), seat + back)) for s in (-1, 1)
+    ]
+    slats: list[Box] = [
+        ((-x, -y, seat + h * back), (-x + 2, y, seat + (h + 0.16) * back))
+        for h in (0.3, 0.56, 0.84)
+    ]
     return [((-x, -y, seat), (x, y, seat + 4)), *_legs(x, y, leg, seat), *posts, *slats]
 
 
@@ -29,7 +43,11 @@ def table() -> list[Box]:
 
 def monitor() -> list[Box]:
     """A flat screen on a foot; it faces +x."""
-    return [((-2, -30, 12), (2, 30, 48)), ((-4, -4, 1), (-1, 4, 30)), ((-10, -14, 0), (10, 14, 1.5))]
+    return [
+        ((-2, -30, 12), (2, 30, 48)),
+        ((-4, -4, 1), (-1, 4, 30)),
+        ((-10, -14, 0), (10, 14, 1.5)),
+    ]
 
 
 SAMPLES: dict[str, Callable[[], list[Box]]] = {"chair": chair, "table": table, "monitor": monitor}
@@ -45,7 +63,9 @@ def sample_mesh(name: str) -> Mesh:
 def boxes_mesh(boxes: list[Box], name: str) -> Mesh:
     """A mesh of axis-aligned boxes, each closed by twelve triangles."""
     corner = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
-    sides = np.array([(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)])
+    sides = np.array(
+        [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    )
     triangles = np.concatenate([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]])
     spans = np.sort(np.array(boxes, float), axis=1)  # (boxes, low and high, xyz)
     vertices = np.where(corner[None], spans[:, 1:2], spans[:, 0:1])

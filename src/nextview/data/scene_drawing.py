@@ -1,7 +1,7 @@
 """Draw a folder of scenes around the objects of a dataset, on all cores, resumable.
 
-Things are set beside a target, where nothing stands yet, until so much of it shows as it should. No physics: they stand
-upright on the table. Their footprints, which are convex hulls, never overlap.
+Things are set beside a target, where nothing stands yet, until so much of it shows as it should. No
+physics: they stand upright on the table. Their footprints, which are convex hulls, never overlap.
 """
 
 from collections.abc import Iterator, Sequence
@@ -33,32 +33,50 @@ from nextview.simulation.scene import (
     mesh_hash,
     place,
     separation,
-)  # fmt: skip
+)
 from nextview.simulation.scene_layout import LEVELS, SUFFIX, Block, Placement, SceneLayout
 from nextview.simulation.simulated import SimulatedCamera, visible_shares
 
 GRID = ViewSphere.named("40")
-SIZE, COARSE = 112, 48  # pixels of the pictures that tell how much of the target shows: in the end, and while drawing
-SPREAD, TOLERANCE = 0.04, 0.02  # how far a scene's wanted share lies from its level's at most, and how well it is met
-FEWEST, MOST = 3, 20  # things around a target
-TRIES, LAYOUTS_TRIED = 200, 20  # things that are tried for one layout, and layouts for one scene
+# pixels of the pictures that tell how much of the target shows: in the end, and while drawing
+SIZE = 112
+COARSE = 48
+# how far a scene's wanted share lies from its level's at most, and how well it is met
+SPREAD = 0.04
+TOLERANCE = 0.02
+# things around a target
+FEWEST = 3
+MOST = 20
+# things that are tried for one layout, and layouts for one scene
+TRIES = 200
+LAYOUTS_TRIED = 20
 GAP = 0.04  # between things, at least, object radii
-AWAY = {"light": (0.5, 2.6), "medium": (0.5, 2.3), "heavy": (0.5, 2.1)}  # from the target's middle, object radii
+# from the target's middle, object radii
+AWAY = {"light": (0.5, 2.6), "medium": (0.5, 2.3), "heavy": (0.5, 2.1)}
 OBJECT_RADIUS = (0.5, 1.1)
 FEWEST_OBJECTS = 2  # of things that are no boxes or walls, if there are any meshes for them
 OBJECTS = {"light": 0.7, "medium": 0.6, "heavy": 0.4}  # share of objects among objects and boxes
-BOX_HEIGHT = {"light": HEIGHT, "medium": HEIGHT, "heavy": (1.4, 2.9)}  # what is low hides nothing from above
-LEAST = {"light": 0.0, "medium": 0.0, "heavy": 0.008}  # what a thing hides at least: the table is soon full
-WALLS = {"light": (0.8, 0.2, 0.0), "medium": (0.5, 0.4, 0.1), "heavy": (0.3, 0.4, 0.3)}  # chances of 0, 1 and 2
-WALL_AWAY, WALL_WIDTH, WALL_DEPTH, WALL_HEIGHT = (1.2, 1.9), (2.0, 3.5), 0.1, (1.0, 2.6)
+# what is low hides nothing from above
+BOX_HEIGHT = {"light": HEIGHT, "medium": HEIGHT, "heavy": (1.4, 2.9)}
+# what a thing hides at least: the table is soon full
+LEAST = {"light": 0.0, "medium": 0.0, "heavy": 0.008}
+# chances of 0, 1 and 2
+WALLS = {"light": (0.8, 0.2, 0.0), "medium": (0.5, 0.4, 0.1), "heavy": (0.3, 0.4, 0.3)}
+WALL_AWAY = (1.2, 1.9)
+WALL_WIDTH = (2.0, 3.5)
+WALL_DEPTH = 0.1
+WALL_HEIGHT = (1.0, 2.6)
 POOL = 8  # meshes that are tried in one scene, at several places each: reading them takes longest
-LARGEST = 100_000  # triangles of an object around the target: larger ones are passed over, for the sake of time
+# triangles of an object around the target: larger ones are passed over, for the sake of time
+LARGEST = 100_000
 MOST_SCENES = 100_000  # at each level, of each split
 
 
 @dataclass(frozen=True)
 class Task:
-    """One scene to draw: its target's mesh file (relative to the dataset), split, level of clutter, name and file."""
+    """One scene to draw: its target's mesh file (relative to the dataset), split, level of
+    clutter, name and file.
+    """
 
     target: str
     split: str
@@ -69,7 +87,9 @@ class Task:
 
 @dataclass(frozen=True)
 class Meshes:
-    """The mesh files that may stand around a target: a folder, and paths below it, with forward slashes, sorted."""
+    """The mesh files that may stand around a target: a folder, and paths below it, with forward
+    slashes, sorted.
+    """
 
     folder: Path
     files: tuple[str, ...]
@@ -88,25 +108,31 @@ def draw_scenes(
 ) -> Iterator[tuple[str, str | None]]:
     """Draw the scenes that are not in the folder yet. Which they are depends on the seed alone.
 
-    The objects of each split are taken in an order that the seed draws, each once before any is taken again, the same
-    at all levels. What stands around an object is of its own split. Files are CLASS/SPLIT/NAME@LEVEL-NUMBER.json, or
-    CLASS/NAME@LEVEL-NUMBER.json where the dataset has no splits. Options as of ``nextview scenes`` and ``pool.each``.
-    Yields (name, None) for each scene that is there, (name, reason) for one that cannot be drawn.
+    The objects of each split are taken in an order that the seed draws, each once before any is
+    taken again, the same at all levels. What stands around an object is of its own split. Files are
+    CLASS/SPLIT/NAME@LEVEL-NUMBER.json, or CLASS/NAME@LEVEL-NUMBER.json where the dataset has no
+    splits. Options as of ``nextview scenes`` and ``pool.each``. Yields (name, None) for each scene
+    that is there, (name, reason) for one that cannot be drawn.
     """
-    dataset, out = Path(dataset), Path(out)
+    dataset = Path(dataset)
+    out = Path(out)
     wanted = tasks(dataset, out, levels, scenes, seed, split, held_out)
     there = next(out.rglob(f"*@*{SUFFIX}"), None)
     if there is None:
         check_new(out, folder=True)
     elif SceneLayout.load(there).seed != seed:
-        raise DatasetError(f"{there}: was drawn with another seed; give another folder or the same seed")
+        raise DatasetError(
+            f"{there}: was drawn with another seed; give another folder or the same seed"
+        )
     done = {task for task in wanted if task.path.exists()}
     yield from ((task.name, None) for task in wanted if task in done)
     todo = [task for task in wanted if task not in done]
     files: dict[str, list[str]] = {}
     for entry in list_dataset(dataset):
         files.setdefault(entry.split, []).append(entry.path.relative_to(dataset).as_posix())
-    meshes = {name: Meshes(dataset.absolute(), tuple(sorted(found))) for name, found in files.items()}
+    meshes = {
+        name: Meshes(dataset.absolute(), tuple(sorted(found))) for name, found in files.items()
+    }
     with writing(out):
         for task, result in each(partial(_draw, meshes, seed), todo, workers, scheduler):
             reason = f"{task.name}: {result}" if isinstance(result, WorkerDied) else result
@@ -125,7 +151,9 @@ def tasks(
     """All scenes that are asked for, see ``draw_scenes``."""
     unknown = [level for level in levels if level not in LEVELS]
     if unknown or not levels:
-        raise UsageError(f"the level of a scene is {', '.join(LEVELS)}, not {unknown[0] if unknown else 'none'}")
+        raise UsageError(
+            f"the level of a scene is {', '.join(LEVELS)}, not {unknown[0] if unknown else 'none'}"
+        )
     if scenes is not None:
         whole(scenes, "the number of scenes at each level", 1, MOST_SCENES)
     whole(seed, "a seed", 0, 2**31 - 1)
@@ -139,7 +167,9 @@ def tasks(
             for level in levels:
                 name = f"{entry.name}@{level}-{number // len(mine)}"
                 path = out.absolute() / entry.label / one / f"{name}{SUFFIX}"
-                found.append(Task(entry.path.relative_to(dataset).as_posix(), one, level, name, path))
+                found.append(
+                    Task(entry.path.relative_to(dataset).as_posix(), one, level, name, path)
+                )
     return found
 
 
@@ -153,9 +183,11 @@ def _draw(meshes: dict[str, Meshes], seed: int, task: Task) -> str | None:
 
 
 def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) -> SceneLayout:
-    """A scene of some level around a target, a mesh file of the folder; seed and name decide all that is random.
+    """A scene of some level around a target, a mesh file of the folder; seed and name decide all
+    that is random.
 
-    MeshError if the target cannot be used; DatasetError if no layout shows as much of it as the level wants.
+    MeshError if the target cannot be used; DatasetError if no layout shows as much of it as the
+    level wants.
     """
     rng = np.random.default_rng([seed, *name.encode()])
     mesh = cached_mesh(meshes.folder / target)
@@ -163,7 +195,15 @@ def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) ->
     others = [others[i] for i in rng.permutation(len(others))[:POOL]]
     hiding = _Hiding(mesh)
     for _ in range(LAYOUTS_TRIED):
-        placed = _layout(mesh, others, meshes.folder, hiding, level, LEVELS[level] + rng.uniform(-SPREAD, SPREAD), rng)
+        placed = _layout(
+            mesh,
+            others,
+            meshes.folder,
+            hiding,
+            level,
+            LEVELS[level] + rng.uniform(-SPREAD, SPREAD),
+            rng,
+        )
         if placed is not None:
             scene = Scene(mesh, tuple(item for _, item in placed))
             objects = tuple(thing for thing, _ in placed if isinstance(thing, Placement))
@@ -172,20 +212,29 @@ def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) ->
             unreachable = tuple(np.flatnonzero(~scene.reachable(GRID.poses[:, :3, 3])).tolist())
             middle = Placement(target, mesh_hash(meshes.folder / target))
             return SceneLayout(name, level, seed, middle, objects, blocks, shares, unreachable)
-    raise DatasetError(f"{meshes.folder / target}: no layout of {LAYOUTS_TRIED} lets {LEVELS[level]:.0%} of it show")
+    raise DatasetError(
+        f"{meshes.folder / target}: no layout of {LAYOUTS_TRIED} lets {LEVELS[level]:.0%} of it"
+        " show"
+    )
 
 
 class _Hiding:
-    """What of a target shows from the 40 views, as rays from the cameras to the points of its surface that they see."""
+    """What of a target shows from the 40 views, as rays from the cameras to the points of its
+    surface that they see.
+    """
 
     def __init__(self, mesh: Mesh) -> None:
         camera = SimulatedCamera(mesh, COARSE, GRID.distance)
-        eyes, rays, views = [], [], []
+        eyes = []
+        rays = []
+        views = []
         for view, pose in enumerate(GRID.poses):
             seen = camera.observe(pose)
             rows, columns = np.nonzero(seen.depth)
             (fx, _, cx), (_, fy, cy) = seen.intrinsics[:2]
-            ahead = np.stack([(columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy, np.ones(len(rows))], 1)
+            ahead = np.stack(
+                [(columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy, np.ones(len(rows))], 1
+            )
             rays.append(seen.depth[rows, columns, None] * ahead @ pose[:3, :3].T)
             eyes.append(np.broadcast_to(pose[:3, 3], rays[-1].shape))
             views.append(np.full(len(rows), view))
@@ -195,7 +244,9 @@ class _Hiding:
 
     def by(self, item: Item, still: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Which of the rays that are still free end on something first, (R,)."""
-        length, _ = RayCaster([(item.vertices, item.faces)]).cast(self.eyes[still], self.rays[still])
+        length, _ = RayCaster([(item.vertices, item.faces)]).cast(
+            self.eyes[still], self.rays[still]
+        )
         hidden = np.zeros(len(still), bool)
         hidden[still] = length < 1
         return hidden
@@ -209,11 +260,20 @@ Thing = tuple[Placement | Block, Item]
 
 
 def _layout(
-    mesh: Mesh, others: Sequence[str], folder: Path, hiding: _Hiding, level: str, goal: float, rng: np.random.Generator
+    mesh: Mesh,
+    others: Sequence[str],
+    folder: Path,
+    hiding: _Hiding,
+    level: str,
+    goal: float,
+    rng: np.random.Generator,
 ) -> list[Thing] | None:
-    """Things around a target, of which they leave about so much to see; None if that does not come about."""
+    """Things around a target, of which they leave about so much to see; None if that does not
+    come about.
+    """
     walls = int(rng.choice(3, p=WALLS[level]))
-    middle, floor = footprint(mesh.vertices), float(mesh.vertices[:, 2].min())
+    middle = footprint(mesh.vertices)
+    floor = float(mesh.vertices[:, 2].min())
     placed: list[Thing] = []
     free = np.ones(len(hiding.views), bool)
     for _ in range(TRIES):
@@ -222,12 +282,21 @@ def _layout(
             return placed
         if len(placed) == MOST:
             return None
-        short = bool(others) and sum(isinstance(thing, Placement) for thing, _ in placed) < FEWEST_OBJECTS
+        short = (
+            bool(others)
+            and sum(isinstance(thing, Placement) for thing, _ in placed) < FEWEST_OBJECTS
+        )
         thing = _wall(rng) if len(placed) < walls else _thing(others, folder, level, short, rng)
         item = _stood(thing, folder, floor)
         if item is None or np.abs(item.footprint).max() > TABLE:
             continue
-        if min(separation(item.footprint, other) for other in [middle, *(i.footprint for _, i in placed)]) < GAP:
+        if (
+            min(
+                separation(item.footprint, other)
+                for other in [middle, *(i.footprint for _, i in placed)]
+            )
+            < GAP
+        ):
             continue
         left = free & ~hiding.by(item, free)
         if goal - TOLERANCE <= hiding.share(left) <= share - LEAST[level] * (not short):
@@ -236,22 +305,36 @@ def _layout(
     return None
 
 
-def _thing(others: Sequence[str], folder: Path, level: str, short: bool, rng: np.random.Generator) -> Placement | Block:
+def _thing(
+    others: Sequence[str], folder: Path, level: str, short: bool, rng: np.random.Generator
+) -> Placement | Block:
     """An object or a box, anywhere around; an object where there are too few."""
-    away, towards, azimuth = rng.uniform(*AWAY[level]), rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi)
+    away = rng.uniform(*AWAY[level])
+    towards = rng.uniform(0, 2 * np.pi)
+    azimuth = rng.uniform(0, 2 * np.pi)
     there = away * np.cos(towards), away * np.sin(towards), azimuth
     if short or (others and rng.random() < OBJECTS[level]):
         file = others[int(rng.integers(len(others)))]
-        return Placement(file, mesh_hash(folder / file), *_rounded(*there, rng.uniform(*OBJECT_RADIUS)))
-    x, y, azimuth, *size = _rounded(*there, *rng.uniform(*FOOTPRINT, 2), rng.uniform(*BOX_HEIGHT[level]))
+        return Placement(
+            file, mesh_hash(folder / file), *_rounded(*there, rng.uniform(*OBJECT_RADIUS))
+        )
+    x, y, azimuth, *size = _rounded(
+        *there, *rng.uniform(*FOOTPRINT, 2), rng.uniform(*BOX_HEIGHT[level])
+    )
     return Block(x, y, azimuth, size[0], size[1], size[2])
 
 
 def _wall(rng: np.random.Generator) -> Block:
     """A wall, across the way from the target."""
-    away, towards, lean = rng.uniform(*WALL_AWAY), rng.uniform(0, 2 * np.pi), rng.uniform(-0.3, 0.3)
-    x, y, azimuth = away * np.cos(towards), away * np.sin(towards), towards + np.pi / 2 + lean
-    x, y, azimuth, width, height = _rounded(x, y, azimuth, rng.uniform(*WALL_WIDTH), rng.uniform(*WALL_HEIGHT))
+    away = rng.uniform(*WALL_AWAY)
+    towards = rng.uniform(0, 2 * np.pi)
+    lean = rng.uniform(-0.3, 0.3)
+    x = away * np.cos(towards)
+    y = away * np.sin(towards)
+    azimuth = towards + np.pi / 2 + lean
+    x, y, azimuth, width, height = _rounded(
+        x, y, azimuth, rng.uniform(*WALL_WIDTH), rng.uniform(*WALL_HEIGHT)
+    )
     return Block(x, y, azimuth, width, WALL_DEPTH, height, wall=True)
 
 

@@ -14,7 +14,13 @@ from nextview.errors import DatasetError
 from nextview.geometry.observation import SceneView
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState
-from nextview.sensing.expected_visibility import GRID, Occupancy, SeenScene, expected_visibility, sight_lines
+from nextview.sensing.expected_visibility import (
+    GRID,
+    Occupancy,
+    SeenScene,
+    expected_visibility,
+    sight_lines,
+)
 from nextview.session.episode import Visible, unconstrained
 from nextview.simulation.scene import Scene
 from nextview.simulation.scene_layout import clutter_level
@@ -23,17 +29,22 @@ from nextview.simulation.simulated import TARGET, SceneCamera, visible_shares
 SIDE = 80  # of the pictures of the whole scene, pixels
 HALF = 2.0  # they show so many object radii to each side of the target's centre
 SCENE_UNIT = 2e-4  # their depth is stored as uint16 in steps of this many object radii: up to 13.1
-SHARE_SIZE = 112  # side of the picture in which the share that shows is measured, pixels; as when the scene was drawn
+# side of the picture in which the share that shows is measured, pixels; as when the scene was drawn
+SHARE_SIZE = 112
 
 
 def scene_intrinsics(distance: float, side: int = SIDE) -> NDArray[np.float64]:
-    """Pinhole matrix of the pictures of a scene, (3, 3), pixels; the first pixel's centre is at 0.5."""
+    """Pinhole matrix of the pictures of a scene, (3, 3), pixels; the first pixel's centre is at
+    0.5.
+    """
     focal = side / 2 * distance / HALF
     return np.array([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1.0]])
 
 
 def render_scene(scene: Scene, sphere: ViewSphere) -> dict[str, NDArray]:
-    """All that is kept of a scene beside its target's views, without errors of a sensor, by the names of the arrays."""
+    """All that is kept of a scene beside its target's views, without errors of a sensor, by the
+    names of the arrays.
+    """
     camera = SceneCamera(scene, scene_intrinsics(sphere.distance), (SIDE, SIDE))
     looks = [camera.look(pose) for pose in sphere.poses]
     positions = sphere.poses[:, :3, 3]
@@ -42,32 +53,45 @@ def render_scene(scene: Scene, sphere: ViewSphere) -> dict[str, NDArray]:
         "scene/depth": depth.clip(max=np.iinfo(np.uint16).max).astype(np.uint16),
         "scene/owner": np.stack([owner for _, owner in looks]),
         "scene/reachable": scene.reachable(positions),
-        "measures/visible_share": visible_shares(scene, sphere.poses, SHARE_SIZE, sphere.distance).astype(np.float32),
+        "measures/visible_share": visible_shares(
+            scene, sphere.poses, SHARE_SIZE, sphere.distance
+        ).astype(np.float32),
         "measures/clearance": scene.clearance(positions).astype(np.float32),
     }
 
 
 @dataclass(frozen=True)
 class SceneViews:
-    """One scene of a store, as it is from all V views."""
+    """One scene of a store, as it is from all V views.
 
-    depth: NDArray[np.float32]  # (V, S, S), object radii, 0 = nothing
-    owner: NDArray[np.uint8]  # of each pixel: NOTHING, TARGET, OTHER or TABLE_TOP, (V, S, S)
+    Attributes:
+        depth: (V, S, S), object radii, 0 = nothing.
+        owner: of each pixel: NOTHING, TARGET, OTHER or TABLE_TOP, (V, S, S).
+        visible_share: of the target, the truth, (V,).
+        clearance: (V,), object radii.
+    """
+
+    depth: NDArray[np.float32]
+    owner: NDArray[np.uint8]
     intrinsics: NDArray[np.float64]
     poses: NDArray[np.float64]
     reachable: NDArray[np.bool_]
-    visible_share: NDArray[np.float32]  # of the target, the truth, (V,)
-    clearance: NDArray[np.float32]  # (V,), object radii
+    visible_share: NDArray[np.float32]
+    clearance: NDArray[np.float32]
 
     def scene_view(self, view: int) -> SceneView:
         """What a camera sees from there: things and table alike are no target."""
-        return SceneView(self.depth[view], self.owner[view] == TARGET, self.poses[view], self.intrinsics, True)
+        return SceneView(
+            self.depth[view], self.owner[view] == TARGET, self.poses[view], self.intrinsics, True
+        )
 
 
 def scene_views(store: ViewStore, i: int) -> SceneViews:
     """Scene i of a store that was rendered of scenes."""
     if store.attributes.scene is None:
-        raise DatasetError(f"{store.path}: holds single objects, no scenes; nextview scenes draws some")
+        raise DatasetError(
+            f"{store.path}: holds single objects, no scenes; nextview scenes draws some"
+        )
     return SceneViews(
         store.read("scene/depth", i) * np.float32(SCENE_UNIT),
         store.read("scene/owner", i),
@@ -93,7 +117,9 @@ def sight_of(scenes: "SceneSight | None", objects: NDArray[np.int64]) -> tuple[C
 
 
 def scenes_of(p: Predictions) -> "SceneSight | None":
-    """The scenes that predictions are of; None if they are of single objects, whose store need not be there."""
+    """The scenes that predictions are of; None if they are of single objects, whose store need
+    not be there.
+    """
     try:
         store = ViewStore.open(p.store) if p.store else None
     except DatasetError:
@@ -101,14 +127,20 @@ def scenes_of(p: Predictions) -> "SceneSight | None":
     if store is not None:
         return SceneSight.of(store, p.names)
     if any(map(clutter_level, p.names)):
-        lost = f"there is no view store at {p.store} any more; put it back, or" if p.store else "name no view store;"
+        lost = (
+            f"there is no view store at {p.store} any more; put it back, or"
+            if p.store
+            else "name no view store;"
+        )
         raise DatasetError(f"these predictions are of scenes, and {lost} predict again")
     return None
 
 
 @dataclass(frozen=True)
 class SceneSight:
-    """Of N scenes, ``rows`` of a store: where cameras can be, and what is expected to show after some views."""
+    """Of N scenes, ``rows`` of a store: where cameras can be, and what is expected to show after
+    some views.
+    """
 
     store: ViewStore
     rows: NDArray[np.int64]
@@ -130,19 +162,28 @@ class SceneSight:
         """Some of the scenes, by their index; also the same one several times."""
         return replace(self, rows=self.rows[kept], reachable=self.reachable[kept])
 
-    def visibility(self, scenes: NDArray[np.int64], visited: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def visibility(
+        self, scenes: NDArray[np.int64], visited: NDArray[np.bool_]
+    ) -> NDArray[np.float64]:
         """Share of the target that is expected to show from each view."""
-        keys = [(int(self.rows[scene]), np.packbits(row).tobytes()) for scene, row in zip(scenes, visited, strict=True)]
+        keys = [
+            (int(self.rows[scene]), np.packbits(row).tobytes())
+            for scene, row in zip(scenes, visited, strict=True)
+        ]
         new = {key: row for key, row in zip(keys, visited, strict=True) if key not in self._found}
         read = lru_cache(maxsize=1)(partial(scene_views, self.store))
         for key in sorted(new):  # scene by scene, each read once
             frames = (self._frame(key[0], int(view), read) for view in np.flatnonzero(new[key]))
             scene = reduce(SeenScene.and_also, frames, SeenScene.unseen())
-            self._found[key] = expected_visibility(scene, self.store.sphere.poses[:, :3, 3]).expected.astype(np.float32)
+            self._found[key] = expected_visibility(
+                scene, self.store.sphere.poses[:, :3, 3]
+            ).expected.astype(np.float32)
         return np.stack([self._found[key] for key in keys]).astype(np.float64)
 
     def _frame(self, row: int, view: int, read: Callable[[int], SceneViews]) -> SeenScene:
-        """What the frame from one view says alone of what lies on a line of sight; kept packed, a hundredth or so."""
+        """What the frame from one view says alone of what lies on a line of sight; kept packed,
+        a hundredth or so.
+        """
         if (row, view) not in self._frames:
             asked = sight_lines(GRID, self.store.sphere.poses[:, :3, 3].tobytes()).asked
             seen = SeenScene(Occupancy.unseen(GRID, asked)).seen(read(row).scene_view(view))

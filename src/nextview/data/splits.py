@@ -1,4 +1,6 @@
-"""Which objects train and which validate: by object, stratified by class, identical meshes together. And samples."""
+"""Which objects train and which validate: by object, stratified by class, identical meshes
+together. And samples.
+"""
 
 from pathlib import Path
 
@@ -15,18 +17,24 @@ Floats = NDArray[np.floating]
 
 
 def duplicate_groups(measured: Floats) -> Indices:
-    """A number for each object, (N,), the same for those whose depth-entropies, (N, V), are: copies of one mesh."""
+    """A number for each object, (N,), the same for those whose depth-entropies, (N, V), are:
+    copies of one mesh.
+    """
     return np.unique(measured, axis=0, return_inverse=True)[1].ravel()
 
 
 def deduplicated(labels: Indices, measured: Floats) -> Indices:
     """One object of each shape and label, the first: indices, sorted."""
-    _, first = np.unique(np.stack([duplicate_groups(measured), labels], 1), axis=0, return_index=True)
+    _, first = np.unique(
+        np.stack([duplicate_groups(measured), labels], 1), axis=0, return_index=True
+    )
     return np.sort(first)
 
 
 def divide(labels: Indices, measured: Floats, share: float, seed: int) -> tuple[Indices, Indices]:
-    """Indices of objects that train, and of the share of every class that validates; their copies follow them."""
+    """Indices of objects that train, and of the share of every class that validates; their
+    copies follow them.
+    """
     group = duplicate_groups(measured)
     rng = np.random.default_rng(seed)
     validates = np.zeros(len(labels), bool)
@@ -38,7 +46,9 @@ def divide(labels: Indices, measured: Floats, share: float, seed: int) -> tuple[
 
 
 def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple[Indices, Indices]:
-    """Divide the rendered objects of the training split (all objects of a store without splits), see ``divide``."""
+    """Divide the rendered objects of the training split (all objects of a store without splits),
+    see ``divide``.
+    """
     usable = np.flatnonzero(store.done & np.isin(store.splits, ("train", "")))
     if len(usable) == 0:
         raise DatasetError(f"{store.path}: holds no rendered object of the training split")
@@ -47,8 +57,13 @@ def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple
 
 
 def check_any(store: ViewStore, training: Indices, validation: Indices, lacking: str = "") -> None:
-    """Refuse to train on no object, or to validate with none; ``lacking`` says why some may be missing."""
-    for objects, what in ((training, "to train on"), (validation, "to validate with (see --validation-share)")):
+    """Refuse to train on no object, or to validate with none; ``lacking`` says why some may be
+    missing.
+    """
+    for objects, what in (
+        (training, "to train on"),
+        (validation, "to validate with (see --validation-share)"),
+    ):
         if len(objects) == 0:
             raise DatasetError(f"{store.path}: no object is left {what}{lacking}")
 
@@ -67,14 +82,18 @@ def sample(objects: Indices, count: int | None = None) -> Indices:
 
 
 def some_objects(
-    store: ViewStore, split: str | None = None, held_out: ModelCard | str | Path | None = None, count: int | None = None
+    store: ViewStore,
+    split: str | None = None,
+    held_out: ModelCard | str | Path | None = None,
+    count: int | None = None,
 ) -> Indices:
     """Indices of the rendered objects of a store that are asked for, sorted."""
     chosen = store.done & (True if split is None else store.splits == split)
     of = "" if split is None else f" of the split {split!r}"
     if held_out is not None:
         card = held_out if isinstance(held_out, ModelCard) else find_card(held_out)
-        targets = [name.partition("@")[0] for name in store.names]  # in scenes; all of the name for others
+        # in scenes; all of the name for others
+        targets = [name.partition("@")[0] for name in store.names]
         chosen &= np.isin(targets, card.held_out) | np.isin(store.names, card.held_out)
         of += f" that {card.name} calls held out"
     if not chosen.any():

@@ -1,4 +1,6 @@
-"""The view store: every view of every object of a dataset, in one Zarr group, one chunk an object."""
+"""The view store: every view of every object of a dataset, in one Zarr group, one chunk an
+object.
+"""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,17 +29,28 @@ from nextview.geometry.viewsphere import ViewSphere
 FORMAT = 2
 DEPTH_UNIT = 1e-4  # depth is stored as uint16 in steps of this many object radii
 POINT_UNIT = 1 / 32767  # points are stored as int16 in steps of this many object radii
-PENDING, DONE, FAILED = 0, 1, 2
+PENDING = 0
+DONE = 1
+FAILED = 2
 PLANNED = 5  # views of a plan: the thesis's longest episode
-RENDERED = ("image", "depth", "points", "measures/depth_entropy", "radius", "status")  # by rendering; more in scenes:
-SCENE = ("scene/depth", "scene/owner", "scene/reachable", "measures/visible_share", "measures/clearance")
+# by rendering; more in scenes:
+RENDERED = ("image", "depth", "points", "measures/depth_entropy", "radius", "status")
+SCENE = (
+    "scene/depth",
+    "scene/owner",
+    "scene/reachable",
+    "measures/visible_share",
+    "measures/clearance",
+)
 Name = Annotated[str, Meta(min_length=1)]
 Split = Literal["train", "test", "val", ""]
 Pixels = Annotated[int, Meta(ge=1, le=100_000)]
 
 
 class Attributes(msgspec.Struct, omit_defaults=True):
-    """The objects of a store, its views, and how it was rendered: through a ``sensor``, of a ``scene`` (pixels)."""
+    """The objects of a store, its views, and how it was rendered: through a ``sensor``, of a
+    ``scene`` (pixels).
+    """
 
     format: Literal[2]
     names: Annotated[list[Name], Meta(min_length=1)]
@@ -61,7 +74,9 @@ class Attributes(msgspec.Struct, omit_defaults=True):
     commands: list[str] = []
 
 
-def describe(entries: Sequence[Entry], sphere: ViewSphere, size: int, recipe: Mapping[str, Any]) -> Attributes:
+def describe(
+    entries: Sequence[Entry], sphere: ViewSphere, size: int, recipe: Mapping[str, Any]
+) -> Attributes:
     """The attributes of a store of these objects and views."""
     return Attributes(
         format=2,
@@ -80,11 +95,12 @@ def describe(entries: Sequence[Entry], sphere: ViewSphere, size: int, recipe: Ma
 class ViewStore:
     """Views of N objects from the V views of a sphere.
 
-    Arrays of the group, one chunk an object: ``image`` (N, V, S, S) uint8; ``depth`` (N, V, S, S) uint16 in DEPTH_UNIT,
-    0 = no object; ``points`` (N, V, 1024, 3) int16 in POINT_UNIT, object frame; ``measures/NAME`` (N, V) float32;
-    ``plans/NAME`` (N, V, PLANNED) float32, the views that a policy takes from each first view; ``radius`` (N,) float64,
-    in the unit of its mesh file; ``status`` (N,) uint8. Every chunk has a checksum. Of a chunk that is gone zarr would
-    read the fill value, so every read looks for its file.
+    Arrays of the group, one chunk an object: ``image`` (N, V, S, S) uint8; ``depth`` (N, V, S, S)
+    uint16 in DEPTH_UNIT, 0 = no object; ``points`` (N, V, 1024, 3) int16 in POINT_UNIT, object
+    frame; ``measures/NAME`` (N, V) float32; ``plans/NAME`` (N, V, PLANNED) float32, the views that
+    a policy takes from each first view; ``radius`` (N,) float64, in the unit of its mesh file;
+    ``status`` (N,) uint8. Every chunk has a checksum. Of a chunk that is gone zarr would read the
+    fill value, so every read looks for its file.
     """
 
     path: Path
@@ -93,7 +109,9 @@ class ViewStore:
 
     @classmethod
     def create(cls, path: Path, attributes: Attributes, overwrite: bool = False) -> "ViewStore":
-        """Make an empty store, whole or not at all; with ``overwrite`` it replaces the store at ``path``."""
+        """Make an empty store, whole or not at all; with ``overwrite`` it replaces the store at
+        ``path``.
+        """
         with new_folder(path, overwrite, last="zarr.json") as part:
             store = cls(part, zarr.open_group(part, mode="w"), attributes)
             store.note()
@@ -114,12 +132,18 @@ class ViewStore:
         try:
             group = zarr.open_group(path, mode="r+")
         except DAMAGED as error:
-            raise DatasetError(f"{path}: zarr.json is damaged ({error}); copy it back or render again") from None
+            raise DatasetError(
+                f"{path}: zarr.json is damaged ({error}); copy it back or render again"
+            ) from None
         content = group.attrs.asdict()
         if content.get("format") != FORMAT:
             raise DatasetError(f"{path}: not a view store of format {FORMAT}; render it again")
         content.setdefault("rotated", content.get("turn", False))  # its name before
-        return cls(path, group, decode_record(content, Attributes, f"{path}: zarr.json is damaged", DatasetError))
+        return cls(
+            path,
+            group,
+            decode_record(content, Attributes, f"{path}: zarr.json is damaged", DatasetError),
+        )
 
     @property
     def rendered(self) -> tuple[str, ...]:
@@ -130,7 +154,9 @@ class ViewStore:
     def added(self) -> list[str]:
         """Names of the arrays that were added later."""
         files = self.path.glob("[!.]*/*/zarr.json")
-        return sorted({file.parent.relative_to(self.path).as_posix() for file in files} - {*self.rendered})
+        return sorted(
+            {file.parent.relative_to(self.path).as_posix() for file in files} - {*self.rendered}
+        )
 
     def note(self, **changes: Any) -> None:
         """Change attributes, and write them."""
@@ -144,7 +170,12 @@ class ViewStore:
             return
         shape, dtype, fill = self._layout(name)
         packed = BloscCodec(cname="zstd", clevel=2, shuffle="shuffle"), Crc32cCodec()
-        layout = {"shape": (len(self), *shape), "chunks": (1, *shape), "dtype": dtype, "fill_value": fill}
+        layout = {
+            "shape": (len(self), *shape),
+            "chunks": (1, *shape),
+            "dtype": dtype,
+            "fill_value": fill,
+        }
         self.group.create_array(name, **layout, compressors=packed)
 
     def remove(self, name: str) -> None:
@@ -154,7 +185,9 @@ class ViewStore:
 
     def _layout(self, name: str) -> tuple[tuple[int, ...], str, float]:
         """Shape for one object, type and fill value of an array."""
-        v, size, scene = len(self.sphere), self.attributes.size, self.attributes.scene or 0
+        v = len(self.sphere)
+        size = self.attributes.size
+        scene = self.attributes.scene or 0
         layouts = {
             "image": ((v, size, size), "uint8", 0),
             "depth": ((v, size, size), "uint16", 0),
@@ -166,7 +199,8 @@ class ViewStore:
             "scene/owner": ((v, scene, scene), "uint8", 0),
             "scene/reachable": ((v,), "bool", False),
         }
-        added = ((v, min(PLANNED, v)) if name.startswith("plans/") else (v,), "float32", np.nan)  # a plan or measure
+        # a plan or measure
+        added = ((v, min(PLANNED, v)) if name.startswith("plans/") else (v,), "float32", np.nan)
         return layouts.get(name, added)
 
     def array(self, name: str) -> zarr.Array:
@@ -174,12 +208,19 @@ class ViewStore:
         try:
             array = self.group[name]
         except KeyError:
-            raise DatasetError(f"{self.path}: the array {name} is missing; {self._remedy(name)}") from None
+            raise DatasetError(
+                f"{self.path}: the array {name} is missing; {self._remedy(name)}"
+            ) from None
         except DAMAGED as error:
-            raise DatasetError(f"{self.path}: the array {name} cannot be opened ({error})") from None
+            raise DatasetError(
+                f"{self.path}: the array {name} cannot be opened ({error})"
+            ) from None
         shape, dtype, _ = self._layout(name)
         wanted = ((len(self), *shape), (1, *shape), dtype)
-        if not isinstance(array, zarr.Array) or (array.shape, array.chunks, str(array.dtype)) != wanted:
+        if (
+            not isinstance(array, zarr.Array)
+            or (array.shape, array.chunks, str(array.dtype)) != wanted
+        ):
             raise DatasetError(f"{self.path}: the array {name} is not one of {wanted[0]} {dtype}")
         return array
 
@@ -187,7 +228,11 @@ class ViewStore:
         if name in self.rendered:
             return "remove the store and render again"
         kind, _, rest = name.partition("/")
-        maker = f"nextview measure {self.path} --measures {rest}" if kind == "measures" else "the command that made it"
+        maker = (
+            f"nextview measure {self.path} --measures {rest}"
+            if kind == "measures"
+            else "the command that made it"
+        )
         return f"{maker} makes it"
 
     def holds(self, name: str) -> bool:
@@ -196,7 +241,9 @@ class ViewStore:
 
     def _chunk(self, array: zarr.Array, i: int) -> Path:
         """The file with the values of object i in an array: its only chunk there."""
-        return self.path / array.path / array.metadata.encode_chunk_key((i,) + (0,) * (array.ndim - 1))
+        return (
+            self.path / array.path / array.metadata.encode_chunk_key((i,) + (0,) * (array.ndim - 1))
+        )
 
     def has(self, name: str, i: int) -> bool:
         """Whether an array holds values of object i."""
@@ -209,7 +256,8 @@ class ViewStore:
 
     def read(self, name: str, i: int) -> NDArray:
         """The values of object i in an array, as they are stored."""
-        array, what = self.array(name), f"{name} of {self.names[i]}"
+        array = self.array(name)
+        what = f"{name} of {self.names[i]}"
         if not self._chunk(array, i).exists():
             raise DatasetError(f"{self.path}: {what} is missing; {self._remedy(name)}")
         return self._values(array, i, what)
@@ -218,11 +266,17 @@ class ViewStore:
         try:
             return array[at]
         except DAMAGED as error:
-            raise DatasetError(f"{self.path}: {what} cannot be read ({error}); {self._remedy(array.path)}") from None
+            raise DatasetError(
+                f"{self.path}: {what} cannot be read ({error}); {self._remedy(array.path)}"
+            ) from None
 
     def rows(self, name: str) -> NDArray:
-        """One of the arrays, as it is stored, (N, ...). Rows of objects that are not rendered may hold anything."""
-        done, array = self.done, self.array(name)
+        """One of the arrays, as it is stored, (N, ...).
+
+        Rows of objects that are not rendered may hold anything.
+        """
+        done = self.done
+        array = self.array(name)
         with suppress(*DAMAGED):  # a damaged chunk, of which it matters whose it is
             values = array[:]
             if self.held(name)[done].all():
@@ -233,8 +287,12 @@ class ViewStore:
         return values
 
     def write(self, i: int, arrays: Mapping[str, NDArray]) -> None:
-        """Set the values of object i in some arrays, in this order. Each is written whole or not at all."""
-        with zarr.config.set({"array.write_empty_chunks": True}):  # zeros too: what has no chunk is missing
+        """Set the values of object i in some arrays, in this order.
+
+        Each is written whole or not at all.
+        """
+        # zeros too: what has no chunk is missing
+        with zarr.config.set({"array.write_empty_chunks": True}):
             for name, values in arrays.items():
                 self.group[name][i] = values
 
@@ -325,12 +383,16 @@ class ViewStore:
         return sorted(file.parent.name for file in self.path.glob("measures/*/zarr.json"))
 
     def measure(self, name: str = "depth_entropy") -> NDArray[np.float32]:
-        """A view measure of all objects, (N, V) float32; anything where an object is not rendered."""
+        """A view measure of all objects, (N, V) float32; anything where an object is not
+        rendered.
+        """
         return self.rows(f"measures/{name}")
 
 
 def opened(path: Path) -> ViewStore:
-    """A store to work on object by object: opened once for each process, and anew when its attributes change."""
+    """A store to work on object by object: opened once for each process, and anew when its
+    attributes change.
+    """
     about = (path / "zarr.json").stat()
     return _opened(path, about.st_ino, about.st_mtime_ns)
 
@@ -347,18 +409,27 @@ def writing(path: Path) -> Iterator[None]:
         try:
             yield
         except OSError as error:
-            reason = f"cannot be written ({error.strerror or error}); what is done is kept, run again to go on"
+            reason = (
+                f"cannot be written ({error.strerror or error}); what is done is kept, run again to"
+                " go on"
+            )
             raise DatasetError(f"{path}: {reason}") from None
 
 
-def check(path: Path, workers: int | None = None, scheduler: str | None = None) -> Iterator[tuple[str, str | None]]:
-    """Read all arrays of all rendered objects, by their checksums; yields (name, None) or (name, what is wrong)."""
+def check(
+    path: Path, workers: int | None = None, scheduler: str | None = None
+) -> Iterator[tuple[str, str | None]]:
+    """Read all arrays of all rendered objects, by their checksums; yields (name, None) or (name,
+    what is wrong).
+    """
     store = ViewStore.open(path)
     for name in store.rendered:
         store.array(name)  # says what is wrong
     objects = np.flatnonzero(store.done).tolist()
     for i, result in each(partial(_check_object, path.absolute()), objects, workers, scheduler):
-        problem = f"{path}: {store.names[i]}: {result}" if isinstance(result, WorkerDied) else result
+        problem = (
+            f"{path}: {store.names[i]}: {result}" if isinstance(result, WorkerDied) else result
+        )
         yield store.names[i], problem
 
 

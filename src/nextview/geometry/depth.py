@@ -1,24 +1,32 @@
-"""Depth images in object radii, 0 where there is no object: their points, and how they look under a headlight."""
+"""Depth images in object radii, 0 where there is no object: their points, and how they look
+under a headlight.
+"""
 
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-FARTHEST = 50.0  # object radii; what is farther is no object: depth cameras have large numbers for "nothing"
-AMBIENT = 0.15  # brightness of a surface seen edge-on, so that it stays apart from the black background
+# object radii; what is farther is no object: depth cameras have large numbers for "nothing"
+FARTHEST = 50.0
+# brightness of a surface seen edge-on, so that it stays apart from the black background
+AMBIENT = 0.15
 POINTS = 1024  # points in the partial cloud of one view (thesis, section 4.1.2)
 
 
 def object_depth(depth: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Depth with 0 where a sensor gives NaN, infinity, a negative or a huge number; itself if there is none."""
+    """Depth with 0 where a sensor gives NaN, infinity, a negative or a huge number; itself if
+    there is none.
+    """
     if depth.min() >= 0 and depth.max() < FARTHEST:  # not so if there is a NaN
         return depth
     return np.where((depth > 0) & (depth < FARTHEST), depth, 0)
 
 
 def slope(before: NDArray, here: NDArray, after: NDArray) -> NDArray[np.float32]:
-    """Change of depth per pixel, from the side where it is smaller: the one on the same surface. 0 if alone."""
+    """Change of depth per pixel, from the side where it is smaller: the one on the same surface.
+    0 if alone.
+    """
     back = np.where(before > 0, here - before, np.inf)
     forth = np.where(after > 0, after - here, np.inf)
     slope = np.where(np.abs(back) < np.abs(forth), back, forth)
@@ -26,7 +34,9 @@ def slope(before: NDArray, here: NDArray, after: NDArray) -> NDArray[np.float32]
 
 
 def headlight(depth: NDArray[np.float32], intrinsics: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """The surface as lit by a lamp at the camera, (H, W) uint8: as bright as the cosine of ray and surface normal."""
+    """The surface as lit by a lamp at the camera, (H, W) uint8: as bright as the cosine of ray
+    and surface normal.
+    """
     height, width = depth.shape
     padded = np.pad(depth, 1)
     (fx, _, cx), (_, fy, cy) = intrinsics[:2]
@@ -42,20 +52,28 @@ def headlight(depth: NDArray[np.float32], intrinsics: NDArray[np.float64]) -> ND
 
 @lru_cache(maxsize=8)
 def pixel_order(pixels: int, seed: int) -> NDArray[np.int32]:
-    """A fixed shuffle of an image's pixels, (pixels,) int32; earlier ones are preferred when points are drawn."""
+    """A fixed shuffle of an image's pixels, (pixels,) int32; earlier ones are preferred when
+    points are drawn.
+    """
     return np.random.default_rng(seed).permutation(pixels).astype(np.int32)
 
 
 def visible_points(
-    depth: NDArray[np.float32], pose: NDArray[np.float64], intrinsics: NDArray[np.float64], seed: int = 0
+    depth: NDArray[np.float32],
+    pose: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    seed: int = 0,
 ) -> NDArray[np.float32]:
-    """Points on the visible surface, (1024, 3) float32, object frame; all zero if nothing is visible.
+    """Points on the visible surface, (1024, 3) float32, object frame; all zero if nothing is
+    visible.
 
-    A uniform draw from the pixels that show the object, by the seed and these pixels alone; few pixels repeat.
+    A uniform draw from the pixels that show the object, by the seed and these pixels alone; few
+    pixels repeat.
     """
     flat = object_depth(depth).ravel()
     order = pixel_order(flat.size, seed)
-    for first in (4 * POINTS, 8 * POINTS, 16 * POINTS, flat.size):  # most often the beginning of the order holds enough
+    # most often the beginning of the order holds enough
+    for first in (4 * POINTS, 8 * POINTS, 16 * POINTS, flat.size):
         visible = np.flatnonzero(flat[order[:first]])
         if len(visible) >= POINTS:
             break

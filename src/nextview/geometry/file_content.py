@@ -1,4 +1,6 @@
-"""What a file holds that is not the mesh its name promises: a packed file, a web page, another format."""
+"""What a file holds that is not the mesh its name promises: a packed file, a web page, another
+format.
+"""
 
 import re
 
@@ -26,11 +28,20 @@ TEXT_BEGINNINGS = (  # patterns in lower case, likewise
         rb"<!doctype html|(<\?xml[^>]*>\s*)?<html",
         "it is a web page (HTML), not what was to be downloaded",
     ),
-    (rb"(<\?xml[^>]*>\s*)?(<!--.*?-->\s*)?<collada", "it is a COLLADA file; export it as OBJ, PLY or STL"),
+    (
+        rb"(<\?xml[^>]*>\s*)?(<!--.*?-->\s*)?<collada",
+        "it is a COLLADA file; export it as OBJ, PLY or STL",
+    ),
     (rb"<\?xml", "it is an XML file"),
-    (rb"version https://git-lfs", "it is a pointer of Git LFS; git lfs pull fetches the file itself"),
+    (
+        rb"version https://git-lfs",
+        "it is a pointer of Git LFS; git lfs pull fetches the file itself",
+    ),
     (rb"\S*/annex/objects/", "it is a pointer of git-annex; git annex get fetches the file itself"),
-    (rb"\{\s*\"", "it is a JSON file, as glTF is that keeps its numbers elsewhere; export it as GLB"),
+    (
+        rb"\{\s*\"",
+        "it is a JSON file, as glTF is that keeps its numbers elsewhere; export it as GLB",
+    ),
 )
 MESH_BEGINNINGS = (  # of the formats that are read
     (".ply", rb"ply[ \t]*\n(comment.*\n|obj_info.*\n)*format[ \t]"),
@@ -40,7 +51,9 @@ MESH_BEGINNINGS = (  # of the formats that are read
 )
 GLB_BEGINNING = b"glTF"
 # Two numbers after each other that each have a comma where a point is meant.
-DECIMAL_COMMAS = re.compile(rb"(?<![\d.,])[-+]?\d+,\d+([eE][-+]?\d+)?[ \t]+[-+]?\d+,\d+([eE][-+]?\d+)?(?![\d.,])")
+DECIMAL_COMMAS = re.compile(
+    rb"(?<![\d.,])[-+]?\d+,\d+([eE][-+]?\d+)?[ \t]+[-+]?\d+,\d+([eE][-+]?\d+)?(?![\d.,])"
+)
 
 
 def foreign_content(data: bytes, suffix: str) -> str | None:
@@ -51,7 +64,8 @@ def foreign_content(data: bytes, suffix: str) -> str | None:
         suffix: that of its name, in lower case.
 
     Returns:
-        A phrase that says what it is instead, or that its numbers have decimal commas; None if nothing of that is seen.
+        A phrase that says what it is instead, or that its numbers have decimal commas; None if
+        nothing of that is seen.
     """
     for beginning, said in BINARY_BEGINNINGS:
         if data.startswith(beginning):
@@ -74,7 +88,10 @@ def foreign_content(data: bytes, suffix: str) -> str | None:
 
 
 def _other_format(suffix: str) -> str:
-    return f"its content is that of {'an' if suffix[1] in 'os' else 'a'} {suffix[1:].upper()} file; name it so"
+    return (
+        f"its content is that of {'an' if suffix[1] in 'os' else 'a'} {suffix[1:].upper()} file;"
+        " name it so"
+    )
 
 
 def _decimal_commas(text: bytes) -> str | None:

@@ -19,22 +19,28 @@ BYTES_PER_FACE = 60  # how many bytes a mesh file may have for each triangle tha
 FORMATS = tuple(READERS)
 UNITS = {"mm": 0.001, "cm": 0.01, "inch": 0.0254, "foot": 0.3048, "m": 1.0}  # of length, metres
 ODD_RADII = (0.001, 20.0)  # metres: a radius outside is likelier one in another unit
-FLAT = 1e-12  # twice the area, square object radii, below which a face counts as a line: rounding makes up to 1e-15
+# twice the area, square object radii, below which a face counts as a line: rounding makes up to
+# 1e-15
+FLAT = 1e-12
 
 
 Y_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""Rotation from the axes of a file whose y axis points up to those of a ``Mesh``, whose z axis does."""
+"""Rotation from the axes of a file whose y axis points up to those of a ``Mesh``, whose z axis
+does.
+"""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh in the object frame: z up, bounding-box centre at the origin, farthest vertex at radius 1.
+    """A triangle mesh in the object frame: z up, bounding-box centre at the origin, farthest vertex
+    at radius 1.
 
     Attributes:
         vertices: (V, 3) float64, object radii.
         faces: (F, 3) int32, indices into the vertices.
         centre: bounding-box centre in the file's frame, (3,) float64, the file's units.
-        radius: object radius in the file's units; ``vertices * radius + centre`` are the file's positions.
+        radius: object radius in the file's units; ``vertices * radius + centre`` are the file's
+            positions.
         name: what to call it in messages.
         unit: the file's unit, one of UNITS; None if it is not known.
         notes: what was left out of the file's mesh, a sentence each; usually nothing.
@@ -55,15 +61,20 @@ class Mesh:
 
 
 def make_mesh(
-    vertices: NDArray[np.floating], faces: NDArray[np.integer], name: str = "mesh", unit: str | None = None
+    vertices: NDArray[np.floating],
+    faces: NDArray[np.integer],
+    name: str = "mesh",
+    unit: str | None = None,
 ) -> Mesh:
     """Check raw vertices, (V, 3), any unit, and faces, (F, 3), and normalise them.
 
-    Returns the mesh in the object frame, without the vertices that no face uses, and each triangle once: copies in the
-    same place show nothing new, and a great many of them take a minute a view. MeshError: no faces, not triangles, an
-    index out of range, a position that is not finite, no extent, or no area.
+    Returns the mesh in the object frame, without the vertices that no face uses, and each triangle
+    once: copies in the same place show nothing new, and a great many of them take a minute a view.
+    MeshError: no faces, not triangles, an index out of range, a position that is not finite, no
+    extent, or no area.
     """
-    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
+    vertices = np.asarray(vertices, np.float64)
+    faces = np.asarray(faces)
     for array, what in ((vertices, "vertices"), (faces, "faces")):
         if len(array) == 0:
             raise MeshError(f"{name}: the mesh has no {what}")
@@ -71,16 +82,22 @@ def make_mesh(
             raise MeshError(f"{name}: {what} have the shape {array.shape}, not (n, 3)")
     if faces.min() < 0 or faces.max() >= len(vertices):
         worst = int(faces.min() if faces.min() < 0 else faces.max())
-        raise MeshError(f"{name}: a face refers to vertex {worst}, but there are only {len(vertices)} vertices")
+        raise MeshError(
+            f"{name}: a face refers to vertex {worst}, but there are only {len(vertices)} vertices"
+        )
     places = np.sort(_first_of_equals(vertices)[faces], 1)
     faces = faces[_first_of_equals(places) == np.arange(len(faces))]
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     if not used.all():
-        faces, vertices = (np.cumsum(used) - 1)[faces], vertices[used]
+        faces = (np.cumsum(used) - 1)[faces]
+        vertices = vertices[used]
     if not np.isfinite(vertices).all():
-        raise MeshError(f"{name}: {int((~np.isfinite(vertices)).any(1).sum())} vertices are NaN or infinite")
-    low, high = vertices.min(0), vertices.max(0)
+        raise MeshError(
+            f"{name}: {int((~np.isfinite(vertices)).any(1).sum())} vertices are NaN or infinite"
+        )
+    low = vertices.min(0)
+    high = vertices.max(0)
     # Halves first: the sum or difference of two very large finite numbers may not be finite.
     centre = low / 2 + high / 2
     vertices = vertices - centre
@@ -92,8 +109,11 @@ def make_mesh(
     if reach > np.finfo(float).max / radius:
         raise MeshError(f"{name}: the mesh is too large, its radius is not a finite number")
     normalised: NDArray[np.float64] = vertices / radius
-    parts = (faces[first : first + 4096].T for first in range(0, len(faces), 4096))  # most often the first few tell
-    areas = (np.cross(normalised[b] - normalised[a], normalised[c] - normalised[a]) for a, b, c in parts)
+    # most often the first few tell
+    parts = (faces[first : first + 4096].T for first in range(0, len(faces), 4096))
+    areas = (
+        np.cross(normalised[b] - normalised[a], normalised[c] - normalised[a]) for a, b, c in parts
+    )
     if not any(np.abs(area).max() > FLAT for area in areas):
         raise MeshError(f"{name}: the mesh has no area, all its faces are lines or points")
     return Mesh(normalised, faces.astype(np.int32), centre, float(radius * reach), name, unit)
@@ -112,8 +132,8 @@ def _first_of_equals(rows: NDArray) -> NDArray[np.int64]:
 def mesh_warnings(mesh: Mesh) -> tuple[str, ...]:
     """What is likely to be wrong with the mesh of one object, a sentence each; usually nothing.
 
-    That something was left out of it, that it has parts far from its main part, that it stands on a large plane, and
-    that it is of an odd size. It takes about as long as reading the file.
+    That something was left out of it, that it has parts far from its main part, that it stands on a
+    large plane, and that it is of an odd size. It takes about as long as reading the file.
 
     Args:
         mesh: as ``load_mesh`` returns it.
@@ -125,7 +145,9 @@ def mesh_warnings(mesh: Mesh) -> tuple[str, ...]:
 
 
 def is_y_up(path: Path, up: str | None = None) -> bool:
-    """Whether the y axis of a mesh file points up: as ``up`` says, or as the standard of its format does."""
+    """Whether the y axis of a mesh file points up: as ``up`` says, or as the standard of its
+    format does.
+    """
     return (up or ("y" if path.suffix.lower() == ".glb" else "z")) == "y"
 
 
@@ -136,15 +158,17 @@ def load_mesh(
     max_faces: int = MAX_FACES,
     largest_part: bool = False,
 ) -> Mesh:
-    """Read an OFF, OBJ, PLY, STL or GLB file, by its suffix, into the object frame; the parts of a scene are joined.
+    """Read an OFF, OBJ, PLY, STL or GLB file, by its suffix, into the object frame; the parts of a
+    scene are joined.
 
     Args:
         path: the file.
         up: its up axis, "y" or "z"; by default z, but y for GLB, whose standard says so.
         unit: its unit of length, one of UNITS; None if it is not known.
-        max_faces: how many triangles the mesh may have. The file may have BYTES_PER_FACE bytes for each.
-        largest_part: leave out all that is not connected to the part with the largest surface, as loose pieces of a
-            scan. A plate, such as a turntable's, is not taken for that part.
+        max_faces: how many triangles the mesh may have. The file may have BYTES_PER_FACE bytes for
+            each.
+        largest_part: leave out all that is not connected to the part with the largest surface, as
+            loose pieces of a scan. A plate, such as a turntable's, is not taken for that part.
 
     Raises:
         MeshError: what is wrong with the file, in one sentence.
@@ -154,13 +178,17 @@ def load_mesh(
     if up not in (None, "y", "z"):
         raise MeshError(f"{path}: the up axis is y or z, not {one_line(repr(up))}")
     if unit is not None and unit not in UNITS:
-        raise MeshError(f"{path}: the unit is one of {', '.join(UNITS)}, not {one_line(repr(unit))}")
+        raise MeshError(
+            f"{path}: the unit is one of {', '.join(UNITS)}, not {one_line(repr(unit))}"
+        )
     if suffix not in FORMATS and not os.path.isdir(path):
         raise MeshError(f"{path}: not a mesh format nextview reads ({', '.join(FORMATS)})")
     regular_file(path, "a mesh", MeshError)
     most = BYTES_PER_FACE * whole(max_faces, "the largest number of faces", 1)
     if path.stat().st_size > most:
-        raise MeshError(f"{path}: has more than {most:,} bytes; --max-faces (max_faces) allows more")
+        raise MeshError(
+            f"{path}: has more than {most:,} bytes; --max-faces (max_faces) allows more"
+        )
     try:
         data = path.read_bytes()
         if not data.strip():
@@ -168,16 +196,23 @@ def load_mesh(
         vertices, faces = READERS[suffix](data, max_faces)
         check_faces(len(faces), max_faces)
         if len(faces) == 0:
-            raise MeshError(no_faces(len(vertices)) if len(vertices) else "it holds neither vertices nor faces")
+            raise MeshError(
+                no_faces(len(vertices)) if len(vertices) else "it holds neither vertices nor faces"
+            )
     except OSError as error:
         raise MeshError(f"{path}: cannot be read ({error.strerror})") from None
     except MemoryError:
         raise MeshError(f"{path}: too large for this machine's memory") from None
-    except (ValueError, OverflowError) as error:  # MeshErrors, and numbers that are none or too large
+    # MeshErrors, and numbers that are none or too large
+    except (ValueError, OverflowError) as error:
         reason = foreign_content(data, suffix)
         if reason is None:
-            reason = str(error) if isinstance(error, MeshError) else f"{type(error).__name__}: {error}"
-        raise MeshError(f"{path}: not a readable {suffix[1:].upper()} mesh ({one_line(reason, 240)})") from None
+            reason = (
+                str(error) if isinstance(error, MeshError) else f"{type(error).__name__}: {error}"
+            )
+        raise MeshError(
+            f"{path}: not a readable {suffix[1:].upper()} mesh ({one_line(reason, 240)})"
+        ) from None
     if is_y_up(path, up):
         vertices = vertices[:, [0, 2, 1]] * (1, -1, 1)
     mesh = make_mesh(vertices, faces, str(path), unit)

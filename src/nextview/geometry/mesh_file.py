@@ -1,7 +1,8 @@
 """Read mesh files: OFF and OBJ here, PLY and STL in files of their own, GLB by trimesh.
 
-ModelNet's OFF files break the standard (``OFF490926 662722 0`` on one line), and trimesh takes a truncated one for
-whole; its OBJ reader counts relative indices from the end of the file, and cuts polygons into fans.
+ModelNet's OFF files break the standard (``OFF490926 662722 0`` on one line), and trimesh takes a
+truncated one for whole; its OBJ reader counts relative indices from the end of the file, and cuts
+polygons into fans.
 """
 
 import io
@@ -21,16 +22,20 @@ from nextview.geometry.ply_file import read_ply
 from nextview.geometry.stl_file import read_stl
 from nextview.geometry.triangles import MAX_FACES, check_faces, triangulate
 
-# The letters before OFF announce texture coordinates, colours and normals, which follow each vertex's position. Four
-# coordinates a vertex (4OFF), any number of them (nOFF) and binary files are not read.
+# The letters before OFF announce texture coordinates, colours and normals, which follow each
+# vertex's position. Four coordinates a vertex (4OFF), any number of them (nOFF) and binary files
+# are not read.
 OFF_HEADER = re.compile(
-    rb"\s*(?:(?P<unread>(?:ST|C|N)*(?:4n?|(?-i:n)(?=OFF))OFF|\w*OFF[ \t]+BINARY)\b|(?:ST|C|N)*OFF(?:\b|(?=[0-9])))",
+    rb"\s*(?:(?P<unread>(?:ST|C|N)*(?:4n?|(?-i:n)(?=OFF))OFF|\w*OFF["
+    rb" \t]+BINARY)\b|(?:ST|C|N)*OFF(?:\b|(?=[0-9])))",
     re.IGNORECASE,
 )
 # Of vertices, faces and edges, on one line or on three; the last is often missing.
 OFF_COUNTS = re.compile(rb"\s*(\d+)\s+(\d+)(?:\s+\d+(?=[ \t]*(?:\n|$)))?[ \t]*(?=\n|$)")
 Shape = tuple[NDArray[np.float64], NDArray[np.int64]]  # vertices, (V, 3), and triangles, (F, 3)
-GLB_TRIANGLES, GLB_STRIP, GLB_FAN = 4, 5, 6
+GLB_TRIANGLES = 4
+GLB_STRIP = 5
+GLB_FAN = 6
 GLB_NODES = 20_000  # Trimesh takes some seconds to place so many
 
 
@@ -51,7 +56,9 @@ def read_off(data: bytes, max_faces: int = MAX_FACES) -> Shape:
     if header is None:
         raise MeshError("it does not begin with OFF")
     if header["unread"]:
-        raise MeshError(f"it begins with {header[0].strip().decode()}, a kind of OFF that is not read here")
+        raise MeshError(
+            f"it begins with {header[0].strip().decode()}, a kind of OFF that is not read here"
+        )
     counts = OFF_COUNTS.match(text, header.end())
     if counts is None:
         raise MeshError("the counts of vertices and faces are missing")
@@ -63,10 +70,17 @@ def read_off(data: bytes, max_faces: int = MAX_FACES) -> Shape:
 
 
 def _plain_off(body: bytes, n_vertices: int, n_faces: int) -> Shape | None:
-    """The usual case at full speed: three numbers a line, then triangles alone. None if the file is anything else."""
+    """The usual case at full speed: three numbers a line, then triangles alone.
+
+    None if the file is anything else.
+    """
     body = body.strip()
     ends = np.flatnonzero(np.frombuffer(body, np.uint8) == ord("\n"))
-    if min(n_vertices, n_faces) == 0 or len(ends) != n_vertices + n_faces - 1 or re.search(rb"\n[ \t]*\n", body):
+    if (
+        min(n_vertices, n_faces) == 0
+        or len(ends) != n_vertices + n_faces - 1
+        or re.search(rb"\n[ \t]*\n", body)
+    ):
         return None
     middle = int(ends[n_vertices - 1])
     try:
@@ -94,7 +108,9 @@ def _off_by_lines(body: bytes, n_vertices: int, n_faces: int, max_faces: int) ->
             raise MeshError(f"face {len(sizes)} has {len(words) - 1} of {sides} corners")
         polygon = list(map(int, words[1 : 1 + sides]))
         if polygon and not 0 <= min(polygon) <= max(polygon) < n_vertices:
-            raise MeshError(f"face {len(sizes)} refers to a vertex outside of the {n_vertices} that there are")
+            raise MeshError(
+                f"face {len(sizes)} refers to a vertex outside of the {n_vertices} that there are"
+            )
         corners.extend(polygon)
         sizes.append(sides)
 
@@ -127,14 +143,20 @@ def read_obj(data: bytes, max_faces: int = MAX_FACES) -> Shape:
             if len(words) < 3:
                 raise MeshError(f"cut short, a face has {len(words)} of 3 or more corners")
             asked = [int(word.partition(b"/")[0]) for word in words]
-            polygon = [index - 1 if index > 0 else count + index for index in asked]  # below 0 from the last so far
+            # below 0 from the last so far
+            polygon = [index - 1 if index > 0 else count + index for index in asked]
             if 0 in asked or min(polygon) < 0 or max(polygon) >= len(text):
-                raise MeshError(f"a face refers to vertices {asked}, but the first is 1 and {count} come before it")
+                raise MeshError(
+                    f"a face refers to vertices {asked}, but the first is 1 and {count} come"
+                    " before it"
+                )
             corners.extend(polygon)
             sizes.append(len(polygon))
     named = np.array(corners)
     if named.size and named.max() >= count:
-        raise MeshError(f"a face refers to vertex {named.max() + 1}, but there are only {count} vertices")
+        raise MeshError(
+            f"a face refers to vertex {named.max() + 1}, but there are only {count} vertices"
+        )
     return _shape(positions, corners, sizes, max_faces)
 
 
@@ -145,9 +167,13 @@ def _coordinates(words: list[bytes], vertex: int) -> Iterator[float]:
 
 
 def _shape(positions: array, corners: array, sizes: array, max_faces: int) -> Shape:
-    """Vertices and triangles of coordinates, three after three, and of polygons, as ``triangulate`` takes them."""
+    """Vertices and triangles of coordinates, three after three, and of polygons, as
+    ``triangulate`` takes them.
+    """
     vertices = np.array(positions).reshape(-1, 3)
-    return vertices, triangulate(vertices, np.array(corners, np.int64), np.array(sizes, np.int64), max_faces)
+    return vertices, triangulate(
+        vertices, np.array(corners, np.int64), np.array(sizes, np.int64), max_faces
+    )
 
 
 def read_glb(data: bytes, max_faces: int = MAX_FACES) -> Shape:
@@ -165,7 +191,8 @@ def read_glb(data: bytes, max_faces: int = MAX_FACES) -> Shape:
         parts = _glb_parts(data)
     except (MeshError, MemoryError):
         raise
-    except (*DAMAGED, AssertionError, NameError) as error:  # the last two are what trimesh raises on purpose
+    # the last two are what trimesh raises on purpose
+    except (*DAMAGED, AssertionError, NameError) as error:
         raise MeshError(f"{type(error).__name__}: {error}") from error
     check_faces(sum(len(shape.faces) for _, shape in parts), max_faces)
     vertices = [np.zeros((0, 3))]
@@ -189,12 +216,18 @@ def _glb_parts(data: bytes) -> list[tuple[NDArray[np.float64], Any]]:
 
 
 def _check_glb(data: bytes) -> None:
-    """Hold what the JSON announces against the file's size, and refuse what trimesh would read as another shape."""
+    """Hold what the JSON announces against the file's size, and refuse what trimesh would read
+    as another shape.
+    """
     if data[:4] != b"glTF" or int.from_bytes(data[8:12], "little") != len(data):
         raise MeshError("it does not begin with glTF, or is not as long as it announces")
     gltf = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
     accessors, nodes, views = (gltf.get(key, []) for key in ("accessors", "nodes", "bufferViews"))
-    taken = [a["count"] for a in accessors if "bufferView" not in a or "byteStride" in views[a["bufferView"]]]
+    taken = [
+        a["count"]
+        for a in accessors
+        if "bufferView" not in a or "byteStride" in views[a["bufferView"]]
+    ]
     if sum(taken) > len(data) or sum(view["byteLength"] for view in views) > 2 * len(data):
         raise MeshError("it announces more numbers than its bytes hold")
     if any("uri" in buffer for buffer in gltf.get("buffers", [])):
@@ -209,7 +242,10 @@ def _check_glb(data: bytes) -> None:
         if part.get("mode", GLB_TRIANGLES) == GLB_FAN:
             raise MeshError("it has fans of triangles, which are not read here")
         if any("bufferView" not in accessor or "sparse" in accessor for accessor in used):
-            raise MeshError("its positions or faces are compressed, sparse or without data, which is not read here")
+            raise MeshError(
+                "its positions or faces are compressed, sparse or without data, which is not read"
+                " here"
+            )
         if any(accessor.get("normalized") for accessor in used):
             raise MeshError("its positions are fractions of whole numbers, which are not read here")
         if min(accessor["count"] for accessor in used) < 0:

@@ -1,4 +1,6 @@
-"""The parts of a mesh, and what is likely to be wrong with a scan: a table in it, pieces that float, a lost shape."""
+"""The parts of a mesh, and what is likely to be wrong with a scan: a table in it, pieces that
+float, a lost shape.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,18 +10,22 @@ from numpy.typing import NDArray
 
 from nextview.errors import MeshError
 
-HASH_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)  # odd, of many bits
+# odd, of many bits
+HASH_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 FLAT_PART = 0.05  # thickness of a part, over its width, below which it is a plate
 SMALL_PART = 0.01  # of the surface of the largest part: smaller ones are crumbs
 FAR_PARTS = 3.0  # how many times as large as its main part a mesh has to be to be asked about
 WIDE_PLANE = 2.0  # how many times as large as what stands on it
 MOST_WIDE_PLANE = 25.0  # more, and what is beside it is no object but a bump
-ONE_SIDED = 0.8  # how much more of what is not in the plane is on one side of it: 0 as much on both, 1 all
+# how much more of what is not in the plane is on one side of it: 0 as much on both, 1 all
+ONE_SIDED = 0.8
 PLANE_THICKNESS = 0.05  # of the mesh's size: what lies no farther from a plane belongs to it
 PLANE_FACES = 100_000  # that are looked at in search of a plane
 PLANE_ANGLE = np.cos(np.radians(15))  # between its normal and those of its faces
-LOST_STEP = 0.05  # object radii between two numbers of single precision, from where on a shape is lost
-USED_STEPS = 0.2  # share of coordinates that are odd multiples of such a step, half of them by chance
+# object radii between two numbers of single precision, from where on a shape is lost
+LOST_STEP = 0.05
+# share of coordinates that are odd multiples of such a step, half of them by chance
+USED_STEPS = 0.2
 
 
 @dataclass(frozen=True)
@@ -40,14 +46,19 @@ class Parts:
 
     @classmethod
     def of(cls, vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> "Parts":
-        """Find the parts of a mesh. Vertices in the same place count as one, as in an STL file they have to."""
+        """Find the parts of a mesh.
+
+        Vertices in the same place count as one, as in an STL file they have to.
+        """
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
         places = _places(vertices)[faces]
         count = int(places.max()) + 1 if len(places) else 0
         ends = np.concatenate([places[:, :2], places[:, 1:]]).astype(np.int32)
-        graph = coo_array((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
+        graph = coo_array(
+            (np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count)
+        )
         _, component = connected_components(graph, directed=False)
         _, part = np.unique(component[places[:, 0]], return_inverse=True)
         areas = np.bincount(part, _areas(vertices, faces)).astype(np.float64)
@@ -100,15 +111,16 @@ def keep_largest_part(
 ) -> tuple[NDArray[np.int32], tuple[str, ...]]:
     """Leave out what is not connected to the largest part of a mesh.
 
-    The largest part has the largest surface. A plate, thinner than a twentieth of its width, is taken for what the
-    object stood on, and only counts if the other parts are crumbs.
+    The largest part has the largest surface. A plate, thinner than a twentieth of its width, is
+    taken for what the object stood on, and only counts if the other parts are crumbs.
 
     Args:
         vertices: (V, 3).
         faces: (F, 3), indices into the vertices.
 
     Returns:
-        The faces of the part, and a sentence about what was left out; none if there is one part alone.
+        The faces of the part, and a sentence about what was left out; none if there is one part
+        alone.
     """
     parts = Parts.of(vertices, faces)
     if len(parts.areas) == 1:
@@ -119,7 +131,8 @@ def keep_largest_part(
 
 
 def refuse_lost_shape(vertices: NDArray[np.float64], radius: float, name: str) -> None:
-    """Refuse an object that single precision, far from the origin, has rounded until its shape was lost.
+    """Refuse an object that single precision, far from the origin, has rounded until its shape was
+    lost.
 
     Args:
         vertices: (V, 3), as they stand in the file.
@@ -127,8 +140,8 @@ def refuse_lost_shape(vertices: NDArray[np.float64], radius: float, name: str) -
         name: of the file.
 
     Raises:
-        MeshError: neighbouring numbers of single precision are more than a twentieth of the radius apart there, and the
-            positions are such numbers.
+        MeshError: neighbouring numbers of single precision are more than a twentieth of the radius
+            apart there, and the positions are such numbers.
     """
     column = vertices[:, np.abs(vertices).max(0).argmax()]
     farthest = np.abs(column).max()
@@ -140,10 +153,16 @@ def refuse_lost_shape(vertices: NDArray[np.float64], radius: float, name: str) -
             return
         steps = column / np.spacing(np.abs(column).astype(np.float32)).astype(np.float64)
     rounded = bool((steps == np.round(steps)).all())
-    # A building whose corners stand at whole metres is not rounded: half of rounded numbers are odd multiples.
+    # A building whose corners stand at whole metres is not rounded: half of rounded numbers are odd
+    # multiples.
     if rounded and (step > radius or (steps % 2 == 1).mean() > USED_STEPS):
-        where = f"it lies {farthest:,.0f} from its origin, where single precision has steps of {step:.2g}"
-        raise MeshError(f"{name}: {where}, and has lost its shape; move it to the origin before it is saved")
+        where = (
+            f"it lies {farthest:,.0f} from its origin, where single precision has steps of"
+            f" {step:.2g}"
+        )
+        raise MeshError(
+            f"{name}: {where}, and has lost its shape; move it to the origin before it is saved"
+        )
 
 
 def mesh_doubts(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> tuple[str, ...]:
@@ -158,16 +177,23 @@ def mesh_doubts(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> tu
     size = _size(vertices)
     times = size / _size(parts.points_of(parts.main))
     if times >= FAR_PARTS:
-        largest = f"it has {len(parts.areas):,} parts, and is {times:.1f} times as large as its main part"
-        doubts.append(f"{largest}: does a table or a loose piece belong to it? --largest-part leaves them out")
+        largest = (
+            f"it has {len(parts.areas):,} parts, and is {times:.1f} times as large as its main part"
+        )
+        doubts.append(
+            f"{largest}: does a table or a loose piece belong to it? --largest-part leaves them out"
+        )
     elif (times := _plane_times(vertices, faces)) >= WIDE_PLANE:
         plane = f"a plane in it is {times:.1f} times as large as all that stands on it"
-        doubts.append(f"{plane}: is it a table? Cut it off, or use --largest-part if it is a part of its own")
+        doubts.append(
+            f"{plane}: is it a table? Cut it off, or use --largest-part if it is a part of its own"
+        )
     return tuple(doubts)
 
 
 def _plane_times(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> float:
-    """How many times as large as the rest a mesh is because of one plane that reaches beyond it on all sides.
+    """How many times as large as the rest a mesh is because of one plane that reaches beyond it on
+    all sides.
 
     1 if there is no such plane, or nothing beside it.
     """
@@ -203,7 +229,9 @@ def _plane_times(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> f
     return size / rest if width > rest else 1.0
 
 
-def _main_direction(normals: NDArray[np.float64], areas: NDArray[np.float64]) -> NDArray[np.float64]:
+def _main_direction(
+    normals: NDArray[np.float64], areas: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """The direction, of either sign, that most of a surface faces, (3,)."""
     upper = np.where(normals[:, 2:] < 0, -normals, normals)
     cells = np.round(upper * 4).astype(int) + 4  # directions some 15 degrees apart
@@ -217,7 +245,9 @@ def _main_direction(normals: NDArray[np.float64], areas: NDArray[np.float64]) ->
     return direction
 
 
-def _mean_direction(normals: NDArray[np.float64], areas: NDArray[np.float64]) -> NDArray[np.float64]:
+def _mean_direction(
+    normals: NDArray[np.float64], areas: NDArray[np.float64]
+) -> NDArray[np.float64]:
     mean = (normals * areas[:, None]).sum(0)
     length = float(np.linalg.norm(mean))
     return mean / length if length > 0 else normals[0]

@@ -26,9 +26,9 @@ def encoding_of(data: bytes) -> tuple[str, int]:
         data: the file's bytes.
 
     Returns:
-        The name of the encoding, and how many bytes the mark before the text has. Without a mark UTF-16 is told by the
-        zero beside each of the first two letters; everything else is "utf-8", of which only ASCII is ever looked at, so
-        that Latin-1 and its kin are read too.
+        The name of the encoding, and how many bytes the mark before the text has. Without a mark
+        UTF-16 is told by the zero beside each of the first two letters; everything else is "utf-8",
+        of which only ASCII is ever looked at, so that Latin-1 and its kin are read too.
     """
     for mark, name in MARKS:
         if data.startswith(mark):
@@ -42,7 +42,8 @@ def encoding_of(data: bytes) -> tuple[str, int]:
 
 
 def plain_text(data: bytes) -> bytes:
-    r"""A text file in an encoding of which ASCII is a part, without a byte-order mark, every line ended by ``\n``.
+    r"""A text file in an encoding of which ASCII is a part, without a byte-order mark, every line
+    ended by ``\n``.
 
     Args:
         data: the file's bytes, in UTF-8, UTF-16, UTF-32 or any eight-bit encoding.
@@ -67,7 +68,9 @@ def plain_text(data: bytes) -> bytes:
 
 
 def lines_of_words(text: bytes) -> Iterator[list[bytes]]:
-    """The words of each line that has any, without comments (#), one line at a time for the sake of memory."""
+    """The words of each line that has any, without comments (#), one line at a time for the sake
+    of memory.
+    """
     for line in io.BytesIO(text):
         words = line.partition(b"#")[0].split()
         if words:
@@ -93,4 +96,6 @@ def _parsed(text: bytes, kind: type) -> NDArray:
         try:
             return np.fromstring(text, kind, sep=" ")
         except (DeprecationWarning, ValueError):  # which of them depends on NumPy's version
-            raise ValueError("there is something else than numbers where numbers are expected") from None
+            raise ValueError(
+                "there is something else than numbers where numbers are expected"
+            ) from None

@@ -13,26 +13,37 @@ from nextview.errors import ObservationError
 from nextview.geometry.depth import FARTHEST, headlight, object_depth, visible_points
 
 LEAST_SHARE = 0.006
-"""An object is seen if one connected part of it fills this share of the image. In the networks' images of 112 pixels a
-side, less are specks of 8 x 9 pixels. The thinnest object of ModelNet10, a screen seen from its edge, fills 0.011."""
+"""An object is seen if one connected part of it fills this share of the image. In the networks'
+images of 112 pixels a side, less are specks of 8 x 9 pixels. The thinnest object of ModelNet10, a
+screen seen from its edge, fills 0.011."""
 SPECKS = 8  # or if all its parts together fill so many times as much
 LEAST_PIXELS = 9  # the least share in pixels, for small images
 LARGEST = 1e9  # numbers of poses and intrinsics are smaller
-RIGID = 1e-3  # how far a pose may be from a rigid motion: numbers may have been written with four digits
+# how far a pose may be from a rigid motion: numbers may have been written with four digits
+RIGID = 1e-3
 
 
 @dataclass(frozen=True)
 class SceneView:
-    """All that one frame shows, the object and what stands around it, in the object frame and object radii.
+    """All that one frame shows, the object and what stands around it, in the object frame and
+    object radii.
 
-    Its pinhole and distance may be others than those of its observation. ObservationError: no images of one shape.
+    Its pinhole and distance may be others than those of its observation. ObservationError: no
+    images of one shape.
+
+    Attributes:
+        depth: along the optical axis, (H, W), object radii, 0 where nothing was measured.
+        target: pixels that show the object, (H, W).
+        pose: camera-to-world, (4, 4), OpenCV axes; the world is the object frame.
+        intrinsics: pinhole matrix, (3, 3), pixels; the first pixel's centre is at 0.5.
+        background_free: whether nothing is there where nothing was measured, as in renders; a
+            sensor may miss what is black or shiny.
     """
 
-    depth: NDArray[np.float32]  # along the optical axis, (H, W), object radii, 0 where nothing was measured
-    target: NDArray[np.bool_]  # pixels that show the object, (H, W)
-    pose: NDArray[np.float64]  # camera-to-world, (4, 4), OpenCV axes; the world is the object frame
-    intrinsics: NDArray[np.float64]  # pinhole matrix, (3, 3), pixels; the first pixel's centre is at 0.5
-    # whether nothing is there where nothing was measured, as in renders; a sensor may miss what is black or shiny
+    depth: NDArray[np.float32]
+    target: NDArray[np.bool_]
+    pose: NDArray[np.float64]
+    intrinsics: NDArray[np.float64]
     background_free: bool = False
 
     def __post_init__(self) -> None:
@@ -46,19 +57,22 @@ class Observation:
     """One view of an object. It keeps copies of the arrays, which nobody can write to.
 
     Attributes:
-        depth: distance along the optical axis, (H, W) float32, object radii, 0 where there is no object. What a sensor
-            gives for nothing else (see ``object_depth``) becomes 0 here.
-        pose: camera-to-world, (4, 4) float64, OpenCV axes (x right, y down, z forward); the world is the object frame.
+        depth: distance along the optical axis, (H, W) float32, object radii, 0 where there is no
+            object. What a sensor gives for nothing else (see ``object_depth``) becomes 0 here.
+        pose: camera-to-world, (4, 4) float64, OpenCV axes (x right, y down, z forward); the world
+            is the object frame.
         intrinsics: pinhole matrix, (3, 3) float64, pixels; pixel (row, column) has its centre at
             (column + 0.5, row + 0.5).
-        radius: the object radius, metres: what positions were divided by. None if the camera does not know its scale.
+        radius: the object radius, metres: what positions were divided by. None if the camera does
+            not know its scale.
         image: grey picture, (H, W) uint8, 0 where there is no object. None if the camera has none.
-        scene: all that the camera saw. None where only the object is known: then nothing is taken to hide it.
+        scene: all that the camera saw. None where only the object is known: then nothing is taken
+            to hide it.
         exact: whether the depth is without a sensor's errors, as of a render.
 
     Raises:
-        ObservationError: shapes that are not these, or numbers that no camera can have: what is wrong, and what it
-            looks like.
+        ObservationError: shapes that are not these, or numbers that no camera can have: what is
+            wrong, and what it looks like.
     """
 
     depth: NDArray[np.float32]
@@ -86,7 +100,9 @@ class Observation:
         if self.radius is not None:
             if not (isinstance(self.radius, Real) and 0 < self.radius < LARGEST):
                 shown = one_line(repr(self.radius))
-                raise ObservationError(f"the object radius is a positive number of metres, or None, not {shown}")
+                raise ObservationError(
+                    f"the object radius is a positive number of metres, or None, not {shown}"
+                )
             object.__setattr__(self, "radius", float(self.radius))
 
     @cached_property
@@ -96,17 +112,24 @@ class Observation:
 
     @cached_property
     def seen(self) -> bool:
-        """Whether enough of the object is visible to say anything of it. A view without it is no evidence."""
+        """Whether enough of the object is visible to say anything of it.
+
+        A view without it is no evidence.
+        """
         return enough_shows(self.depth > 0)
 
     @cached_property
     def points(self) -> NDArray[np.float32]:
-        """On the visible surface, (1024, 3) float32, object frame, object radii; all zero if nothing is visible."""
+        """On the visible surface, (1024, 3) float32, object frame, object radii; all zero if
+        nothing is visible.
+        """
         return visible_points(self.depth, self.pose, self.intrinsics)
 
     @cached_property
     def picture(self) -> NDArray[np.uint8]:
-        """The image; where the camera has none, the depth as a headlight would show it. (H, W) uint8."""
+        """The image; where the camera has none, the depth as a headlight would show it. (H, W)
+        uint8.
+        """
         return headlight(self.depth, self.intrinsics) if self.image is None else self.image
 
 
@@ -119,8 +142,11 @@ def _own(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def enough_shows(mask: NDArray[np.bool_]) -> bool:
-    """Whether the pixels that show the object, (H, W) bool, are enough to say anything of it: see LEAST_SHARE."""
-    least, n = max(LEAST_PIXELS, LEAST_SHARE * mask.size), np.count_nonzero(mask)
+    """Whether the pixels that show the object, (H, W) bool, are enough to say anything of it:
+    see LEAST_SHARE.
+    """
+    least = max(LEAST_PIXELS, LEAST_SHARE * mask.size)
+    n = np.count_nonzero(mask)
     if not least <= n < SPECKS * least:
         return bool(n >= least)
     from scipy.ndimage import label  # only where little is seen: importing it takes time
@@ -137,36 +163,54 @@ class Camera(Protocol):
 
 
 def checked_pose(pose: Any) -> NDArray[np.float64]:
-    """A camera-to-world pose, (4, 4) float64, OpenCV axes, object radii; ObservationError if no camera has it."""
+    """A camera-to-world pose, (4, 4) float64, OpenCV axes, object radii; ObservationError if no
+    camera has it.
+    """
     pose = numbers(pose, "the pose").astype(np.float64, copy=False)
     if pose.shape != (4, 4):
-        raise ObservationError(f"the pose is a camera-to-world matrix of the shape (4, 4), not {pose.shape}")
+        raise ObservationError(
+            f"the pose is a camera-to-world matrix of the shape (4, 4), not {pose.shape}"
+        )
     if not (np.abs(pose) < LARGEST).all():  # not so if there is a NaN
         raise ObservationError("the pose holds NaN or infinity, or a number that no camera has")
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID:
-        raise ObservationError(f"the last row of the pose is {pose[3].tolist()}, not 0 0 0 1: is it transposed?")
+        raise ObservationError(
+            f"the last row of the pose is {pose[3].tolist()}, not 0 0 0 1: is it transposed?"
+        )
     rotation = pose[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID:
-        raise ObservationError("the pose is not rigid: its rotation does not keep lengths and angles")
+        raise ObservationError(
+            "the pose is not rigid: its rotation does not keep lengths and angles"
+        )
     if np.linalg.det(rotation) < 0:
-        raise ObservationError("the pose is mirrored: an axis is reversed (OpenCV axes are x right, y down, z forward)")
+        raise ObservationError(
+            "the pose is mirrored: an axis is reversed (OpenCV axes are x right, y down, z forward)"
+        )
     distance = float(np.sqrt((pose[:3, 3] ** 2).sum()))
     if distance > 2 * FARTHEST:
         what = f"the camera stands {distance:.4g} object radii from the object"
-        raise ObservationError(f"{what}: is its position in millimetres? Divide it by the object radius")
+        raise ObservationError(
+            f"{what}: is its position in millimetres? Divide it by the object radius"
+        )
     return pose
 
 
 def checked_intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """A pinhole matrix, (3, 3) float64, pixels, of an image of some shape; ObservationError if no camera has it."""
+    """A pinhole matrix, (3, 3) float64, pixels, of an image of some shape; ObservationError if
+    no camera has it.
+    """
     intrinsics = numbers(intrinsics, "the matrix of intrinsics").astype(np.float64, copy=False)
     if intrinsics.shape != (3, 3):
-        raise ObservationError(f"the intrinsics are a pinhole matrix of the shape (3, 3), not {intrinsics.shape}")
+        raise ObservationError(
+            f"the intrinsics are a pinhole matrix of the shape (3, 3), not {intrinsics.shape}"
+        )
     if not (np.abs(intrinsics) < LARGEST).all():  # not so if there is a NaN
         raise ObservationError("the intrinsics hold NaN, infinity or a number that no camera has")
     if np.abs(intrinsics[2] - (0, 0, 1)).max() > RIGID:
         last = intrinsics[2].tolist()
-        raise ObservationError(f"the last row of the intrinsics is {last}, not 0 0 1: are they transposed?")
+        raise ObservationError(
+            f"the last row of the intrinsics is {last}, not 0 0 1: are they transposed?"
+        )
     focal = intrinsics[0, 0], intrinsics[1, 1]
     if not min(focal) > 0.01 * max(shape):  # less would show all that lies ahead: metres, say
         wanted = f"positive numbers of pixels, about as many as the image has a side ({max(shape)})"
@@ -183,14 +227,20 @@ def numbers(values: Any, what: str) -> NDArray[Any]:
 
 
 def array_of(values: Any, what: str) -> NDArray[Any]:
-    """An array of anything, in the byte order of this machine; ObservationError if it cannot become one.
+    """An array of anything, in the byte order of this machine; ObservationError if it cannot become
+    one.
 
     What a masked array hides becomes 0: nothing was measured there.
     """
     try:
-        array = np.ma.filled(values, 0) if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
-    except (ValueError, TypeError) as error:  # rows of different lengths, or what cannot become an array at all
-        raise ObservationError(f"{what} cannot be taken for an array of numbers ({error})") from None
+        array = (
+            np.ma.filled(values, 0) if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
+        )
+    # rows of different lengths, or what cannot become an array at all
+    except (ValueError, TypeError) as error:
+        raise ObservationError(
+            f"{what} cannot be taken for an array of numbers ({error})"
+        ) from None
     return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
 
 
@@ -203,34 +253,49 @@ def depth_image(depth: Any) -> NDArray[Any]:
 
 
 def _check_unit(given: NDArray[np.float32], near: int) -> None:
-    """Refuse depth of which next to nothing is near enough to be an object. One large number is that for nothing."""
+    """Refuse depth of which next to nothing is near enough to be an object.
+
+    One large number is that for nothing.
+    """
     if 99 * near >= given.size:
         return
     far = given[np.isfinite(given) & (given >= FARTHEST)]
     varied = np.count_nonzero(far < far.max()) if len(far) else 0
     if varied > max(LEAST_PIXELS, 99 * near):
         raise ObservationError(
-            f"the depth looks like millimetres, or metres, not object radii (its median is {np.median(far):.4g}, and "
-            f"{FARTHEST:g} and more counts as nothing): divide it by the object radius, and set all else to 0"
+            "the depth looks like millimetres, or metres, not object radii (its median is"
+            f" {np.median(far):.4g}, and {FARTHEST:g} and more counts as nothing): divide it by the"
+            " object radius, and set all else to 0"
         )
 
 
 def _image(image: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     image = numbers(image, "the image")
     if image.shape != shape:
-        raise ObservationError(f"the image is grey and of the depth's shape {shape}, not {image.shape}")
-    if image.dtype != np.uint8 and (image.dtype.kind == "f" or image.min() < 0 or image.max() > 255):
-        raise ObservationError(f"the image holds whole numbers from 0 to 255 (uint8), not {image.dtype}")
+        raise ObservationError(
+            f"the image is grey and of the depth's shape {shape}, not {image.shape}"
+        )
+    if image.dtype != np.uint8 and (
+        image.dtype.kind == "f" or image.min() < 0 or image.max() > 255
+    ):
+        raise ObservationError(
+            f"the image holds whole numbers from 0 to 255 (uint8), not {image.dtype}"
+        )
     return image.astype(np.uint8, copy=False)
 
 
 def pinhole(size: int, distance: float) -> NDArray[np.float64]:
-    """Pinhole matrix, (3, 3) float64, of a square image that just holds the unit sphere seen from a distance.
+    """Pinhole matrix, (3, 3) float64, of a square image that just holds the unit sphere seen from a
+    distance.
 
-    ``size`` is its side, pixels; the distance is from the centre, object radii. ObservationError if that is inside.
+    ``size`` is its side, pixels; the distance is from the centre, object radii. ObservationError if
+    that is inside.
     """
     distance = number(distance, "the distance")
     if not 1 < distance < LARGEST:
-        raise ObservationError(f"the camera has to stand more than one object radius from the centre, not {distance:g}")
-    focal = size / 2 * np.sqrt(distance**2 - 1)  # size/2 over the tangent of the half angle asin(1/distance)
+        raise ObservationError(
+            f"the camera has to stand more than one object radius from the centre, not {distance:g}"
+        )
+    # size/2 over the tangent of the half angle asin(1/distance)
+    focal = size / 2 * np.sqrt(distance**2 - 1)
     return np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])

@@ -1,7 +1,9 @@
-"""Read PLY files: text and binary, triangles, polygons of any number of corners, and triangle strips.
+"""Read PLY files: text and binary, triangles, polygons of any number of corners, and triangle
+strips.
 
-Trimesh does not read binary files in which the polygons have different numbers of corners, and takes strips for points;
-meshio does not read strips either. A text file is read as a binary one whose numbers are all of one kind.
+Trimesh does not read binary files in which the polygons have different numbers of corners, and
+takes strips for points; meshio does not read strips either. A text file is read as a binary one
+whose numbers are all of one kind.
 """
 
 import re
@@ -16,19 +18,47 @@ from nextview.geometry.mesh_text import encoding_of, numbers, plain_text
 from nextview.geometry.triangles import MAX_FACES, check_faces, no_faces, triangulate
 
 KINDS = {  # the format's names of its numbers, and those that are found in the wild
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
-    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
-    "int64": "i8", "uint64": "u8", "float16": "f2", "float32": "f4", "float64": "f8",
-}  # fmt: skip
-FORMAT_CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q", "f8": "d"}
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "int64": "i8",
+    "uint64": "u8",
+    "float16": "f2",
+    "float32": "f4",
+    "float64": "f8",
+}
+FORMAT_CODES = {
+    "i1": "b",
+    "u1": "B",
+    "i2": "h",
+    "u2": "H",
+    "i4": "i",
+    "u4": "I",
+    "i8": "q",
+    "u8": "Q",
+    "f8": "d",
+}
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 CORNER_LISTS = ("vertex_indices", "vertex_index")
 BYTES_OF_NUMBER = 8  # of a text, all of which are read as doubles
 STRIP_END = -1  # among the vertices of a strip: here another one begins
 
-Corners = tuple[NDArray[np.int64], NDArray[np.int64]]  # of polygons, one after the other, and how many each has
+# of polygons, one after the other, and how many each has
+Corners = tuple[NDArray[np.int64], NDArray[np.int64]]
 Scalars = dict[str, NDArray]  # a number of each row, by the name of the property
-Lists = dict[str, tuple[NDArray, NDArray[np.int64]]]  # what all the lists of a property hold, and their lengths
+# what all the lists of a property hold, and their lengths
+Lists = dict[str, tuple[NDArray, NDArray[np.int64]]]
 
 
 @dataclass(frozen=True)
@@ -66,7 +96,9 @@ class Element:
         return tuple(column for column in self.properties if column.count is not None)
 
 
-def read_ply(data: bytes, max_faces: int = MAX_FACES) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def read_ply(
+    data: bytes, max_faces: int = MAX_FACES
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Read a PLY file.
 
     Args:
@@ -105,7 +137,9 @@ def read_ply(data: bytes, max_faces: int = MAX_FACES) -> tuple[NDArray[np.float6
 
 
 def _check_rows(element: Element, there: NDArray[np.int64], wanted: NDArray[np.int64]) -> None:
-    """Refuse rows of a text that have more or fewer numbers than the header and their lists say; in bytes, (rows,)."""
+    """Refuse rows of a text that have more or fewer numbers than the header and their lists say;
+    in bytes, (rows,).
+    """
     wrong = np.flatnonzero(there != wanted)
     if len(wrong):
         row = int(wrong[0])
@@ -116,27 +150,36 @@ def _check_rows(element: Element, there: NDArray[np.int64], wanted: NDArray[np.i
 
 
 def _open(data: bytes) -> tuple[bool, list[Element], bytes]:
-    """Whether a file is text, its elements that have rows and columns, and the bytes after its header."""
+    """Whether a file is text, its elements that have rows and columns, and the bytes after its
+    header.
+    """
     encoding, mark = encoding_of(data)
     data = data[mark:] if encoding == "utf-8" else plain_text(data)
     first = re.match(rb"ply[ \t]*(\r?\n|\r)", data)
     if first is None:
         raise MeshError("it does not begin with ply")
-    # The line ends of the first line are those of the header's last one: a byte of what follows may look like one.
+    # The line ends of the first line are those of the header's last one: a byte of what follows may
+    # look like one.
     ending = rb"\r" if first[1] == b"\r" else rb"\r?\n"
     end = re.compile(rb"[\r\n]end_header[ \t]*" + ending).search(data)
     if end is None:
         raise MeshError("its header does not end with end_header")
     lines = [line.decode("latin-1").split() for line in data[: end.start()].splitlines()]
-    order = next((words[1] for words in lines if words[:1] == ["format"] and len(words) > 1), "missing")
+    order = next(
+        (words[1] for words in lines if words[:1] == ["format"] and len(words) > 1), "missing"
+    )
     if order not in BYTE_ORDERS:
         raise MeshError(f"its format is one of {', '.join(BYTE_ORDERS)}, not {order}")
     is_text = order == "ascii"
     if encoding != "utf-8" and not is_text:
-        raise MeshError(f"it is a binary file that was saved as {encoding.upper()} text, by an editor")
+        raise MeshError(
+            f"it is a binary file that was saved as {encoding.upper()} text, by an editor"
+        )
 
     body = data[end.end() :]
-    elements = [element for element in _elements(lines, is_text, BYTE_ORDERS[order]) if element.rows]
+    elements = [
+        element for element in _elements(lines, is_text, BYTE_ORDERS[order]) if element.rows
+    ]
     if sum(element.rows for element in elements) > len(body):
         raise MeshError("the file is cut short, its header announces more rows than there are")
     return is_text, elements, body
@@ -161,7 +204,9 @@ def _elements(lines: list[list[str]], is_text: bool, order: str) -> list[Element
             if not found:
                 raise MeshError(f"its header has the line {' '.join(words)!r} before any element")
             found[-1][2].append(_property(words, is_text, order))
-    return [Element(name, rows, tuple(properties)) for name, rows, properties in found if properties]
+    return [
+        Element(name, rows, tuple(properties)) for name, rows, properties in found if properties
+    ]
 
 
 def _name_and_rows(words: list[str]) -> tuple[str, int]:
@@ -189,7 +234,9 @@ def _bad_line(words: list[str]) -> MeshError:
 
 
 def _numbers_of_rows(body: bytes, rows: int) -> tuple[bytes, NDArray[np.int64]]:
-    """The numbers of a text file's rows, a line each, as doubles, and how many bytes of these each row has, (rows,)."""
+    """The numbers of a text file's rows, a line each, as doubles, and how many bytes of these
+    each row has, (rows,).
+    """
     text = plain_text(body)
     characters = np.frombuffer(text, np.uint8)
     white = characters <= ord(" ")
@@ -206,8 +253,11 @@ def _numbers_of_rows(body: bytes, rows: int) -> tuple[bytes, NDArray[np.int64]]:
     return found.tobytes(), BYTES_OF_NUMBER * words
 
 
-def _read_element(data: bytes, at: int, element: Element) -> tuple[Scalars, Lists, NDArray[np.int64]]:
-    """The columns of an element whose rows begin at a byte, and the bytes of each row: (rows,), or () if all are equal.
+def _read_element(
+    data: bytes, at: int, element: Element
+) -> tuple[Scalars, Lists, NDArray[np.int64]]:
+    """The columns of an element whose rows begin at a byte, and the bytes of each row: (rows,), or
+    () if all are equal.
 
     Args:
         data: the bytes that the rows stand in.
@@ -218,7 +268,8 @@ def _read_element(data: bytes, at: int, element: Element) -> tuple[Scalars, List
         MeshError: there are fewer bytes than the rows need, or the length of a list is none.
     """
     least = sum(
-        column.kind.itemsize if column.count is None else column.count.itemsize for column in element.properties
+        column.kind.itemsize if column.count is None else column.count.itemsize
+        for column in element.properties
     )
     if at + element.rows * least > len(data):
         raise MeshError("the file is cut short, its header announces more rows than there are")
@@ -255,7 +306,8 @@ def _gathered(data: bytes, places: NDArray[np.int64], kind: np.dtype) -> NDArray
     """The numbers that begin at some bytes, (n,)."""
     held = np.frombuffer(data, np.uint8)
     single_bytes = np.empty((len(places), kind.itemsize), np.uint8)
-    for byte in range(kind.itemsize):  # one after the other: an index of all would take eight times the memory
+    # one after the other: an index of all would take eight times the memory
+    for byte in range(kind.itemsize):
         single_bytes[:, byte] = held[places + byte]
     return single_bytes.view(kind)[:, 0]
 
@@ -263,7 +315,9 @@ def _gathered(data: bytes, places: NDArray[np.int64], kind: np.dtype) -> NDArray
 def _table(
     data: bytes, at: int, element: Element, lengths: dict[str, int]
 ) -> tuple[Scalars, Lists, NDArray[np.int64]] | None:
-    """As ``_read_element``, at full speed, where all lists of a column have one length; None where they have not."""
+    """As ``_read_element``, at full speed, where all lists of a column have one length; None
+    where they have not.
+    """
     width = sum(column.kind.itemsize * lengths.get(column.name, 1) for column in element.properties)
     width += sum(column.count.itemsize for column in element.lists if column.count is not None)
     if at + element.rows * width > len(data):
@@ -281,14 +335,20 @@ def _table(
             return None
         at += column.count.itemsize
         size = column.kind.itemsize
-        held = np.ndarray((element.rows, length), column.kind, data, at if length else 0, (width, size))
+        held = np.ndarray(
+            (element.rows, length), column.kind, data, at if length else 0, (width, size)
+        )
         lists[column.name] = (held.reshape(-1), counts.astype(np.int64))
         at += size * length
     return scalars, lists, np.array(width)
 
 
-def _walk(data: bytes, at: int, element: Element, rows: int) -> tuple[dict[str, NDArray[np.int64]], NDArray[np.int64]]:
-    """Where each list of some rows starts, in bytes, and its length, (rows, 2) by column; and where each row ends."""
+def _walk(
+    data: bytes, at: int, element: Element, rows: int
+) -> tuple[dict[str, NDArray[np.int64]], NDArray[np.int64]]:
+    """Where each list of some rows starts, in bytes, and its length, (rows, 2) by column; and
+    where each row ends.
+    """
     steps = []
     skipped = 0
     for column in element.properties:
@@ -312,14 +372,18 @@ def _walk(data: bytes, at: int, element: Element, rows: int) -> tuple[dict[str, 
                 raise MeshError(f"the file is cut short in row {row:,} of element {element.name}")
             (length,) = count_at(data, at)
             if not 0 <= length <= len(data) or length != int(length):
-                raise MeshError(f"row {row:,} of element {element.name} announces a list of {length:g} numbers")
+                raise MeshError(
+                    f"row {row:,} of element {element.name} announces a list of {length:g} numbers"
+                )
             at += count_bytes
             found[row, which] = at, length
             at += int(length) * item_bytes
         at += skipped
         ends[row] = at
     if at > len(data):
-        raise MeshError(f"the file is cut short, the rows of its element {element.name} need more bytes")
+        raise MeshError(
+            f"the file is cut short, the rows of its element {element.name} need more bytes"
+        )
     return {column.name: found[:, which] for which, column in enumerate(element.lists)}, ends
 
 
@@ -335,13 +399,17 @@ def _vertices(columns: Scalars) -> NDArray[np.float64]:
 
 
 def _corners(element: str, lists: dict[str, Lists]) -> Corners:
-    """The vertices that the rows of an element name, one row after the other, and how many each row names."""
+    """The vertices that the rows of an element name, one row after the other, and how many each
+    row names.
+    """
     columns = lists.get(element, {})
     if not columns:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     name = next((name for name in CORNER_LISTS if name in columns), None)
     if name is None and len(columns) > 1:
-        raise MeshError(f"none of the lists of its element {element} is called {' or '.join(CORNER_LISTS)}")
+        raise MeshError(
+            f"none of the lists of its element {element} is called {' or '.join(CORNER_LISTS)}"
+        )
     named, sizes = columns[name or next(iter(columns))]
     with np.errstate(invalid="ignore"):
         corners = named.astype(np.int64)
@@ -351,18 +419,25 @@ def _corners(element: str, lists: dict[str, Lists]) -> Corners:
 
 
 def _strips(corners: NDArray[np.int64], sizes: NDArray[np.int64], max_faces: int) -> Corners:
-    """The triangles of strips: of each three vertices in a row, every second one wound the other way."""
-    check_faces(int(np.maximum(sizes - 2, 0).sum()) - 3 * int((corners == STRIP_END).sum()), max_faces)
+    """The triangles of strips: of each three vertices in a row, every second one wound the other
+    way.
+    """
+    check_faces(
+        int(np.maximum(sizes - 2, 0).sum()) - 3 * int((corners == STRIP_END).sum()), max_faces
+    )
     row = np.repeat(np.arange(len(sizes)), sizes)
     place = np.arange(len(corners))
     begins = np.diff(row, prepend=-1) > 0
     begins[1:] |= corners[:-1] == STRIP_END
-    odd = (place - np.maximum.accumulate(np.where(begins, place, 0)))[: max(len(place) - 2, 0)] % 2 == 1
+    odd = (place - np.maximum.accumulate(np.where(begins, place, 0)))[
+        : max(len(place) - 2, 0)
+    ] % 2 == 1
 
     threes = np.stack([corners[:-2], corners[1:-1], corners[2:]], 1)
     threes[odd] = threes[odd][:, [1, 0, 2]]
     whole = (row[:-2] == row[2:]) & (threes != STRIP_END).all(1)
-    distinct = (threes != np.roll(threes, 1, axis=1)).all(1)  # a strip turns by naming a vertex twice
+    # a strip turns by naming a vertex twice
+    distinct = (threes != np.roll(threes, 1, axis=1)).all(1)
     threes = threes[whole & distinct]
     return threes.reshape(-1), np.full(len(threes), 3)
 
@@ -370,10 +445,20 @@ def _strips(corners: NDArray[np.int64], sizes: NDArray[np.int64], max_faces: int
 def _say_what_it_is(elements: list[Element], n_vertices: int) -> None:
     """Raise a MeshError that tells what a file without faces holds, and what to do about it."""
     names = {element.name for element in elements}
-    columns = {column.name for element in elements if element.name == "vertex" for column in element.properties}
+    columns = {
+        column.name
+        for element in elements
+        if element.name == "vertex"
+        for column in element.properties
+    }
     if "range_grid" in names:
         one_side = "a range grid, which is one depth image: it shows the object from one side"
-        raise MeshError(f"it holds {one_side}; merge the grids of all sides to a mesh, or teach depth frames")
+        raise MeshError(
+            f"it holds {one_side}; merge the grids of all sides to a mesh, or teach depth frames"
+        )
     if "f_dc_0" in columns:
-        raise MeshError(f"it holds {n_vertices:,} Gaussian splats and no faces; export a mesh from the splats first")
+        raise MeshError(
+            f"it holds {n_vertices:,} Gaussian splats and no faces; export a mesh from the splats"
+            " first"
+        )
     raise MeshError(no_faces(n_vertices, {"nx", "ny", "nz"} <= columns))

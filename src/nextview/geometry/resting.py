@@ -15,7 +15,8 @@ LIKELY_POSE = 0.1  # resting poses less likely than this are left out
 MOST_POSES = 4  # and all but so many, the mesh's own among them
 SAME_TILT = np.radians(20)  # resting poses whose directions up are within this angle are one
 RARE_REST = 0.05  # this share of the throws, those into the rarest poses, is not looked at
-FLAT_SHEET = 1e-4  # thickness, object radii, below which an object is a sheet: it has two sides and no convex hull
+# thickness, object radii, below which an object is a sheet: it has two sides and no convex hull
+FLAT_SHEET = 1e-4
 
 # Of the comparison of an object with itself, turned. Distances are in object radii.
 SURFACE_POINTS = 20_000
@@ -41,16 +42,18 @@ class _Pose:
 def resting_poses(mesh: Mesh) -> NDArray[np.float64]:
     """Rotate a mesh into each of its likely resting poses.
 
-    A dropped object rests on a face of its convex hull, the likelier the larger it looks from the centre of mass
-    (Goldberg et al., "Part pose statistics", IJRR 1999, as in trimesh). The mesh's own pose is always among them. Poses
-    that look alike are one, and their shares of the throws are added: a can lies on its side in one way, whichever part
-    of the side is down, and a ball has one pose.
+    A dropped object rests on a face of its convex hull, the likelier the larger it looks from the
+    centre of mass (Goldberg et al., "Part pose statistics", IJRR 1999, as in trimesh). The mesh's
+    own pose is always among them. Poses that look alike are one, and their shares of the throws are
+    added: a can lies on its side in one way, whichever part of the side is down, and a ball has one
+    pose.
 
     Args:
         mesh: the object.
 
     Returns:
-        Rotations from the mesh's own axes into the poses, (P, 3, 3) float64, the likeliest first after the identity.
+        Rotations from the mesh's own axes into the poses, (P, 3, 3) float64, the likeliest first
+        after the identity.
     """
     ups, shares = _stable_poses(mesh)
     own, *others = _distinct_poses(mesh, ups, shares)
@@ -61,7 +64,9 @@ def resting_poses(mesh: Mesh) -> NDArray[np.float64]:
 
 
 def _stable_poses(mesh: Mesh) -> tuple[Vectors, Vectors]:
-    """The directions that point up when the mesh lies on each stable face, (N, 3), and their shares of throws, (N,)."""
+    """The directions that point up when the mesh lies on each stable face, (N, 3), and their
+    shares of throws, (N,).
+    """
     from trimesh import Trimesh
     from trimesh.poses import compute_stable_poses
 
@@ -70,14 +75,17 @@ def _stable_poses(mesh: Mesh) -> tuple[Vectors, Vectors]:
     if np.ptp(mesh.vertices @ normal) < FLAT_SHEET:
         return np.stack([normal, -normal]), np.array([0.5, 0.5])
 
-    # The outermost vertices in many directions are enough of the hull, and a fine mesh takes no minute.
+    # The outermost vertices in many directions are enough of the hull, and a fine mesh takes no
+    # minute.
     directions = np.concatenate([_DIRECTIONS, axes, -axes])
     outer = np.unique((directions @ mesh.vertices.T).argmax(1))
     try:
         hull = Trimesh(mesh.vertices[outer]).convex_hull
     except QhullError as error:
         reason = str(error).partition("\n")[0]
-        _log.warning("%s: has no convex hull (%s); it is taken to lie only as in its file", mesh.name, reason)
+        _log.warning(
+            "%s: has no convex hull (%s); it is taken to lie only as in its file", mesh.name, reason
+        )
         return np.zeros((0, 3)), np.zeros(0)
 
     transforms, shares = compute_stable_poses(hull, n_samples=1)
@@ -106,10 +114,14 @@ def _distinct_poses(mesh: Mesh, ups: Vectors, shares: Vectors) -> list[_Pose]:
 
 @dataclass(frozen=True)
 class _SelfComparison:
-    """Compares an object in one pose with itself in another."""
+    """Compares an object in one pose with itself in another.
+
+    Attributes:
+        few: points on the surface, (COMPARED_POINTS, 3).
+    """
 
     surface: cKDTree
-    few: Vectors  # points on the surface, (COMPARED_POINTS, 3)
+    few: Vectors
 
     @classmethod
     def of(cls, mesh: Mesh) -> "_SelfComparison":
@@ -120,7 +132,8 @@ class _SelfComparison:
     def look_alike(self, first_up: Vectors, second_up: Vectors) -> bool:
         """Whether a turn about the vertical makes the one pose look like the other.
 
-        The best of many turns is fitted closer by iterative closest points (Besl and McKay, PAMI 1992).
+        The best of many turns is fitted closer by iterative closest points (Besl and McKay, PAMI
+        1992).
         """
         from scipy.spatial.transform import Rotation
 
@@ -129,11 +142,13 @@ class _SelfComparison:
         moved = self.few @ turns.transpose(0, 2, 1)
         apart = np.asarray(self.surface.query(moved)[0])
         best = (apart**2).mean(1).argmin()
-        turn, points = turns[best], moved[best]
+        turn = turns[best]
+        points = moved[best]
 
         for _ in range(FITTING_ROUNDS):
             nearest = self.surface.data[self.surface.query(points)[1]]
-            centre, target = points.mean(0), nearest.mean(0)
+            centre = points.mean(0)
+            target = nearest.mean(0)
             closer = _best_rotation(points - centre, nearest - target)
             points = (points - centre) @ closer.T + target
             turn = closer @ turn
@@ -157,7 +172,9 @@ def _points_on(mesh: Mesh, count: int, rng: Generator) -> Vectors:
 
 
 def _best_rotation(points: Vectors, targets: Vectors) -> Vectors:
-    """The rotation, (3, 3), that brings centred points, (N, 3), nearest to as many targets (Kabsch, 1976)."""
+    """The rotation, (3, 3), that brings centred points, (N, 3), nearest to as many targets
+    (Kabsch, 1976).
+    """
     left, _, right = np.linalg.svd(points.T @ targets)
     no_mirror = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
     return (left @ no_mirror @ right).T

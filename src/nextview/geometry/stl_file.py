@@ -1,7 +1,8 @@
 """Read STL files, binary and text.
 
-Trimesh takes the words "vertex" and "endsolid" in a solid's name for the format's own, does not know "end solid",
-refuses bytes after a binary file's end, and logs a traceback where normals are missing.
+Trimesh takes the words "vertex" and "endsolid" in a solid's name for the format's own, does not
+know "end solid", refuses bytes after a binary file's end, and logs a traceback where normals are
+missing.
 """
 
 import re
@@ -14,21 +15,26 @@ from nextview.geometry.mesh_text import encoding_of, numbers, plain_text
 from nextview.geometry.triangles import MAX_FACES, check_faces, triangulate
 
 HEADER_BYTES = 84
-FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])  # 50 bytes
+# 50 bytes
+FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 # A line that begins or ends a solid; what follows is its name, which may be any text.
 SOLID_LINE = re.compile(rb"^[ \t]*(end[ \t]*)?solid\b[^\n]*", re.MULTILINE | re.IGNORECASE)
 LOOP_WORDS = re.compile(rb"\bvertex\s++(\S++\s++\S++\s++\S++)|\bendloop\b", re.IGNORECASE)
 
 
-def read_stl(data: bytes, max_faces: int = MAX_FACES) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def read_stl(
+    data: bytes, max_faces: int = MAX_FACES
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Read an STL file.
 
     Args:
-        data: the file's bytes. Which kind it is tells its length: many binary files begin with the word solid.
+        data: the file's bytes. Which kind it is tells its length: many binary files begin with the
+            word solid.
         max_faces: how many triangles there may be.
 
     Returns:
-        Vertices, (V, 3), and triangles, (F, 3). Every triangle has vertices of its own, as in the file.
+        Vertices, (V, 3), and triangles, (F, 3). Every triangle has vertices of its own, as in the
+        file.
 
     Raises:
         MeshError, ValueError: what is wrong with the file.
@@ -38,7 +44,9 @@ def read_stl(data: bytes, max_faces: int = MAX_FACES) -> tuple[NDArray[np.float6
     if len(data) != needed and _begins_as_text(data):
         return _read_text(plain_text(data), max_faces)
     if len(data) < max(needed, HEADER_BYTES):
-        raise MeshError(f"the file is cut short or damaged, {announced} faces do not take {len(data)} bytes")
+        raise MeshError(
+            f"the file is cut short or damaged, {announced} faces do not take {len(data)} bytes"
+        )
     held, rest = divmod(len(data) - HEADER_BYTES, FACET.itemsize)
     if held > announced and rest == 0:  # other bytes after the end are somebody's notes
         raise MeshError(f"it announces {announced} faces, but holds {held}")
@@ -50,7 +58,9 @@ def read_stl(data: bytes, max_faces: int = MAX_FACES) -> tuple[NDArray[np.float6
 
 
 def _begins_as_text(data: bytes) -> bool:
-    """Whether a file begins with the word solid, in any encoding, and without the zeros of a binary header."""
+    """Whether a file begins with the word solid, in any encoding, and without the zeros of a
+    binary header.
+    """
     encoding, mark = encoding_of(data)
     head = data[mark : mark + 4 * HEADER_BYTES].decode(encoding, "replace")[:HEADER_BYTES]
     return head.lstrip()[:5].lower() == "solid" and "\0" not in head
@@ -61,7 +71,8 @@ def _read_text(text: bytes, max_faces: int) -> tuple[NDArray[np.float64], NDArra
     ends = [bool(match[1]) for match in SOLID_LINE.finditer(text)]
     if 2 * sum(ends) != len(ends):
         raise MeshError("the file is cut short, endsolid is missing")
-    found = LOOP_WORDS.findall(SOLID_LINE.sub(b"", text))  # three numbers of each vertex, nothing at the end of a loop
+    # three numbers of each vertex, nothing at the end of a loop
+    found = LOOP_WORDS.findall(SOLID_LINE.sub(b"", text))
     loops = np.flatnonzero([not vertex for vertex in found])
     if len(found) and (len(loops) == 0 or loops[-1] != len(found) - 1):
         raise MeshError("the file is cut short, endloop is missing")

@@ -6,9 +6,12 @@ from numpy.typing import NDArray
 from nextview.errors import MeshError
 
 MAX_FACES = 10_000_000  # triangles that a mesh may have if nothing else is asked for
-CORNERS_AT_ONCE = 1 << 18  # of polygons that are tested together: the numbers stay in the processor's cache
-MAX_CUTTING_STEPS = 1e9  # sum of the squared numbers of corners of concave polygons; takes some ten seconds at most
-ROUNDING = 1e-9  # of a polygon's area: a triangle that lies the wrong way by less is as good as flat
+# of polygons that are tested together: the numbers stay in the processor's cache
+CORNERS_AT_ONCE = 1 << 18
+# sum of the squared numbers of corners of concave polygons; takes some ten seconds at most
+MAX_CUTTING_STEPS = 1e9
+# of a polygon's area: a triangle that lies the wrong way by less is as good as flat
+ROUNDING = 1e-9
 
 
 def check_faces(faces: int, max_faces: int) -> None:
@@ -22,7 +25,10 @@ def check_faces(faces: int, max_faces: int) -> None:
         MeshError: there are more.
     """
     if faces > max_faces:
-        raise MeshError(f"it has {faces:,} triangles, more than {max_faces:,}; --max-faces (max_faces) allows more")
+        raise MeshError(
+            f"it has {faces:,} triangles, more than {max_faces:,}; --max-faces (max_faces) allows"
+            " more"
+        )
 
 
 def no_faces(n_points: int, with_normals: bool = False) -> str:
@@ -33,7 +39,8 @@ def no_faces(n_points: int, with_normals: bool = False) -> str:
         with_normals: whether the file has their normals, too.
     """
     if with_normals:
-        what, how = f"{n_points:,} points with normals and no faces", "MeshLab's Screened Poisson reconstruction"
+        what = f"{n_points:,} points with normals and no faces"
+        how = "MeshLab's Screened Poisson reconstruction"
     else:
         what = f"{n_points:,} points and no faces"
         how = "MeshLab's Compute Normals for Point Sets, then Screened Poisson reconstruction"
@@ -48,12 +55,14 @@ def triangulate(
 ) -> NDArray[np.int64]:
     """Cut polygons into triangles, in the order of the polygons.
 
-    A polygon becomes a fan from its first corner where the fan covers it exactly, as it does every convex polygon. Any
-    other one, seen along its normal, is cut by ear clipping (mapbox_earcut). The triangles are wound as the polygon is.
+    A polygon becomes a fan from its first corner where the fan covers it exactly, as it does every
+    convex polygon. Any other one, seen along its normal, is cut by ear clipping (mapbox_earcut).
+    The triangles are wound as the polygon is.
 
     Args:
         vertices: (V, 3) positions.
-        corners: (C,) indices into the vertices: the corners of the first polygon, then those of the second, ...
+        corners: (C,) indices into the vertices: the corners of the first polygon, then those of the
+            second, ...
         sizes: (N,) how many corners each polygon has. One with less than three makes no triangle.
         max_faces: how many triangles there may be.
 
@@ -61,14 +70,17 @@ def triangulate(
         (F, 3) int64, indices into the vertices.
 
     Raises:
-        MeshError: a corner is no vertex, there are too many triangles, or cutting the polygons would take too long.
+        MeshError: a corner is no vertex, there are too many triangles, or cutting the polygons
+            would take too long.
     """
     counts = np.maximum(sizes - 2, 0)
     check_faces(int(counts.sum()), max_faces)
 
     if len(corners) and (corners.min() < 0 or corners.max() >= len(vertices)):
         worst = int(corners.min() if corners.min() < 0 else corners.max())
-        raise MeshError(f"a face refers to vertex {worst}, but there are only {len(vertices)} vertices")
+        raise MeshError(
+            f"a face refers to vertex {worst}, but there are only {len(vertices)} vertices"
+        )
     if (sizes == 3).all():
         return corners.reshape(-1, 3)
 
@@ -79,7 +91,12 @@ def triangulate(
     for size, same in _polygons_by_size(sizes):
         polygons = corners[starts[same, None] + np.arange(size)]
         fans = np.stack(
-            [np.broadcast_to(polygons[:, :1], (len(same), size - 2)), polygons[:, 1:-1], polygons[:, 2:]], 2
+            [
+                np.broadcast_to(polygons[:, :1], (len(same), size - 2)),
+                polygons[:, 1:-1],
+                polygons[:, 2:],
+            ],
+            2,
         )
         faces[places[same, None] + np.arange(size - 2)] = fans
         if size > 3:
@@ -88,7 +105,10 @@ def triangulate(
     steps = float((sizes[concave].astype(float) ** 2).sum())
     if steps > MAX_CUTTING_STEPS:
         largest = int(sizes[concave].max())
-        raise MeshError(f"its concave faces, of up to {largest:,} corners, take too long to cut; export triangles")
+        raise MeshError(
+            f"its concave faces, of up to {largest:,} corners, take too long to cut; export"
+            " triangles"
+        )
 
     kept = np.ones(len(faces), bool)
     for which in concave:
@@ -102,7 +122,9 @@ def triangulate(
 
 
 def _polygons_by_size(sizes: NDArray[np.int64]) -> list[tuple[int, NDArray[np.int64]]]:
-    """Polygons with one number of corners, three or more, and their indices; many of them are in several groups."""
+    """Polygons with one number of corners, three or more, and their indices; many of them are in
+    several groups.
+    """
     order = np.argsort(sizes, kind="stable")
     bounds = np.flatnonzero(np.diff(sizes[order])) + 1
     groups: list[tuple[int, NDArray[np.int64]]] = []
@@ -118,8 +140,8 @@ def _polygons_by_size(sizes: NDArray[np.int64]) -> list[tuple[int, NDArray[np.in
 def _fan_is_right(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether the fan from the first corner covers each of some polygons, (N, K, 3), exactly, (N,).
 
-    It does if no triangle of the fan lies the other way than the polygon. A polygon whose triangles cancel each other
-    out has no such way.
+    It does if no triangle of the fan lies the other way than the polygon. A polygon whose triangles
+    cancel each other out has no such way.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         spokes = points[:, 1:] - points[:, :1]
@@ -134,7 +156,9 @@ def _fan_is_right(points: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _clip_ears(points: NDArray[np.float64]) -> NDArray[np.int64] | None:
-    """Triangles of one polygon, (K, 3), as indices of its corners, (T, 3); None if it has no area to be cut."""
+    """Triangles of one polygon, (K, 3), as indices of its corners, (T, 3); None if it has no
+    area to be cut.
+    """
     from mapbox_earcut import triangulate_float64
 
     with np.errstate(over="ignore", invalid="ignore"):
@@ -145,12 +169,15 @@ def _clip_ears(points: NDArray[np.float64]) -> NDArray[np.int64] | None:
 
     points = points / extent
     normal = np.cross(points[1:-1], points[2:]).sum(0)
-    if np.abs(normal).max() < ROUNDING:  # its parts cancel each other out, as in a bow tie: the plane that fits it best
+    # its parts cancel each other out, as in a bow tie: the plane that fits it best
+    if np.abs(normal).max() < ROUNDING:
         normal = np.linalg.svd(points - points.mean(0))[2][2]
     axis = int(np.abs(normal).argmax())
     # Seen along an axis instead of the normal, a polygon is sheared: what overlaps does not change.
     flat = np.ascontiguousarray(points[:, [(axis + 1) % 3, (axis + 2) % 3]])
-    triangles = triangulate_float64(flat, np.array([len(flat)], np.uint32)).astype(np.int64).reshape(-1, 3)
+    triangles = (
+        triangulate_float64(flat, np.array([len(flat)], np.uint32)).astype(np.int64).reshape(-1, 3)
+    )
     if len(triangles) == 0:
         return None
 

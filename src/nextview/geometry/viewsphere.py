@@ -1,8 +1,9 @@
-"""Candidate viewpoints around an object: where they are, which are neighbours, what it costs to move.
+"""Candidate viewpoints around an object: where they are, which are neighbours, what it costs to
+move.
 
-The world is z up, the object sits at the origin inside the unit sphere, and every viewpoint looks at the origin.
-On a ``ViewSphere`` they lie on rings of equal elevation, evenly spaced in azimuth; ``view = ring * azimuths +
-azimuth_index``. ``Directions`` lie anywhere.
+The world is z up, the object sits at the origin inside the unit sphere, and every viewpoint looks
+at the origin. On a ``ViewSphere`` they lie on rings of equal elevation, evenly spaced in azimuth;
+``view = ring * azimuths + azimuth_index``. ``Directions`` lie anywhere.
 """
 
 import re
@@ -19,9 +20,12 @@ from nextview.errors import UsageError
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 DISTANCE = 3.0  # distance of the camera from the object's centre, in object radii
-CELL = np.radians((18.0, 45.0))  # elevation and azimuth of a cell, in which travel off any grid is counted
-MOST = 5_000  # viewpoints that there may be: distances between all of them are kept, 200 MB at this number
-SNAP = 1e-6  # radians within which a camera stands at a candidate. What is more is a place of its own
+# elevation and azimuth of a cell, in which travel off any grid is counted
+CELL = np.radians((18.0, 45.0))
+# viewpoints that there may be: distances between all of them are kept, 200 MB at this number
+MOST = 5_000
+# radians within which a camera stands at a candidate. What is more is a place of its own
+SNAP = 1e-6
 
 
 def rotation_z(angle: float) -> Float:
@@ -32,29 +36,43 @@ def rotation_z(angle: float) -> Float:
 
 
 def look_at_origin(elevation: ArrayLike, azimuth: ArrayLike, distance: float = DISTANCE) -> Float:
-    """Camera-to-world poses, (..., 4, 4) float64, of cameras that look at the origin with the horizon level.
+    """Camera-to-world poses, (..., 4, 4) float64, of cameras that look at the origin with the
+    horizon level.
 
-    Camera axes are OpenCV's: x right, y down, z forward. Elevation above the horizontal plane and azimuth about +z,
-    counter-clockwise from +x, are radians, (...); the distance is from the origin, object radii.
+    Camera axes are OpenCV's: x right, y down, z forward. Elevation above the horizontal plane and
+    azimuth about +z, counter-clockwise from +x, are radians, (...); the distance is from the
+    origin, object radii.
     """
-    elevation, azimuth = np.broadcast_arrays(np.asarray(elevation, float), np.asarray(azimuth, float))
-    ce, se, ca, sa = np.cos(elevation), np.sin(elevation), np.cos(azimuth), np.sin(azimuth)
+    elevation, azimuth = np.broadcast_arrays(
+        np.asarray(elevation, float), np.asarray(azimuth, float)
+    )
+    ce = np.cos(elevation)
+    se = np.sin(elevation)
+    ca = np.cos(azimuth)
+    sa = np.sin(azimuth)
     outward = np.stack([ce * ca, ce * sa, se], -1)
     right = np.stack([-sa, ca, np.zeros_like(sa)], -1)
     pose = np.zeros((*elevation.shape, 4, 4))
-    pose[..., :3, :] = np.stack([right, np.cross(-outward, right), -outward, distance * outward], -1)
+    pose[..., :3, :] = np.stack(
+        [right, np.cross(-outward, right), -outward, distance * outward], -1
+    )
     pose[..., 3, 3] = 1.0
     return pose
 
 
 def level_pose(direction: Float, distance: float = DISTANCE) -> Float:
-    """The level pose of a camera in some direction from the origin, (3,), that looks at it, (4, 4)."""
+    """The level pose of a camera in some direction from the origin, (3,), that looks at it, (4,
+    4).
+    """
     return look_at_origin(elevation_of(direction), azimuth_of(direction), distance)
 
 
 def great_circle(a: Float, b: Float, n: int = 25) -> Float:
-    """Unit vectors from one to another, (3,) each, on the circle through both, (n, 3); opposite ones over the top."""
-    angle, side = angle_between(a, b), b - (a @ b) * a
+    """Unit vectors from one to another, (3,) each, on the circle through both, (n, 3); opposite
+    ones over the top.
+    """
+    angle = angle_between(a, b)
+    side = b - (a @ b) * a
     for up in np.eye(3)[[2, 0]]:
         side = side if np.linalg.norm(side) > SNAP else up - (up @ a) * a
     turned = np.linspace(0, angle, n)[:, None]
@@ -68,7 +86,8 @@ def _fixed(array: NDArray) -> NDArray:
 
 def angle_between(a: Float, b: Float) -> Float:
     """Great-circle angle between unit vectors, (..., 3) each, radians, (...)."""
-    # arctan2 keeps its precision for equal and for opposite directions, where arccos loses half the digits.
+    # arctan2 keeps its precision for equal and for opposite directions, where arccos loses half the
+    # digits.
     return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1))
 
 
@@ -83,9 +102,11 @@ def azimuth_of(directions: Float) -> Float:
 
 
 def direction_of(pose: Float) -> Float:
-    """Unit vector from the origin towards a camera, (3,); pose camera-to-world, (4, 4), object frame.
+    """Unit vector from the origin towards a camera, (3,); pose camera-to-world, (4, 4), object
+    frame.
 
-    Straight above the origin the azimuth is that from which a level camera would see the same picture.
+    Straight above the origin the azimuth is that from which a level camera would see the same
+    picture.
     """
     position = pose[:3, 3]
     outward = position / np.linalg.norm(position) if position.any() else -pose[:3, 2]
@@ -96,7 +117,10 @@ def direction_of(pose: Float) -> Float:
 
 
 class Viewpoints:
-    """Candidate viewpoints, V of them: what ``ViewSphere`` and ``Directions`` have in common. Arrays are read-only."""
+    """Candidate viewpoints, V of them: what ``ViewSphere`` and ``Directions`` have in common.
+
+    Arrays are read-only.
+    """
 
     distance: float
     directions: Float
@@ -134,11 +158,15 @@ class Viewpoints:
         return _fixed(self.travel_between(self.directions[:, None], self.directions[None, :]))
 
     def cells(self, directions: Float) -> tuple[Float, Float]:
-        """Where directions, (..., 3), lie on the grid whose cells travel is counted in: row and column, (...) each."""
+        """Where directions, (..., 3), lie on the grid whose cells travel is counted in: row and
+        column, (...) each.
+        """
         return elevation_of(directions) / CELL[0], azimuth_of(directions) / CELL[1]
 
     def travel_between(self, a: Float, b: Float) -> Float:
-        """Distance between any directions, (..., 3) each, in grid cells: Euclidean over row and column, (...)."""
+        """Distance between any directions, (..., 3) each, in grid cells: Euclidean over row and
+        column, (...).
+        """
         (row_a, column_a), (row_b, column_b) = self.cells(a), self.cells(b)
         steps = np.abs(column_a - column_b)
         return np.hypot(row_a - row_b, np.minimum(steps, self.columns - steps))
@@ -181,9 +209,12 @@ class Directions(Viewpoints):
 
     @classmethod
     def fibonacci(cls, n: int) -> "Directions":
-        """n views spread evenly over the upper half (Fibonacci lattice; Swinbank and Purser, QJRMS 132, 2006)."""
+        """n views spread evenly over the upper half (Fibonacci lattice; Swinbank and Purser,
+        QJRMS 132, 2006).
+        """
         whole(n, "the number of viewpoints", 1, MOST)
-        height, azimuth = (np.arange(n) + 0.5) / n, np.arange(n) * np.pi * (3 - np.sqrt(5))
+        height = (np.arange(n) + 0.5) / n
+        azimuth = np.arange(n) * np.pi * (3 - np.sqrt(5))
         flat = np.sqrt(1 - height**2)
         return cls(np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], 1))
 
@@ -217,9 +248,13 @@ class ViewSphere(Viewpoints):
 
     @classmethod
     def named(cls, name: str) -> "ViewSphere":
-        """The thesis's layouts: "40" (5 rings of 8, section 4.1.1) and "12" (one ring at 45 degrees)."""
+        """The thesis's layouts: "40" (5 rings of 8, section 4.1.1) and "12" (one ring at 45
+        degrees).
+        """
         if name not in LAYOUTS:
-            raise UsageError(f"no view sphere is called {one_line(repr(name))}; there are {', '.join(LAYOUTS)}")
+            raise UsageError(
+                f"no view sphere is called {one_line(repr(name))}; there are {', '.join(LAYOUTS)}"
+            )
         return LAYOUTS[name]
 
     def __len__(self) -> int:
@@ -251,12 +286,16 @@ class ViewSphere(Viewpoints):
 
     def angles(self, view: int) -> tuple[float, float]:
         """(elevation, azimuth) of a view, degrees."""
-        return self.elevations[self.ring[view]], 360.0 * int(self.azimuth_index[view]) / self.azimuths
+        return self.elevations[self.ring[view]], 360.0 * int(
+            self.azimuth_index[view]
+        ) / self.azimuths
 
     @cached_property
     def poses(self) -> Float:
         """Camera-to-world pose of each view, shape (V, 4, 4), float64, OpenCV camera axes."""
-        return _fixed(look_at_origin(np.radians(self.elevations)[self.ring], self.azimuth, self.distance))
+        return _fixed(
+            look_at_origin(np.radians(self.elevations)[self.ring], self.azimuth, self.distance)
+        )
 
     @cached_property
     def directions(self) -> Float:  # type: ignore[override]
@@ -265,19 +304,25 @@ class ViewSphere(Viewpoints):
 
     @cached_property
     def windows(self) -> Index:
-        """Views around each view: all rings x azimuth -1, 0, +1 with wrap-around, shape (V, rings, 3), int64."""
+        """Views around each view: all rings x azimuth -1, 0, +1 with wrap-around, shape (V,
+        rings, 3), int64.
+        """
         columns = (self.azimuth_index[:, None] + np.array([-1, 0, 1])) % self.azimuths
         return _fixed(np.arange(self.rings)[None, :, None] * self.azimuths + columns[:, None, :])
 
     @cached_property
     def travel(self) -> Float:
-        """Distance between views in grid cells (Euclidean over ring and azimuth, table 9), shape (V, V), float64."""
+        """Distance between views in grid cells (Euclidean over ring and azimuth, table 9), shape
+        (V, V), float64.
+        """
         rings = self.ring[:, None] - self.ring[None, :]
         steps = np.abs(self.azimuth_index[:, None] - self.azimuth_index[None, :])
         return _fixed(np.hypot(rings, np.minimum(steps, self.azimuths - steps)))
 
     def cells(self, directions: Float) -> tuple[Float, Float]:
-        """Ring and azimuth step at which directions lie, between those of the views; beyond the last ring, at it."""
+        """Ring and azimuth step at which directions lie, between those of the views; beyond the
+        last ring, at it.
+        """
         order = np.argsort(self.elevations, kind="stable")
         rings = np.interp(elevation_of(directions), np.radians(self.elevations)[order], order)
         return rings, azimuth_of(directions) / (2 * np.pi) * self.azimuths
@@ -297,9 +342,10 @@ LAYOUTS = {
 def viewpoints_of(what: str | Viewpoints | Any) -> Viewpoints:
     """A layout of candidate viewpoints; UsageError if it is none.
 
-    "40" or "12", the thesis's; "rings:0,30,60x12", elevations in degrees by views on each ring; "fibonacci:60", so many
-    spread evenly over the upper half; directions from the object, (V, 3), or poses of cameras in the object frame, (V,
-    4, 4), of which only the directions count; or such a layout itself.
+    "40" or "12", the thesis's; "rings:0,30,60x12", elevations in degrees by views on each ring;
+    "fibonacci:60", so many spread evenly over the upper half; directions from the object, (V, 3),
+    or poses of cameras in the object frame, (V, 4, 4), of which only the directions count; or such
+    a layout itself.
     """
     if isinstance(what, Viewpoints):
         return what
@@ -307,13 +353,19 @@ def viewpoints_of(what: str | Viewpoints | Any) -> Viewpoints:
         try:
             given = np.asarray(what, np.float64)
         except (TypeError, ValueError):
-            raise UsageError("viewpoints are a name, directions (V, 3) or poses (V, 4, 4)") from None
-        return Directions(given[:, :3, 3] if given.ndim == 3 and given.shape[1:] == (4, 4) else given)
+            raise UsageError(
+                "viewpoints are a name, directions (V, 3) or poses (V, 4, 4)"
+            ) from None
+        return Directions(
+            given[:, :3, 3] if given.ndim == 3 and given.shape[1:] == (4, 4) else given
+        )
     if fibonacci := re.fullmatch(r"fibonacci:(\d{1,5})", what):
         return Directions.fibonacci(int(fibonacci[1]))
     if rings := re.fullmatch(r"rings:(-?\d+(?:\.\d+)?(?:,-?\d+(?:\.\d+)?)*)x(\d{1,4})", what):
         return ViewSphere(tuple(map(float, rings[1].split(","))), int(rings[2]))
     if what not in LAYOUTS:
         others = "rings:ELEVATIONSxAZIMUTHS such as rings:0,30,60x12, and fibonacci:N"
-        raise UsageError(f"no viewpoints are called {what!r}; there are {', '.join(LAYOUTS)}, {others}")
+        raise UsageError(
+            f"no viewpoints are called {what!r}; there are {', '.join(LAYOUTS)}, {others}"
+        )
     return LAYOUTS[what]

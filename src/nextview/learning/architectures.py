@@ -1,4 +1,6 @@
-"""The networks: ResNet with torchvision's parameter names, PointNet with its two transforms, and a ResNet of maps."""
+"""The networks: ResNet with torchvision's parameter names, PointNet with its two transforms, and
+a ResNet of maps.
+"""
 
 from nextview.checks import extras
 from nextview.geometry.viewsphere import ViewSphere
@@ -10,7 +12,8 @@ with extras():
     from torch import Tensor, nn
     from torch.nn import functional as F
 
-STAGES = (  # expansion, width, kernel, stride and blocks (Tan and Le, EfficientNet, ICML 2019, table 1)
+# expansion, width, kernel, stride and blocks (Tan and Le, EfficientNet, ICML 2019, table 1)
+STAGES = (
     (1, 16, 3, 1, 1),
     (6, 24, 3, 2, 2),
     (6, 40, 5, 2, 2),
@@ -37,15 +40,21 @@ class Depthwise(nn.Conv2d):
 class InvertedBottleneck(nn.Module):
     """Widen, filter each channel, narrow; with a shortcut where nothing changes its shape."""
 
-    def __init__(self, inputs: int, expansion: int, width: int, kernel: int, stride: int, skip: float = 0.0) -> None:
+    def __init__(
+        self, inputs: int, expansion: int, width: int, kernel: int, stride: int, skip: float = 0.0
+    ) -> None:
         super().__init__()
         wide = inputs * expansion
         self.expand = nn.Conv2d(inputs, wide, 1, bias=False) if expansion > 1 else nn.Identity()
         self.norm0 = _norm(wide) if expansion > 1 else nn.Identity()
-        self.depthwise, self.norm1 = Depthwise(wide, kernel, stride), _norm(wide)
-        self.project, self.norm2 = nn.Conv2d(wide, width, 1, bias=False), _norm(width)
-        self.relu, self.expands = nn.ReLU6(inplace=True), expansion > 1
-        self.has_shortcut, self.skip = stride == 1 and inputs == width, skip
+        self.depthwise = Depthwise(wide, kernel, stride)
+        self.norm1 = _norm(wide)
+        self.project = nn.Conv2d(wide, width, 1, bias=False)
+        self.norm2 = _norm(width)
+        self.relu = nn.ReLU6(inplace=True)
+        self.expands = expansion > 1
+        self.has_shortcut = stride == 1 and inputs == width
+        self.skip = skip
 
     def forward(self, x: Tensor) -> Tensor:
         past = x
@@ -63,7 +72,8 @@ class InvertedBottleneck(nn.Module):
 class RecogniserNetwork(nn.Module):
     """Images (B, channels, H, W) in 0 .. 1 to the logits (B, classes), in a tuple.
 
-    With ``azimuths``, also the log-likelihoods of so many azimuth bins given each class, (B, classes, azimuths).
+    With ``azimuths``, also the log-likelihoods of so many azimuth bins given each class, (B,
+    classes, azimuths).
     """
 
     dropout = 0.0
@@ -91,22 +101,30 @@ class RecogniserNetwork(nn.Module):
 
 
 class LiteNet(RecogniserNetwork):
-    """EfficientNet-Lite0: EfficientNet-B0 without squeeze and excitation, with ReLU6 for swish (TensorFlow, 2020)."""
+    """EfficientNet-Lite0: EfficientNet-B0 without squeeze and excitation, with ReLU6 for swish
+    (TensorFlow, 2020).
+    """
 
     name = "EfficientNet-Lite0"
 
-    def __init__(self, classes: int, channels: int, azimuths: int = 0, dropout: float = 0.0) -> None:
+    def __init__(
+        self, classes: int, channels: int, azimuths: int = 0, dropout: float = 0.0
+    ) -> None:
         super().__init__()
-        self.dropout, inputs = dropout, 32
-        self.stem, self.norm0 = nn.Conv2d(channels, inputs, 3, 2, 1, bias=False), _norm(inputs)
+        self.dropout = dropout
+        inputs = 32
+        self.stem = nn.Conv2d(channels, inputs, 3, 2, 1, bias=False)
+        self.norm0 = _norm(inputs)
         stages: list[nn.Module] = []
         for expansion, width, kernel, stride, length in STAGES:
             for index in range(length):
-                step, skip = 1 if index else stride, dropout * len(stages) / BLOCKS
+                step = 1 if index else stride
+                skip = dropout * len(stages) / BLOCKS
                 stages.append(InvertedBottleneck(inputs, expansion, width, kernel, step, skip))
                 inputs = width
         self.stages = nn.Sequential(*stages)
-        self.head, self.norm1 = nn.Conv2d(inputs, FEATURES, 1, bias=False), _norm(FEATURES)
+        self.head = nn.Conv2d(inputs, FEATURES, 1, bias=False)
+        self.norm1 = _norm(FEATURES)
         self.relu = nn.ReLU6(inplace=True)
         self.finish(FEATURES, classes, azimuths)
 
@@ -120,27 +138,41 @@ def _norm(width: int) -> nn.BatchNorm2d:
     return nn.BatchNorm2d(width, eps=1e-3)  # EfficientNet's epsilon: checkpoints count on it
 
 
-RESNETS = {18: (2, 2, 2, 2), 34: (3, 4, 6, 3), 50: (3, 4, 6, 3), 101: (3, 4, 23, 3), 152: (3, 8, 36, 3)}
+RESNETS = {
+    18: (2, 2, 2, 2),
+    34: (3, 4, 6, 3),
+    50: (3, 4, 6, 3),
+    101: (3, 4, 23, 3),
+    152: (3, 8, 36, 3),
+}
 """Blocks in the four stages of each ResNet (He et al., CVPR 2016, table 1)."""
 
 
 class Residual(nn.Module):
-    """A shortcut around two 3x3 convolutions; or, ``narrow``, around 1x1, 3x3 with the stride, and 1x1."""
+    """A shortcut around two 3x3 convolutions; or, ``narrow``, around 1x1, 3x3 with the stride,
+    and 1x1.
+    """
 
     def __init__(self, inputs: int, width: int, stride: int, narrow: bool) -> None:
         super().__init__()
-        self.relu, outputs = nn.ReLU(inplace=True), width * (4 if narrow else 1)
+        self.relu = nn.ReLU(inplace=True)
+        outputs = width * (4 if narrow else 1)
         kernels = [(3, width, stride), (3, width, 1)]
         if narrow:
             kernels = [(1, width, 1), (3, width, stride), (1, outputs, 1)]
-        self.length, before = len(kernels), inputs
+        self.length = len(kernels)
+        before = inputs
         for k, (kernel, after, step) in enumerate(kernels, 1):
-            self.add_module(f"conv{k}", nn.Conv2d(before, after, kernel, step, kernel // 2, bias=False))
+            self.add_module(
+                f"conv{k}", nn.Conv2d(before, after, kernel, step, kernel // 2, bias=False)
+            )
             self.add_module(f"bn{k}", nn.BatchNorm2d(after))
             before = after
         self.downsample = None
         if stride > 1 or inputs != outputs:
-            self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
+            self.downsample = nn.Sequential(
+                nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs)
+            )
 
     def forward(self, x: Tensor) -> Tensor:
         past = x if self.downsample is None else self.downsample(x)
@@ -155,9 +187,12 @@ class ResNet(RecogniserNetwork):
 
     def __init__(self, depth: int, classes: int, channels: int, azimuths: int = 0) -> None:
         super().__init__()
-        self.name, narrow = f"ResNet-{depth}", depth >= 50
+        self.name = f"ResNet-{depth}"
+        narrow = depth >= 50
         self.conv1 = nn.Conv2d(channels, 64, 7, 2, 3, bias=False)
-        self.bn1, self.relu, self.maxpool = nn.BatchNorm2d(64), nn.ReLU(inplace=True), nn.MaxPool2d(3, 2, 1)
+        self.bn1 = nn.BatchNorm2d(64)
+        self.relu = nn.ReLU(inplace=True)
+        self.maxpool = nn.MaxPool2d(3, 2, 1)
         inputs = 64
         for stage, length in enumerate(RESNETS[depth]):
             layer = []
@@ -166,7 +201,8 @@ class ResNet(RecogniserNetwork):
                 inputs = (64 << stage) * (4 if narrow else 1)
             setattr(self, f"layer{stage + 1}", nn.Sequential(*layer))
         self.finish(inputs, classes, azimuths)
-        for module in self.modules():  # each block begins as the identity, which steadies large rates
+        # each block begins as the identity, which steadies large rates
+        for module in self.modules():
             if isinstance(module, Residual):
                 nn.init.zeros_(getattr(module, f"bn{module.length}").weight)
 
@@ -188,16 +224,21 @@ def recogniser_network(recipe: RecogniserRecipe, classes: int, azimuths: int) ->
 
 def _dense(between: tuple[nn.Module, ...]) -> nn.Sequential:
     """The fully connected layers after the points of a cloud are pooled."""
-    first, second = (nn.Linear(1024, 512), nn.BatchNorm1d(512)), (nn.Linear(512, 256), *between, nn.BatchNorm1d(256))
+    first = (nn.Linear(1024, 512), nn.BatchNorm1d(512))
+    second = (nn.Linear(512, 256), *between, nn.BatchNorm1d(256))
     return nn.Sequential(*first, nn.ReLU(inplace=True), *second, nn.ReLU(inplace=True))
 
 
 class PointLayer(nn.Module):
-    """The same fully connected layer, with batch norm over all points, for every point of clouds (B, P, inputs)."""
+    """The same fully connected layer, with batch norm over all points, for every point of clouds
+    (B, P, inputs).
+    """
 
     def __init__(self, inputs: int, outputs: int, relu: bool = True) -> None:
         super().__init__()
-        self.linear, self.norm, self.relu = nn.Linear(inputs, outputs), nn.BatchNorm1d(outputs), relu
+        self.linear = nn.Linear(inputs, outputs)
+        self.norm = nn.BatchNorm1d(outputs)
+        self.relu = relu
 
     def forward(self, x: Tensor) -> Tensor:
         x = self.norm(self.linear(x).flatten(0, 1)).unflatten(0, x.shape[:2])
@@ -205,7 +246,9 @@ class PointLayer(nn.Module):
 
 
 class Transform(nn.Module):
-    """T-Net: a k x k matrix from a cloud of k-dimensional points (B, P, k), beginning as the identity."""
+    """T-Net: a k x k matrix from a cloud of k-dimensional points (B, P, k), beginning as the
+    identity.
+    """
 
     def __init__(self, k: int) -> None:
         super().__init__()
@@ -222,12 +265,16 @@ class Transform(nn.Module):
 
 
 class PointNet(nn.Module):
-    """PointNet (Qi et al., CVPR 2017) that predicts a map (rings x columns) from a cloud (B, P, 3) in [0, 1]."""
+    """PointNet (Qi et al., CVPR 2017) that predicts a map (rings x columns) from a cloud (B, P,
+    3) in [0, 1].
+    """
 
     def __init__(self, rings: int, columns: int = 3, dropout: float = 0.3) -> None:
         super().__init__()
-        self.input_transform, self.first = Transform(3), PointLayer(3, 64)
-        self.feature_transform, self.second = Transform(64), PointLayer(64, 128)
+        self.input_transform = Transform(3)
+        self.first = PointLayer(3, 64)
+        self.feature_transform = Transform(64)
+        self.second = PointLayer(64, 128)
         self.third = PointLayer(128, 1024, relu=False)
         self.head = _dense((nn.Dropout(dropout),)).append(nn.Linear(256, rings * columns))
         # A ReLU whose input begins below zero stays dead: begin inside the range of the targets.
@@ -243,11 +290,14 @@ class PointNet(nn.Module):
 
 
 class ViewMap(nn.Module):
-    """A ResNet that predicts a map of rings x columns values in 0 .. 1 from a view, (B, channels, H, W) in 0 .. 1."""
+    """A ResNet that predicts a map of rings x columns values in 0 .. 1 from a view, (B,
+    channels, H, W) in 0 .. 1.
+    """
 
     def __init__(self, rings: int, columns: int, depth: int, channels: int) -> None:
         super().__init__()
-        self.resnet, self.shape = ResNet(depth, rings * columns, channels), (rings, columns)
+        self.resnet = ResNet(depth, rings * columns, channels)
+        self.shape = (rings, columns)
 
     def forward(self, view: Tensor) -> tuple[Tensor]:
         return (self.resnet(view)[0].sigmoid().unflatten(1, self.shape),)
@@ -268,6 +318,8 @@ def map_columns(recipe: MapRecipe, sphere: ViewSphere) -> list[int]:
 
 
 def orthogonality(matrix: Tensor) -> Tensor:
-    """How far matrices (B, k, k) are from orthogonal: mean Frobenius norm of I - A A^T (thesis, equation 2)."""
+    """How far matrices (B, k, k) are from orthogonal: mean Frobenius norm of I - A A^T (thesis,
+    equation 2).
+    """
     gram = torch.bmm(matrix, matrix.transpose(1, 2))
     return (gram - torch.eye(matrix.shape[1], device=matrix.device)).flatten(1).norm(dim=1).mean()

@@ -1,4 +1,6 @@
-"""What is fitted into a card from held-out predictions: calibration and promised error rates, sizes, valleys."""
+"""What is fitted into a card from held-out predictions: calibration and promised error rates,
+sizes, valleys.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,12 +22,20 @@ from nextview.learning.fitting_set import blind_walks, card_to_fit, for_fitting,
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.baselines import Random, RandomAll
 from nextview.policies.maps import MapPeak
-from nextview.recognition.belief import PLAIN_SUM, Calibration, RiskBounds, SizeEvidence, fuse, of_true_class
+from nextview.recognition.belief import (
+    PLAIN_SUM,
+    Calibration,
+    RiskBounds,
+    SizeEvidence,
+    fuse,
+    of_true_class,
+)
 from nextview.recognition.model_card import ModelCard
 
 Float = NDArray[np.float64]
 Floats = NDArray[np.floating]
-THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())  # of promised error rates
+# of promised error rates
+THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())
 
 
 @dataclass(frozen=True)
@@ -39,17 +49,26 @@ class FittedCalibration:
 
 
 def fit_calibration(
-    predictions: Path,  # of the training split (nextview predict --held-out, or --split train)
-    card: Path,  # of the recogniser; "calibration" is written into it. Fitted to the objects that it calls held out
-    # predictions of the same objects through sensors (nextview render --sensor mix), fitted to as well
+    predictions: Path,
+    card: Path,
     sensed: tuple[Path, ...] = (),
-    delta: float = 0.1,  # how often a promised error rate may not hold
-    seed: int = 0,  # decides the walks over which is fitted
+    delta: float = 0.1,
+    seed: int = 0,
 ) -> FittedCalibration:
-    """Calibrate a recogniser: how far to trust the sum of several views, and which error rates can be promised.
+    """Calibrate a recogniser: how far to trust the sum of several views, and which error rates can
+    be promised.
 
-    Both go into its card; nextview predict takes them into predictions made before, without predicting again. The size
-    of the objects is not used.
+    Both go into its card; nextview predict takes them into predictions made before, without
+    predicting again. The size of the objects is not used.
+
+    Args:
+        predictions: of the training split (nextview predict --held-out, or --split train).
+        card: of the recogniser; "calibration" is written into it. Fitted to the objects that it
+            calls held out.
+        sensed: predictions of the same objects through sensors (nextview render --sensor mix),
+            fitted to as well.
+        delta: how often a promised error rate may not hold.
+        seed: decides the walks over which is fitted.
     """
     if not 0 < number(delta, "--delta") < 1:
         raise UsageError(f"delta is a probability between 0 and 1, not {delta}")
@@ -65,7 +84,10 @@ def fit_calibration(
         about = f"{len(table)} objects of the training split, classes weighted evenly"
         about += ", clean and through sensors" * bool(sensed)
         write("calibration", about, [table], calibration=calibration)
-    before, after = (loss(data, c, np.random.default_rng([seed, 2]), walks=walks) for c in (PLAIN_SUM, calibration))
+    before, after = (
+        loss(data, c, np.random.default_rng([seed, 2]), walks=walks)
+        for c in (PLAIN_SUM, calibration)
+    )
     return FittedCalibration(calibration, len(data), before, after)
 
 
@@ -74,12 +96,17 @@ def _held_out(path: Path, table: Predictions, card: Path, model: ModelCard) -> P
     once = deduplicated(for_fitting(table).labels, table.depth_entropy)
     kept = once[np.isin(np.array(table.names)[once], model.held_out)]
     if len(kept) == 0:
-        raise PredictionsError(f"{path}: holds no object that {card} calls held out of its training")
+        raise PredictionsError(
+            f"{path}: holds no object that {card} calls held out of its training"
+        )
     return table.of_objects(kept)
 
 
 def _check_recogniser(path: Path, card: ModelCard, predictions: Path, table: Predictions) -> None:
-    """Refuse predictions by another recogniser than a card's. Those that name none are the user's word."""
+    """Refuse predictions by another recogniser than a card's.
+
+    Those that name none are the user's word.
+    """
     by = table.models.get("recogniser")
     if card.sha256 != by[1] if by else card.classes != table.classes:
         raise PredictionsError(f"{predictions}: comes from another recogniser than {path}")
@@ -87,16 +114,24 @@ def _check_recogniser(path: Path, card: ModelCard, predictions: Path, table: Pre
 
 @dataclass(frozen=True)
 class Walks:
-    """Walks over all objects of a set: as many in the local window as over the sphere, those last."""
+    """Walks over all objects of a set: as many in the local window as over the sphere, those
+    last.
+
+    Attributes:
+        objects: (walks,).
+        totals: log-evidence summed over the views so far, (walks, views, D).
+    """
 
     data: Predictions
-    objects: NDArray[np.int64]  # (walks,)
-    totals: Float  # log-evidence summed over the views so far, (walks, views, D)
+    objects: NDArray[np.int64]
+    totals: Float
 
     @classmethod
     def draw(cls, data: Predictions, rng: Generator, n_views: int, walks: int) -> "Walks":
         """So many walks of each kind over every object."""
-        objects, views, n_views = np.tile(np.arange(len(data)), 2 * walks), [], min(n_views, len(data.sphere))
+        objects = np.tile(np.arange(len(data)), 2 * walks)
+        views = []
+        n_views = min(n_views, len(data.sphere))
         for policy in (Random(data.sphere), RandomAll(data.sphere)):
             starts = rng.integers(len(data.sphere), size=walks * len(data))
             views.append(blind_walks(data.sphere, policy, starts, n_views, rng))
@@ -109,20 +144,28 @@ class Walks:
         return np.arange(1, self.totals.shape[1] + 1)
 
     def loss(self, calibration: Calibration) -> float:
-        """Mean negative log-likelihood of the true class over all numbers of views, classes weighted evenly."""
+        """Mean negative log-likelihood of the true class over all numbers of views, classes
+        weighted evenly.
+        """
         logs = calibration.log_belief(self.totals, self.numbers, len(self.data.classes))
         weights = self.data.weights[self.objects]
         of_truth = of_true_class(logs, self.data.labels[self.objects])
         return -float((weights / weights.sum() / len(self.numbers)) @ of_truth.sum(1))
 
 
-def fit_temperature(data: Predictions, rng: Generator, n_views: int = 5, walks: int = 4) -> Calibration:
-    """Temperature of one view and correlations of several, by maximum likelihood over 1 to ``n_views`` views."""
+def fit_temperature(
+    data: Predictions, rng: Generator, n_views: int = 5, walks: int = 4
+) -> Calibration:
+    """Temperature of one view and correlations of several, by maximum likelihood over 1 to
+    ``n_views`` views.
+    """
     walked = Walks.draw(data, rng, n_views, walks)
 
     def calibration(parameters: Float) -> Calibration:
         temperature, correlation, *of_bins = parameters.tolist()
-        return Calibration(temperature, correlation, bin_correlation=of_bins[0] if of_bins else None)
+        return Calibration(
+            temperature, correlation, bin_correlation=of_bins[0] if of_bins else None
+        )
 
     def lost(parameters: Float) -> float:
         return walked.loss(calibration(parameters))
@@ -134,21 +177,37 @@ def fit_temperature(data: Predictions, rng: Generator, n_views: int = 5, walks: 
 
 def calibration_of(data: Predictions, rng: Generator, walks: int = 4) -> Calibration:
     """The calibration of predictions; fitted to them where their recogniser was not calibrated."""
-    return data.calibration if data.calibration != PLAIN_SUM else fit_temperature(data, rng, walks=walks)
+    return (
+        data.calibration
+        if data.calibration != PLAIN_SUM
+        else fit_temperature(data, rng, walks=walks)
+    )
 
 
-def loss(data: Predictions, calibration: Calibration, rng: Generator, n_views: int = 5, walks: int = 4) -> float:
-    """Mean negative log-likelihood of the true class over 1 to ``n_views`` views; see ``fit_temperature``."""
+def loss(
+    data: Predictions, calibration: Calibration, rng: Generator, n_views: int = 5, walks: int = 4
+) -> float:
+    """Mean negative log-likelihood of the true class over 1 to ``n_views`` views; see
+    ``fit_temperature``.
+    """
     return Walks.draw(data, rng, n_views, walks).loss(calibration)
 
 
 def fit_risk(
-    data: Predictions, calibration: Calibration, rng: Generator, delta: float = 0.1, n_views: int = 8, walks: int = 4
+    data: Predictions,
+    calibration: Calibration,
+    rng: Generator,
+    delta: float = 0.1,
+    n_views: int = 8,
+    walks: int = 4,
 ) -> RiskBounds:
-    """Error rates that can be promised among those who stop at a threshold, on either half of the walks."""
+    """Error rates that can be promised among those who stop at a threshold, on either half of
+    the walks.
+    """
     walked = Walks.draw(data, rng, n_views, walks)
     belief = calibration.belief(walked.totals, walked.numbers, len(data.classes))
-    sure, wrong = belief.max(2), belief.argmax(2) != data.labels[walked.objects][:, None]
+    sure = belief.max(2)
+    wrong = belief.argmax(2) != data.labels[walked.objects][:, None]
     halves = np.split(np.arange(len(walked.objects)), 2)
     promised = []
     for n in walked.numbers:
@@ -158,8 +217,11 @@ def fit_risk(
 
 
 def _promise(sure: Float, wrong: NDArray[np.bool_], weights: Float, delta: float) -> Float:
-    """Promised error rate of each threshold, (T,), from confidences and mistakes (walks * N, views)."""
-    promised, worst = np.ones(len(THRESHOLDS)), 0.0
+    """Promised error rate of each threshold, (T,), from confidences and mistakes (walks * N,
+    views).
+    """
+    promised = np.ones(len(THRESHOLDS))
+    worst = 0.0
     for t in reversed(range(len(THRESHOLDS))):
         reached = sure >= THRESHOLDS[t]
         failed = wrong[np.arange(len(wrong)), reached.argmax(1)] & reached.any(1)
@@ -171,7 +233,9 @@ def _promise(sure: Float, wrong: NDArray[np.bool_], weights: Float, delta: float
 
 
 def error_bound(failed: Float, stopped: Float, weights: Float, delta: float) -> float:
-    """Upper bound of a weighted share of failures: Clopper and Pearson's for an effective number of objects."""
+    """Upper bound of a weighted share of failures: Clopper and Pearson's for an effective number
+    of objects.
+    """
     total = float(weights @ stopped)
     if total == 0:
         return 1.0
@@ -183,7 +247,8 @@ def error_bound(failed: Float, stopped: Float, weights: Float, delta: float) -> 
 
 
 RADII = np.geomspace(0.02, 20, 93)  # metres; steps of 7.8 %
-ANY_SIZE = 0.05  # share of the objects of a class that may have any size: toys, and models in wrong units
+# share of the objects of a class that may have any size: toys, and models in wrong units
+ANY_SIZE = 0.05
 
 
 @dataclass(frozen=True)
@@ -198,32 +263,48 @@ class FittedSize:
 
 
 def fit_size(
-    # view store that knows the unit of its meshes (nextview render --unit). Its training objects teach, except those in
-    # the predictions
     store: Path,
-    # of training objects that the recogniser has not seen (nextview predict --held-out); they decide the weight of the
-    # size beside the shape
     predictions: Path,
-    card: Path,  # of the recogniser; "size" is written into it
+    card: Path,
 ) -> FittedSize:
     """Learn how large the objects of each class are, for stores and cameras that know the scale.
 
-    It goes into the card; nextview predict takes it into predictions made before, without predicting again.
+    It goes into the card; nextview predict takes it into predictions made before, without
+    predicting again.
+
+    Args:
+        store: view store that knows the unit of its meshes (nextview render --unit). Its training
+            objects teach, except those in the predictions.
+        predictions: of training objects that the recogniser has not seen (nextview predict
+            --held-out); they decide the weight of the size beside the shape.
+        card: of the recogniser; "size" is written into it.
     """
-    views, predicted = ViewStore.open(store), Predictions.load(predictions)
+    views = ViewStore.open(store)
+    predicted = Predictions.load(predictions)
     table = predicted.deduplicate().by_shape()
     if np.isnan(views.radii[views.done]).any():
-        raise DatasetError(f"{store}: does not know the unit of its meshes; tell it with nextview render --unit")
+        raise DatasetError(
+            f"{store}: does not know the unit of its meshes; tell it with nextview render --unit"
+        )
     rows = views.rows_of(predicted.names)
     if (rows < 0).any():
-        raise PredictionsError(f"{predictions}: holds {predicted.names[rows.argmin()]!r}, which {store} does not")
+        raise PredictionsError(
+            f"{predictions}: holds {predicted.names[rows.argmin()]!r}, which {store} does not"
+        )
     with card_to_fit(card) as (model, write):
         _check_recogniser(card, model, predictions, table)
-        data, judged = for_fitting(table), views.rows_of(table.names)
-        of_training = views.done & (views.splits == "train") & np.isin(views.attributes.labels, table.classes)
+        data = for_fitting(table)
+        judged = views.rows_of(table.names)
+        of_training = (
+            views.done & (views.splits == "train") & np.isin(views.attributes.labels, table.classes)
+        )
         taught = np.setdiff1d(np.flatnonzero(of_training), rows)
-        classes = np.array([table.classes.index(name) if name in table.classes else -1 for name in views.classes])
-        log_density = densities(views.radii[taught], classes[views.labels[taught]], len(table.classes))
+        classes = np.array(
+            [table.classes.index(name) if name in table.classes else -1 for name in views.classes]
+        )
+        log_density = densities(
+            views.radii[taught], classes[views.labels[taught]], len(table.classes)
+        )
         size, before, after = fit_weight(data, views.radii[judged], log_density)
         about = f"{len(taught)} objects of the training split, weighed on {len(data)} others"
         write("size", about, [views, table], size=size)
@@ -232,12 +313,14 @@ def fit_size(
 
 def densities(radii: Float, labels: NDArray[np.int64], classes: int) -> Float:
     """Logarithm of the density of each class over log radius, at ``RADII``, (classes, R)."""
-    span, density = np.log(RADII[-1] / RADII[0]), np.empty((classes, len(RADII)))
+    span = np.log(RADII[-1] / RADII[0])
+    density = np.empty((classes, len(RADII)))
     for c in range(classes):
         logs = np.log(radii[labels == c])
         if len(logs) < 2 or np.ptp(logs) == 0:
             raise DatasetError("every class needs objects of several sizes")
-        middle = np.subtract(*np.percentile(logs, (75, 25))) / 1.34  # the deviation of a Gaussian with these quartiles
+        # the deviation of a Gaussian with these quartiles
+        middle = np.subtract(*np.percentile(logs, (75, 25))) / 1.34
         deviation = logs.std(ddof=1)
         width = len(logs) ** -0.2 * (min(middle, deviation) or deviation)
         kernels = gaussian_kde(logs, width / deviation)(np.log(RADII))
@@ -245,8 +328,12 @@ def densities(radii: Float, labels: NDArray[np.int64], classes: int) -> Float:
     return density
 
 
-def fit_weight(data: Predictions, radii: Float, log_density: Float) -> tuple[SizeEvidence, float, float]:
-    """The most likely weight beside the logits, over single views, at the temperature most likely with it."""
+def fit_weight(
+    data: Predictions, radii: Float, log_density: Float
+) -> tuple[SizeEvidence, float, float]:
+    """The most likely weight beside the logits, over single views, at the temperature most
+    likely with it.
+    """
     of_size = SizeEvidence.from_arrays(RADII, log_density, 1.0).logits(radii)[:, None]
 
     def loss(parameters: Float) -> float:
@@ -255,7 +342,9 @@ def fit_weight(data: Predictions, radii: Float, log_density: Float) -> tuple[Siz
         return -float(np.average(of_true_class(logs, data.labels).mean(1), weights=data.weights))
 
     fitted = minimize(loss, np.ones(2), method="L-BFGS-B", bounds=[(0.01, 100.0), (0.0, 10.0)])
-    size = SizeEvidence.from_arrays(RADII.round(5), log_density.round(3), round(float(fitted.x[1]), 4))
+    size = SizeEvidence.from_arrays(
+        RADII.round(5), log_density.round(3), round(float(fitted.x[1]), 4)
+    )
     return size, loss(np.array([1.0, 0.0])), float(fitted.fun)
 
 
@@ -269,18 +358,26 @@ class FittedValleys:
 
 
 def fit_valleys(
-    # of the training split, by a recogniser that was not trained on the objects (nextview predict --held-out). Fitted
-    # to the objects that the map network was not trained on either
     predictions: Path,
-    card: Path,  # of the map network; "valley_classes" is written into it
+    card: Path,
 ) -> FittedValleys:
     """Choose the classes for which the valley of a predicted map is the better view than its peak.
 
-    They go into the network's card; nextview predict takes them into predictions made before, without predicting again.
+    They go into the network's card; nextview predict takes them into predictions made before,
+    without predicting again.
+
+    Args:
+        predictions: of the training split, by a recogniser that was not trained on the objects
+            (nextview predict --held-out). Fitted to the objects that the map network was not
+            trained on either.
+        card: of the map network; "valley_classes" is written into it.
     """
     table = Predictions.load(predictions)
     with card_to_fit(card, recogniser=False) as (model, write):
-        if model.kind not in table.maps or table.models.get(model.kind) != (model.name, model.sha256):
+        if model.kind not in table.maps or table.models.get(model.kind) != (
+            model.name,
+            model.sha256,
+        ):
             raise PredictionsError(f"{predictions}: holds no maps by {card}")
         kept = _held_out(predictions, table, card, model)
         by_class = valley_gains(kept.sphere, kept.logits, kept.maps[model.kind], kept.labels)
@@ -292,13 +389,21 @@ def fit_valleys(
     return FittedValleys(classes, gains, len(kept))
 
 
-def valley_gains(sphere: ViewSphere, logits: Floats, maps: Floats, labels: NDArray[np.int64]) -> dict[int, float]:
-    """For each class, what the second view gains in belief in the truth at the valley rather than at the peak."""
+def valley_gains(
+    sphere: ViewSphere, logits: Floats, maps: Floats, labels: NDArray[np.int64]
+) -> dict[int, float]:
+    """For each class, what the second view gains in belief in the truth at the valley rather
+    than at the peak.
+    """
     n, v, classes = logits.shape
-    objects, first = np.repeat(np.arange(n), v), np.tile(np.arange(v), n)
+    objects = np.repeat(np.arange(n), v)
+    first = np.tile(np.arange(v), n)
     seen = logits[objects, first]
-    visited, evidence = np.eye(v, dtype=bool)[first], Evidence(seen, {"map": maps[objects, first]})
-    state = EpisodeState(current=first, visited=visited, belief=fuse(seen[:, None]), evidence=evidence, step=1)
+    visited = np.eye(v, dtype=bool)[first]
+    evidence = Evidence(seen, {"map": maps[objects, first]})
+    state = EpisodeState(
+        current=first, visited=visited, belief=fuse(seen[:, None]), evidence=evidence, step=1
+    )
 
     def belief_in_truth(valley_classes: tuple[int, ...]) -> Float:
         policy = MapPeak(sphere, "map", valley_classes)

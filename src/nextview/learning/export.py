@@ -1,4 +1,6 @@
-"""From finished training runs to a model that ships: an ONNX file with half-precision weights, and its card."""
+"""From finished training runs to a model that ships: an ONNX file with half-precision weights,
+and its card.
+"""
 
 import logging
 import warnings
@@ -26,7 +28,12 @@ from nextview.learning.inputs import load_inputs
 from nextview.learning.map_training import target_of
 from nextview.learning.recipes import MapRecipe, RecogniserRecipe
 from nextview.learning.runs import load_run, read_recipe, read_run
-from nextview.recognition.inference import BINS_OUTPUT, FEATURES_OUTPUT, MapNetwork, NetworkRecogniser
+from nextview.recognition.inference import (
+    BINS_OUTPUT,
+    FEATURES_OUTPUT,
+    MapNetwork,
+    NetworkRecogniser,
+)
 from nextview.recognition.map_names import CONFIDENCE, Good, map_name
 from nextview.recognition.model_card import ModelCard, Training, write_card
 from nextview.recognition.network_input import InputSpec, from_store
@@ -42,7 +49,9 @@ SMALL = 2**17
 
 
 class ShippedRecogniser(nn.Module):
-    """The recogniser as it ships: raw input bytes in; the mean logits out, and the features of all networks."""
+    """The recogniser as it ships: raw input bytes in; the mean logits out, and the features of
+    all networks.
+    """
 
     def __init__(self, networks: Sequence[nn.Module]) -> None:
         super().__init__()
@@ -54,19 +63,25 @@ class ShippedRecogniser(nn.Module):
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         x = x.float() / 255
         features = [network.features(x) for network in self.networks]
-        outputs = [network.answers(seen) for network, seen in zip(self.networks, features, strict=True)]
-        logits, joined = torch.stack([each[0] for each in outputs]).mean(0), torch.cat(features, 1)
+        outputs = [
+            network.answers(seen) for network, seen in zip(self.networks, features, strict=True)
+        ]
+        logits = torch.stack([each[0] for each in outputs]).mean(0)
+        joined = torch.cat(features, 1)
         if not self.azimuth_bins:
             return logits, joined
         return logits, joined, torch.stack([each[1] for each in outputs]).mean(0).log_softmax(2)
 
 
 class ShippedMap(nn.Module):
-    """A map network as it ships: the map of the window, and that of the sphere, (B, rings, azimuths), if it has it."""
+    """A map network as it ships: the map of the window, and that of the sphere, (B, rings,
+    azimuths), if it has it.
+    """
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
-        self.network, self.whole = network, network.shape[1] > 3
+        self.network = network
+        self.whole = network.shape[1] > 3
         self.outputs = ["map", "sphere"] if self.whole else ["map"]
 
     def forward(self, seen: Tensor) -> tuple[Tensor, ...]:
@@ -76,9 +91,14 @@ class ShippedMap(nn.Module):
         return (outputs[..., [-1, 0, 1]], outputs) if self.whole else (outputs,)
 
 
-def export_onnx(net: nn.Module, example: NDArray, inputs: str, outputs: list[str], path: Path, bits: int = 16) -> None:
-    """Write a network as ONNX: any batch size, weights in fewer bits, arithmetic in single precision."""
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that torchvision is not installed
+def export_onnx(
+    net: nn.Module, example: NDArray, inputs: str, outputs: list[str], path: Path, bits: int = 16
+) -> None:
+    """Write a network as ONNX: any batch size, weights in fewer bits, arithmetic in single
+    precision.
+    """
+    # it warns that torchvision is not installed
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
@@ -96,7 +116,15 @@ def export_onnx(net: nn.Module, example: NDArray, inputs: str, outputs: list[str
         _shrink(model.graph, bits)
     # The exporter notes source lines and stack traces of the machine.
     graph = model.graph
-    for part in (model, graph, *graph.node, *graph.value_info, *graph.input, *graph.output, *graph.initializer):
+    for part in (
+        model,
+        graph,
+        *graph.node,
+        *graph.value_info,
+        *graph.input,
+        *graph.output,
+        *graph.initializer,
+    ):
         del part.metadata_props[:]
         part.doc_string = ""
     onnx.checker.check_model(model, full_check=True)
@@ -106,11 +134,13 @@ def export_onnx(net: nn.Module, example: NDArray, inputs: str, outputs: list[str
 
 def _shrink(graph: onnx.GraphProto, bits: int) -> None:
     """Store large float32 weights in 16 or 8 bits and widen them where they are used."""
-    nodes, scales = [], []
+    nodes = []
+    scales = []
     for weight in graph.initializer:
         if weight.data_type != TensorProto.FLOAT or np.prod(weight.dims) < 1024:
             continue
-        name, values = weight.name, numpy_helper.to_array(weight)
+        name = weight.name
+        values = numpy_helper.to_array(weight)
         small = f"{name}_small"
         if bits == 16 or values.size < SMALL:
             weight.CopyFrom(numpy_helper.from_array(values.astype(np.float16), small))
@@ -138,14 +168,21 @@ class Exported:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A network that is to ship, and how its file is judged."""
+    """A network that is to ship, and how its file is judged.
+
+    Attributes:
+        sample: views on which file and network are compared.
+        judging: validation objects.
+        seen: views of an object, as the network takes them.
+        scores: of the answers for these objects, (N, V, ...).
+    """
 
     card: ModelCard
     network: ShippedRecogniser | ShippedMap
-    sample: NDArray  # views on which file and network are compared
-    judging: NDArray[np.int64]  # validation objects
-    seen: Callable[[int], NDArray]  # views of an object, as the network takes them
-    scores: Callable[[NDArray[np.float32]], dict[str, Any]]  # of the answers for these objects, (N, V, ...)
+    sample: NDArray
+    judging: NDArray[np.int64]
+    seen: Callable[[int], NDArray]
+    scores: Callable[[NDArray[np.float32]], dict[str, Any]]
 
     def answers(self, card: Path) -> Callable[[NDArray], NDArray[np.float32]]:
         """From views to what the file says of them."""
@@ -157,34 +194,53 @@ class _Candidate:
 
 
 def export_recogniser(
-    run: Path,  # folder made by nextview train recogniser
-    store: Path,  # that it was trained on
-    out: Path,  # folder for NAME.onnx and NAME.json
-    ensemble: tuple[Path, ...] = (),  # further runs on the same store and input; the logits of all are averaged
-    bits: Literal[8, 16] = 16,  # that a weight takes in the file
-    name: str | None = None,  # of the model; by default recogniser-DATASET, after the mesh folder of the store
-    note: str = "",  # what else the card should say
-    overwrite: bool = False,  # replace a model of this name
+    run: Path,
+    store: Path,
+    out: Path,
+    ensemble: tuple[Path, ...] = (),
+    bits: Literal[8, 16] = 16,
+    name: str | None = None,
+    note: str = "",
+    overwrite: bool = False,
     track: Track = silently,
 ) -> Exported:
-    """Export a trained recogniser: ONNX, with a card of its validation scores. Calibrate it with nextview fit.
+    """Export a trained recogniser: ONNX, with a card of its validation scores. Calibrate it with
+    nextview fit.
+
+    Args:
+        run: folder made by nextview train recogniser.
+        store: that it was trained on.
+        out: folder for NAME.onnx and NAME.json.
+        ensemble: further runs on the same store and input; the logits of all are averaged.
+        bits: that a weight takes in the file.
+        name: of the model; by default recogniser-DATASET, after the mesh folder of the store.
+        note: what else the card should say.
+        overwrite: replace a model of this name.
 
     Raises:
-        ModelError: a run is not finished or of another store, runs do not fit together, or the file's answers differ.
+        ModelError: a run is not finished or of another store, runs do not fit together, or the
+            file's answers differ.
         ResultsError: the model exists.
     """
     folders = run, *ensemble
-    views, runs = ViewStore.open(store), [read_run(each) for each in folders]
+    views = ViewStore.open(store)
+    runs = [read_run(each) for each in folders]
     recipes = [read_recipe(each, RecogniserRecipe) for each in folders]
     if len({(recipe.input, recipe.size) for recipe in recipes}) > 1:
-        raise ModelError(f"{folders[0]} and the others do not take the same: geometry or image, of one size")
+        raise ModelError(
+            f"{folders[0]} and the others do not take the same: geometry or image, of one size"
+        )
     spec = InputSpec(recipes[0].input, recipes[0].size)
     held_out = frozenset.intersection(*(frozenset(each.held_out) for each in runs))
     validated = frozenset.intersection(*(frozenset(each.validation) for each in runs))
     validation = np.flatnonzero(np.isin(views.names, list(validated)))
     if len(validation) == 0:
-        raise ModelError(f"{folders[0]} and the others have no validation object of {store} in common")
-    networks = [run_network(each, recipe, views) for each, recipe in zip(folders, recipes, strict=True)]
+        raise ModelError(
+            f"{folders[0]} and the others have no validation object of {store} in common"
+        )
+    networks = [
+        run_network(each, recipe, views) for each, recipe in zip(folders, recipes, strict=True)
+    ]
     shipped = ShippedRecogniser(networks).eval()
     card = ModelCard(
         name or f"recogniser-{views.dataset}",
@@ -198,7 +254,8 @@ def export_recogniser(
         note=note,
         held_out=tuple(sorted(held_out)),
     ).made_by(*views.commands, *(line for each in runs for line in each.commands), command())
-    inputs, judging = load_inputs(store, spec.size, spec.kind), deduplicate(views, validation)
+    inputs = load_inputs(store, spec.size, spec.kind)
+    judging = deduplicate(views, validation)
     sample = np.stack([inputs[i, 5] for i in validation[:: max(1, len(validation) // 8)][:8]])
     scores = partial(recogniser_scores, labels=views.labels[judging])
     made = _Candidate(card, shipped, sample, judging, lambda i: inputs[i], scores)
@@ -212,22 +269,40 @@ def run_network(run: Path, recipe: RecogniserRecipe, views: ViewStore) -> ResNet
 
 
 def export_map(
-    run: Path,  # folder made by nextview train map
-    store: Path,  # that it was trained on
-    out: Path,  # folder for NAME.onnx and NAME.json
-    predictions: Path | None = None,  # that a map of the confidence was trained on
-    bits: Literal[8, 16] = 16,  # that a weight takes in the file
-    name: str | None = None,  # of the model; by default MEASURE-DATASET, after the mesh folder of the store
-    note: str = "",  # what else the card should say
-    overwrite: bool = False,  # replace a model of this name
+    run: Path,
+    store: Path,
+    out: Path,
+    predictions: Path | None = None,
+    bits: Literal[8, 16] = 16,
+    name: str | None = None,
+    note: str = "",
+    overwrite: bool = False,
     track: Track = silently,
 ) -> Exported:
-    """Export a trained map network: ONNX, with a card of its validation scores."""
-    views, recipe, noted = ViewStore.open(store), read_recipe(run, MapRecipe), read_run(run)
-    kind, shape = map_name(recipe.measure), (-1, views.sphere.rings, 3)
+    """Export a trained map network: ONNX, with a card of its validation scores.
+
+    Args:
+        run: folder made by nextview train map.
+        store: that it was trained on.
+        out: folder for NAME.onnx and NAME.json.
+        predictions: that a map of the confidence was trained on.
+        bits: that a weight takes in the file.
+        name: of the model; by default MEASURE-DATASET, after the mesh folder of the store.
+        note: what else the card should say.
+        overwrite: replace a model of this name.
+    """
+    views = ViewStore.open(store)
+    recipe = read_recipe(run, MapRecipe)
+    noted = read_run(run)
+    kind = map_name(recipe.measure)
+    shape = (-1, views.sphere.rings, 3)
     good: Good = "peak" if recipe.measure == CONFIDENCE else find_measure(recipe.measure).good
-    values, there = target_of(recipe.measure, views, None if predictions is None else Predictions.load(predictions))
-    validation = np.flatnonzero(views.done & there & (views.splits == "train") & np.isin(views.names, noted.held_out))
+    values, there = target_of(
+        recipe.measure, views, None if predictions is None else Predictions.load(predictions)
+    )
+    validation = np.flatnonzero(
+        views.done & there & (views.splits == "train") & np.isin(views.names, noted.held_out)
+    )
     if len(validation) == 0:
         raise ModelError(f"{run}: was not trained on {store}")
     shipped = ShippedMap(load_run(map_network(recipe, views.sphere), run)).eval()
@@ -237,7 +312,9 @@ def export_map(
         kind,
         spec,
         "",
-        network="PointNet with both transforms" if spec.kind == "cloud" else f"ResNet-{recipe.layers}",
+        network=(
+            "PointNet with both transforms" if spec.kind == "cloud" else f"ResNet-{recipe.layers}"
+        ),
         measure=recipe.measure,
         good=good,
         output="sphere" if shipped.whole else "window",
@@ -249,25 +326,35 @@ def export_map(
     true = values[judging][:, views.sphere.windows].reshape(shape)
     seen = partial(from_store, spec, views)
     sample = seen(int(validation[0]))[3:11]
-    made = _Candidate(card, shipped, sample, judging, seen, lambda maps: map_scores(maps.reshape(shape), true))
+    made = _Candidate(
+        card, shipped, sample, judging, seen, lambda maps: map_scores(maps.reshape(shape), true)
+    )
     return _export(made, out, bits, overwrite, track)
 
 
-def _training(views: ViewStore, held_out: Iterable[str], recipes: Sequence[Any], usable: Any = True) -> Training:
-    learned = views.done & usable & (views.splits == "train") & ~np.isin(views.names, list(held_out))
+def _training(
+    views: ViewStore, held_out: Iterable[str], recipes: Sequence[Any], usable: Any = True
+) -> Training:
+    learned = (
+        views.done & usable & (views.splits == "train") & ~np.isin(views.names, list(held_out))
+    )
     about = f"{learned.sum()} objects of the training split, {len(views.sphere)} views each"
     return Training(about, tuple(asdict(recipe) for recipe in recipes))
 
 
 def _export(candidate: _Candidate, out: Path, bits: int, overwrite: bool, track: Track) -> Exported:
-    """Write ONNX file and card, once the file answers as the network does; both appear at the end."""
-    name, sample = candidate.card.name, candidate.sample
+    """Write ONNX file and card, once the file answers as the network does; both appear at the
+    end.
+    """
+    name = candidate.card.name
+    sample = candidate.sample
     if Path(name).name != name:
         raise UsageError(f"--name is the name of a model, not a path: {name}")
     for suffix in (".json", ".onnx"):
         check_new(out / f"{name}{suffix}", overwrite)
     with new_folder(out, overwrite=True, last=f"{name}.json") as folder:
-        part, weights = folder / f"{name}.json", folder / f"{name}.onnx"
+        part = folder / f"{name}.json"
+        weights = folder / f"{name}.onnx"
         example = np.resize(sample, (2, *sample.shape[1:]))
         limit, end = (0.1, "input") if candidate.card.is_recogniser else (0.02, "seen")
         export_onnx(candidate.network, example, end, candidate.network.outputs, weights, bits)
@@ -278,7 +365,10 @@ def _export(candidate: _Candidate, out: Path, bits: int, overwrite: bool, track:
             expected = candidate.network(torch.from_numpy(sample))[0].numpy()
         difference = float(np.abs(expected - answers(sample)).max())
         if not difference < limit:
-            raise ModelError(f"{name}: its answers differ from the network's by up to {difference:.2g}; not written")
+            raise ModelError(
+                f"{name}: its answers differ from the network's by up to {difference:.2g}; not"
+                " written"
+            )
         rows: list[NDArray[np.float32]] = []
 
         def judged() -> Iterator[int]:
@@ -287,6 +377,12 @@ def _export(candidate: _Candidate, out: Path, bits: int, overwrite: bool, track:
                 yield len(rows)
 
         track(judged(), len(candidate.judging), "validation objects")
-        scores = {f"validation ({len(rows)} objects of the training split)": candidate.scores(np.stack(rows))}
-        write_card(part, replace(card, scores=scores, largest_difference_to_torch=round(difference, 4)))
+        scores = {
+            f"validation ({len(rows)} objects of the training split)": candidate.scores(
+                np.stack(rows)
+            )
+        }
+        write_card(
+            part, replace(card, scores=scores, largest_difference_to_torch=round(difference, 4))
+        )
     return Exported(out / part.name, difference)

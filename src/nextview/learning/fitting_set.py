@@ -1,4 +1,6 @@
-"""The predictions that something may be fitted to: never of the test split, nor of objects the recogniser learned."""
+"""The predictions that something may be fitted to: never of the test split, nor of objects the
+recogniser learned.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -23,16 +25,21 @@ from nextview.session.episode import run_episodes
 Indices = NDArray[np.int64]
 
 
-def hold_out(labels: Indices, measured: NDArray[np.floating], folds: int, seed: int) -> list[Indices]:
-    """Divide objects into parts, each to be held out from one network; every class is spread evenly."""
+def hold_out(
+    labels: Indices, measured: NDArray[np.floating], folds: int, seed: int
+) -> list[Indices]:
+    """Divide objects into parts, each to be held out from one network; every class is spread
+    evenly.
+    """
     if not 2 <= folds <= len(labels):
         raise DatasetError(
-            f"{len(labels)} objects cannot be divided into {folds} folds: two folds and as many objects are needed "
-            "at least"
+            f"{len(labels)} objects cannot be divided into {folds} folds: two folds and as many"
+            " objects are needed at least"
         )
     rng = np.random.default_rng([seed, folds])
     group = duplicate_groups(measured)
-    first = rng.permutation(np.unique(group, return_index=True)[1])  # one object stands for its group
+    # one object stands for its group
+    first = rng.permutation(np.unique(group, return_index=True)[1])
     first = first[np.argsort(labels[first], kind="stable")]  # dealt out class by class
     fold_of_group = np.empty(len(first), np.int64)
     fold_of_group[group[first]] = np.arange(len(first)) % folds
@@ -42,7 +49,9 @@ def hold_out(labels: Indices, measured: NDArray[np.floating], folds: int, seed: 
 def for_fitting(predictions: Predictions) -> Predictions:
     """The predictions; PredictionsError if they hold objects of the test split."""
     if (predictions.splits == "test").any():
-        raise PredictionsError("these predictions hold objects of the test split, to which nothing may be fitted")
+        raise PredictionsError(
+            "these predictions hold objects of the test split, to which nothing may be fitted"
+        )
     return predictions
 
 
@@ -54,36 +63,60 @@ def load_sensed(paths: Sequence[Path], table: Predictions) -> list[Predictions]:
         row = {name: i for i, name in enumerate(other.names)}
         missing = [name for name in table.names if name not in row]
         if missing:
-            raise PredictionsError(f"{path}: lacks {len(missing)} of the {len(table)} objects, {missing[0]} among them")
-        if (other.classes, other.sphere, other.models) != (table.classes, table.sphere, table.models):
+            raise PredictionsError(
+                f"{path}: lacks {len(missing)} of the {len(table)} objects, {missing[0]} among them"
+            )
+        if (other.classes, other.sphere, other.models) != (
+            table.classes,
+            table.sphere,
+            table.models,
+        ):
             raise PredictionsError(f"{path}: is of other models, classes or viewpoints")
         loaded.append(other.of_objects(np.array([row[name] for name in table.names])))
     return loaded
 
 
-def blind_walks(sphere: ViewSphere, policy: Policy, starts: Indices, n_views: int, rng: np.random.Generator) -> Indices:
-    """Views in order, (E, views) int64, of a policy that knows only where it has been; ``starts`` is (E,)."""
+def blind_walks(
+    sphere: ViewSphere, policy: Policy, starts: Indices, n_views: int, rng: np.random.Generator
+) -> Indices:
+    """Views in order, (E, views) int64, of a policy that knows only where it has been;
+    ``starts`` is (E,).
+    """
 
     def nothing(episodes: Indices, views: Indices) -> Evidence:
         return Evidence(np.zeros((len(episodes), 1)))
 
-    return run_episodes(nothing, sphere, policy, starts, FixedLength(max_views=n_views), rng).outcome.views
+    return run_episodes(
+        nothing, sphere, policy, starts, FixedLength(max_views=n_views), rng
+    ).outcome.views
 
 
 @contextmanager
-def card_to_fit(path: Path, recogniser: bool = True) -> Iterator[tuple[ModelCard, Callable[..., None]]]:
-    """A card, and ``write(name, about, sources, **fields)`` for what was fitted to these sources; one run at a time."""
+def card_to_fit(
+    path: Path, recogniser: bool = True
+) -> Iterator[tuple[ModelCard, Callable[..., None]]]:
+    """A card, and ``write(name, about, sources, **fields)`` for what was fitted to these
+    sources; one run at a time.
+    """
     with only_one(path):
-        card, known = read_card(path), path.read_bytes()
+        card = read_card(path)
+        known = path.read_bytes()
         if recogniser and not card.is_recogniser:
             raise ModelError(f"{path}: is a {card.kind}, not a recogniser")
 
-        def write(name: str, about: str, sources: Sequence[Predictions | ViewStore], **fields: Any) -> None:
+        def write(
+            name: str, about: str, sources: Sequence[Predictions | ViewStore], **fields: Any
+        ) -> None:
             nonlocal known
-            fitted = msgspec.structs.replace(card, **fields, fitted_to={**card.fitted_to, name: about})
+            fitted = msgspec.structs.replace(
+                card, **fields, fitted_to={**card.fitted_to, name: about}
+            )
             lines = (line for source in sources for line in source.commands)
             if path.read_bytes() != known:
-                raise ModelError(f"{path}: was changed while this ran, and is left as it is; run the command again")
+                raise ModelError(
+                    f"{path}: was changed while this ran, and is left as it is; run the command"
+                    " again"
+                )
             write_card(path, fitted.made_by(*lines, command()))
             known = path.read_bytes()
 

@@ -1,4 +1,6 @@
-"""From predictions to the gain policy: its networks, their training, and its card with the ONNX file beside it."""
+"""From predictions to the gain policy: its networks, their training, and its card with the ONNX
+file beside it.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from copy import deepcopy
@@ -19,7 +21,14 @@ from nextview.files import check_new, command, new_folder, sha256_of
 from nextview.learning.export import export_onnx
 from nextview.learning.fitting_set import hold_out, load_sensed
 from nextview.learning.recipes import GainRecipe
-from nextview.learning.rollout import ReplayTable, Value, candidate_values, fit_travel_weight, judge_all, rollout
+from nextview.learning.rollout import (
+    ReplayTable,
+    Value,
+    candidate_values,
+    fit_travel_weight,
+    judge_all,
+    rollout,
+)
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Random, RandomAll
 from nextview.policies.gain import (
@@ -45,18 +54,25 @@ with extras():
 
 Best = tuple[tuple[Gain, ...], Value]  # policies, one for each fold, and their mean value
 BOUND = 1e-5
-"""Largest difference of the file's answers from those of the networks in double precision, relative to the largest
-answer beyond 1. For gains a fiftieth of the lowest travel weight that is tried."""
+"""Largest difference of the file's answers from those of the networks in double precision, relative
+to the largest answer beyond 1. For gains a fiftieth of the lowest travel weight that is tried."""
 
 
 class Perceptrons(nn.Module):
-    """Several perceptrons, averaged over an object and its mirror: features (B, D) to the value of cells (B, V)."""
+    """Several perceptrons, averaged over an object and its mirror: features (B, D) to the value
+    of cells (B, V).
+    """
 
     def __init__(
-        self, weights: list[Tensor], biases: list[Tensor], features_flip: NDArray, cells_flip: NDArray
+        self,
+        weights: list[Tensor],
+        biases: list[Tensor],
+        features_flip: NDArray,
+        cells_flip: NDArray,
     ) -> None:
         super().__init__()
-        self.weights, self.biases = nn.ParameterList(weights), nn.ParameterList(biases)
+        self.weights = nn.ParameterList(weights)
+        self.biases = nn.ParameterList(biases)
         self.register_buffer("features_flip", torch.as_tensor(features_flip))
         self.register_buffer("cells_flip", torch.as_tensor(cells_flip))
 
@@ -68,7 +84,9 @@ class Perceptrons(nn.Module):
         return x
 
     def forward(self, x: Tensor) -> Tensor:
-        return (self.each(x) + self.each(x[:, self.features_flip])[..., self.cells_flip]).mean(0) / 2
+        return (self.each(x) + self.each(x[:, self.features_flip])[..., self.cells_flip]).mean(
+            0
+        ) / 2
 
 
 class RowByRow(nn.Module):
@@ -82,7 +100,8 @@ class RowByRow(nn.Module):
         n = self.networks
         x = torch.stack([told, told[:, n.features_flip]], 1)[:, :, None, None]
         for i, (weights, bias) in enumerate(zip(n.weights, n.biases, strict=True)):
-            # Twice the weights: with one perceptron they would be a matrix, and all rows one product.
+            # Twice the weights: with one perceptron they would be a matrix, and all rows one
+            # product.
             x = torch.matmul(torch.relu(x) if i else x, weights.expand(2, *weights.shape)) + bias
         return (x[:, 0, :, 0] + x[:, 1, :, 0][..., n.cells_flip]).mean(1) / 2
 
@@ -95,44 +114,67 @@ class Score:
 
     def __call__(self, features: NDArray[np.floating]) -> NDArray[np.floating]:
         with torch.inference_mode():
-            return self.networks(torch.from_numpy(features).to(self.networks.weights[0].dtype)).numpy()
+            return self.networks(
+                torch.from_numpy(features).to(self.networks.weights[0].dtype)
+            ).numpy()
 
 
-def walk(table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np.random.Generator) -> list[NDArray]:
+def walk(
+    table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np.random.Generator
+) -> list[NDArray]:
     """S states that are met when each of the policies is followed once over every object.
 
-    Their features, (S, D) float32; the value of each choice less the mean over the free ones, (S, V) float32, cells as
-    in ``policies.learned_tables``; which are free, (S, V); and the objects, (S,).
+    Their features, (S, D) float32; the value of each choice less the mean over the free ones, (S,
+    V) float32, cells as in ``policies.learned_tables``; which are free, (S, V); and the objects,
+    (S,).
     """
-    sphere, parts = table.data.sphere, []
+    sphere = table.data.sphere
+    parts = []
     for policy in policies:
-        for moment in rollout(table, policy, recipe.max_views - 1, rng, VISIBILITY in recipe.inputs):
+        for moment in rollout(
+            table, policy, recipe.max_views - 1, rng, VISIBILITY in recipe.inputs
+        ):
             state = moment.state
             view = cells_from(sphere)[origin(sphere, state, recipe.frame)]
             value = np.take_along_axis(candidate_values(table, moment, recipe.objective), view, 1)
             free = np.take_along_axis(state.free, view, 1)
             mean = (value * free).sum(1, keepdims=True) / np.maximum(free.sum(1, keepdims=True), 1)
             seen = features(sphere, state, recipe.inputs, recipe.frame)
-            parts.append((seen.astype(np.float32), (value - mean).astype(np.float32), free, state.episodes))
+            parts.append(
+                (seen.astype(np.float32), (value - mean).astype(np.float32), free, state.episodes)
+            )
     return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
 
 
 def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gain]:
-    """Train the networks: after every epoch, the policy as it then is, at travel weight 0 and over all views."""
-    rng, data = np.random.default_rng([recipe.seed, fold]), table.data
-    sphere, n, c, e = data.sphere, len(data), len(data.classes), recipe.networks_per_fold
+    """Train the networks: after every epoch, the policy as it then is, at travel weight 0 and
+    over all views.
+    """
+    rng = np.random.default_rng([recipe.seed, fold])
+    data = table.data
+    sphere = data.sphere
+    n = len(data)
+    c = len(data.classes)
+    e = recipe.networks_per_fold
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     features_flip = mirrored_features(sphere, c, recipe.inputs, recipe.frame)
     widths = list(pairwise([len(features_flip), recipe.hidden, recipe.hidden, len(sphere)]))
     scales = [(2 / inputs) ** 0.5 for inputs, _ in widths[:-1]] + [0.0]
-    first = [scale * torch.randn(e, *width, generator=generator) for scale, width in zip(scales, widths, strict=True)]
+    first = [
+        scale * torch.randn(e, *width, generator=generator)
+        for scale, width in zip(scales, widths, strict=True)
+    ]
     biases = [torch.zeros(e, 1, outputs) for _, outputs in widths]
     networks = Perceptrons(first, biases, features_flip, mirrored(sphere))
     drawn = rng.multinomial(n, np.full(n, 1 / n), size=e)
     weights = torch.from_numpy(drawn * data.weights).float()
-    optimiser = torch.optim.AdamW(networks.parameters(), recipe.lr, weight_decay=recipe.weight_decay)
+    optimiser = torch.optim.AdamW(
+        networks.parameters(), recipe.lr, weight_decay=recipe.weight_decay
+    )
     batches = -(-recipe.episodes * (recipe.max_views - 1) * n // recipe.batch)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, recipe.lr, total_steps=recipe.epochs * batches)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, recipe.lr, total_steps=recipe.epochs * batches
+    )
     policies: list[Policy] = [(Random, RandomAll)[i % 2](sphere) for i in range(recipe.episodes)]
     for _ in range(recipe.epochs):
         *states, objects = walk(table, policies, recipe, rng)
@@ -140,8 +182,12 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
             seen, value, free = (torch.from_numpy(values[batch]) for values in states)
             flipped = torch.from_numpy(rng.random(len(batch)) < 0.5)[:, None]
             seen = torch.where(flipped, seen[:, networks.features_flip], seen)
-            value, free = (torch.where(flipped, a[:, networks.cells_flip], a) for a in (value, free))
-            error = (((networks.each(seen) - value) ** 2) * free).sum(-1) / free.sum(-1).clamp(min=1)
+            value, free = (
+                torch.where(flipped, a[:, networks.cells_flip], a) for a in (value, free)
+            )
+            error = (((networks.each(seen) - value) ** 2) * free).sum(-1) / free.sum(-1).clamp(
+                min=1
+            )
             optimiser.zero_grad()
             ((weights[:, objects[batch]] * error).sum() / len(batch)).backward()
             optimiser.step()
@@ -151,8 +197,12 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
         yield policy
 
 
-def best_epoch(folds: Sequence[Iterable[Gain]], tables: Sequence[ReplayTable], recipe: GainRecipe) -> Iterator[Best]:
-    """After every epoch, the policies of the best epoch so far, and their mean value over all objects."""
+def best_epoch(
+    folds: Sequence[Iterable[Gain]], tables: Sequence[ReplayTable], recipe: GainRecipe
+) -> Iterator[Best]:
+    """After every epoch, the policies of the best epoch so far, and their mean value over all
+    objects.
+    """
     best = None
     for policies in zip(*folds, strict=True):
         judged = list(zip(tables, policies, strict=True))
@@ -165,27 +215,45 @@ def best_epoch(folds: Sequence[Iterable[Gain]], tables: Sequence[ReplayTable], r
 def averaged(policies: Sequence[Gain]) -> Gain:
     """One policy whose networks are those of all."""
     networks = [policy.score.networks for policy in policies if isinstance(policy.score, Score)]
-    weights = [torch.cat(layers).detach() for layers in zip(*(n.weights for n in networks), strict=True)]
-    biases = [torch.cat(layers).detach() for layers in zip(*(n.biases for n in networks), strict=True)]
+    weights = [
+        torch.cat(layers).detach() for layers in zip(*(n.weights for n in networks), strict=True)
+    ]
+    biases = [
+        torch.cat(layers).detach() for layers in zip(*(n.biases for n in networks), strict=True)
+    ]
     joined = Perceptrons(weights, biases, networks[0].features_flip, networks[0].cells_flip)
     return replace(policies[0], score=Score(joined))
 
 
 def write_gain(card: Path, policy: Gain, about: PolicyCard, features: NDArray[np.float32]) -> float:
-    """Write a policy that was trained, NAME.onnx and NAME.json, in place of what has these names."""
+    """Write a policy that was trained, NAME.onnx and NAME.json, in place of what has these
+    names.
+    """
     assert isinstance(policy.score, Score)
-    weights, networks = card.with_suffix(".onnx"), policy.score.networks
+    weights = card.with_suffix(".onnx")
+    networks = policy.score.networks
     expected = Score(deepcopy(networks).double())(features.astype(np.float64))
     with new_folder(card.parent, overwrite=True, last=card.name) as part:
         made = part / weights.name
-        export_onnx(RowByRow(networks), features[:2].astype(np.float32), FEATURES_INPUT, ["cells"], made, bits=32)
+        export_onnx(
+            RowByRow(networks),
+            features[:2].astype(np.float32),
+            FEATURES_INPUT,
+            ["cells"],
+            made,
+            bits=32,
+        )
         sha256 = sha256_of(made)
-        answers = open_onnx(made, sha256, threads=1).run(["cells"], {FEATURES_INPUT: features.astype(np.float32)})[0]
+        answers = open_onnx(made, sha256, threads=1).run(
+            ["cells"], {FEATURES_INPUT: features.astype(np.float32)}
+        )[0]
         difference = float(np.abs(answers - expected).max())
         if not difference <= BOUND * max(1.0, float(np.abs(expected).max())):
             differ = f"differ by {difference:.2g} from the networks'"
             raise ModelError(f"{weights}: ONNX Runtime's answers {differ}; not written")
-        table = msgspec.to_builtins(GainTable(policy.classes, policy.inputs, policy.travel_weight, policy.frame))
+        table = msgspec.to_builtins(
+            GainTable(policy.classes, policy.inputs, policy.travel_weight, policy.frame)
+        )
         about = msgspec.structs.replace(about, sha256=sha256, table=table, scope=policy.scope)
         write_policy_card(part / card.name, about)
     return difference
@@ -205,30 +273,42 @@ class TrainedGain:
 
 
 def train_gain(
-    predictions: Path,  # of training objects that the recogniser has not seen (nextview predict --held-out)
-    out: Path,  # card to write (NAME.json); the networks are written beside it (NAME.onnx)
-    # predictions of other such objects, which choose the epoch and the travel weight; those among them are left out of
-    # the training. By default PREDICTIONS choose them, in folds
+    predictions: Path,
+    out: Path,
     validation: Path | None = None,
-    # without VALIDATION, so many policies are trained, at most one for each object, each without its share of the
-    # objects, which validate it; the result is the mean of all
     folds: int = 20,
-    # of a grid cell of travel; by default the lowest at which the policy travels no farther than a random walk in the
-    # local window
     travel_weight: float | None = None,
-    local: bool = False,  # let it choose in the local window only
-    # predictions of the same objects through sensors (nextview render --sensor mix), to learn from as well
+    local: bool = False,
     sensed: tuple[Path, ...] = (),
     recipe: GainRecipe = GainRecipe(),
-    overwrite: bool = False,  # replace files of these names
+    overwrite: bool = False,
     track: Track = silently,
 ) -> TrainedGain:
-    """Train the gain policy, which predicts what a view from each viewpoint brings. When stopped, it begins anew.
+    """Train the gain policy, which predicts what a view from each viewpoint brings. When stopped,
+    it begins anew.
+
+    Args:
+        predictions: of training objects that the recogniser has not seen (nextview predict
+            --held-out).
+        out: card to write (NAME.json); the networks are written beside it (NAME.onnx).
+        validation: predictions of other such objects, which choose the epoch and the travel weight;
+            those among them are left out of the training. By default PREDICTIONS choose them, in
+            folds.
+        folds: without VALIDATION, so many policies are trained, at most one for each object, each
+            without its share of the objects, which validate it; the result is the mean of all.
+        travel_weight: of a grid cell of travel; by default the lowest at which the policy travels
+            no farther than a random walk in the local window.
+        local: let it choose in the local window only.
+        sensed: predictions of the same objects through sensors (nextview render --sensor mix), to
+            learn from as well.
+        overwrite: replace files of these names.
 
     Raises:
         UsageError, ResultsError: the card is not called NAME.json, or exists.
-        PredictionsError: the predictions lack what the recipe takes, are of the test split or do not belong together.
-        DatasetError, ModelError: there are too few objects for the folds; or the ONNX file's answers differ.
+        PredictionsError: the predictions lack what the recipe takes, are of the test split or do
+            not belong together.
+        DatasetError, ModelError: there are too few objects for the folds; or the ONNX file's
+            answers differ.
     """
     if out.suffix != ".json":
         raise UsageError(f"{out}: the card of a policy is called NAME.json")
@@ -252,48 +332,73 @@ def train_gain(
     policy = replace(averaged(policies), travel_weight=travel_weight)
     states = np.concatenate([walk(part, [policy], recipe, data.rng)[0] for part in data.validated])
     difference = write_gain(out, policy, data.about, states)
-    return TrainedGain(out, data.objects, data.validated_on, value.mean, travel_weight, len(states), difference)
+    return TrainedGain(
+        out, data.objects, data.validated_on, value.mean, travel_weight, len(states), difference
+    )
 
 
 @dataclass(frozen=True)
 class _Data:
-    """What is learned from, and what validates: tables side by side, one pair for each fold."""
+    """What is learned from, and what validates: tables side by side, one pair for each fold.
+
+    Attributes:
+        about: of a policy that is trained on it, as yet without its table.
+    """
 
     learned: list[ReplayTable]
     validated: list[ReplayTable]
     objects: int
     validated_on: str
-    about: PolicyCard  # of a policy that is trained on it, as yet without its table
+    about: PolicyCard
     rng: np.random.Generator
 
 
-def _load(predictions: Path, validation: Path | None, sensed: Sequence[Path], recipe: GainRecipe, folds: int) -> _Data:
+def _load(
+    predictions: Path,
+    validation: Path | None,
+    sensed: Sequence[Path],
+    recipe: GainRecipe,
+    folds: int,
+) -> _Data:
     table = Predictions.load(predictions).deduplicate()
     other = table if validation is None else Predictions.load(validation).deduplicate()
     if (other.classes, other.sphere) != (table.classes, table.sphere):
-        raise PredictionsError(f"{validation}: is of other classes or viewpoints than {predictions}")
+        raise PredictionsError(
+            f"{validation}: is of other classes or viewpoints than {predictions}"
+        )
     if sensed and validation is not None:
-        raise UsageError("predictions through sensors choose with those that are learned from: no --validation")
+        raise UsageError(
+            "predictions through sensors choose with those that are learned from: no --validation"
+        )
     variants = load_sensed(sensed, table)
-    sources = [(predictions, table)] if validation is None else [(predictions, table), (validation, other)]
+    sources = (
+        [(predictions, table)]
+        if validation is None
+        else [(predictions, table), (validation, other)]
+    )
     sources += zip(sensed, variants, strict=True)
     for path, p in sources:
         _check(path, p, recipe)
     everything = np.arange(len(table))
     if validation is None:
-        folds = min(folds, len(np.unique(_shapes(table), axis=0)))  # of few objects each has a fold of its own
+        # of few objects each has a fold of its own
+        folds = min(folds, len(np.unique(_shapes(table), axis=0)))
         validating = hold_out(table.labels, _shapes(table), folds, recipe.seed)
         learning = [np.setdiff1d(everything, part) for part in validating]
         validated_on = f"the same, each judged by networks of {folds - 1} other folds"
     else:
-        validating, learning = [np.arange(len(other))], [everything[~np.isin(_targets(table), _targets(other))]]
+        validating = [np.arange(len(other))]
+        learning = [everything[~np.isin(_targets(table), _targets(other))]]
         validated_on = f"{len(other)} others"
-    rng, scenes = np.random.default_rng([recipe.seed, 1]), scenes_of(table)
+    rng = np.random.default_rng([recipe.seed, 1])
+    scenes = scenes_of(table)
     others = scenes if validation is None else scenes_of(other)
     learned = [ReplayTable.select(table, part, rng, variants, scenes) for part in learning]
     validated = [ReplayTable.select(other, part, rng, variants, others) for part in validating]
     objects = len(np.unique(np.concatenate(learning)))
-    learned_from = f"{objects} objects of the training split{', clean and through sensors' * bool(sensed)}"
+    learned_from = (
+        f"{objects} objects of the training split{', clean and through sensors' * bool(sensed)}"
+    )
     about = PolicyCard(
         "gain",
         "global",
@@ -301,9 +406,13 @@ def _load(predictions: Path, validation: Path | None, sensed: Sequence[Path], re
         table.sphere.azimuths,
         table.classes,
         {},
-        f"{learned_from}, classes weighted evenly; epoch and travel weight chosen on {validated_on}",
+        f"{learned_from}, classes weighted evenly; epoch and travel weight chosen on"
+        f" {validated_on}",
         tuple(LearnedFrom(sha256_of(path), p.models) for path, p in sources),
-        tuple((part.data.calibration.temperature, part.data.calibration.correlation) for part in learned),
+        tuple(
+            (part.data.calibration.temperature, part.data.calibration.correlation)
+            for part in learned
+        ),
         asdict(recipe),
         tuple(dict.fromkeys((*(line for _, p in sources for line in p.commands), command()))),
     )
@@ -311,7 +420,9 @@ def _load(predictions: Path, validation: Path | None, sensed: Sequence[Path], re
 
 
 def _shapes(p: Predictions) -> NDArray[np.floating]:
-    """Rows that are the same where the shape is, (N, ...): by what is seen of it, or in scenes by its name."""
+    """Rows that are the same where the shape is, (N, ...): by what is seen of it, or in scenes
+    by its name.
+    """
     if scenes_of(p) is None:
         return p.depth_entropy
     return np.unique(_targets(p), return_inverse=True)[1][:, None].astype(np.float64)
@@ -327,9 +438,13 @@ def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:
     lacking = [name for name in maps_of(recipe.inputs) if name not in p.maps]
     if lacking:
         known = ", ".join((*INPUTS, VISIBILITY, *in_order(p.maps)))
-        raise PredictionsError(f"{path}: holds no map {lacking[0]!r}; predict it, or choose --inputs among {known}")
+        raise PredictionsError(
+            f"{path}: holds no map {lacking[0]!r}; predict it, or choose --inputs among {known}"
+        )
     if VISIBILITY in recipe.inputs and scenes_of(p) is None:
-        raise PredictionsError(f"{path}: is of no scenes, in which all would show; choose other --inputs")
+        raise PredictionsError(
+            f"{path}: is of no scenes, in which all would show; choose other --inputs"
+        )
     if p.azimuth_bins is None and (recipe.frame == "object" or "azimuth_bin" in recipe.inputs):
         other = "give --frame camera and --inputs without azimuth_bin"
         hint = f"train the recogniser with --azimuth-bins-weight, or {other}"

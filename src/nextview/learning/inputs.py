@@ -1,4 +1,6 @@
-"""The networks' inputs of a whole store: computed once and kept beside the store, each view packed for itself."""
+"""The networks' inputs of a whole store: computed once and kept beside the store, each view
+packed for itself.
+"""
 
 import os
 import time
@@ -18,13 +20,16 @@ from nextview.errors import DAMAGED, DatasetError
 from nextview.files import new_folder, only_one
 from nextview.recognition.network_input import CHANNELS_OF, InputKind, InputSpec, from_store
 
-PACKING = Blosc("lz4", 5, Blosc.NOSHUFFLE)  # views are mostly background and flat faces: a sixth is left, or less
+# views are mostly background and flat faces: a sixth is left, or less
+PACKING = Blosc("lz4", 5, Blosc.NOSHUFFLE)
 AGAIN = "delete it, and it is made again"
 
 
 @dataclass(frozen=True)
 class PackedViews:
-    """Views of all objects, (N, V, C, H, W) uint8, read like an array: ``views[i, v]``, ``views[i, 2:5]``."""
+    """Views of all objects, (N, V, C, H, W) uint8, read like an array: ``views[i, v]``,
+    ``views[i, 2:5]``.
+    """
 
     packed: NDArray[np.uint8]
     places: NDArray[np.int64]
@@ -41,7 +46,9 @@ class PackedViews:
     def __getitem__(self, at: int | tuple[int, int | slice]) -> NDArray[np.uint8]:
         places = self.places[at]
         views = np.zeros((*places.shape[:-1], *self.size), np.uint8)
-        for (start, count), view in zip(places.reshape(-1, 2), views.reshape(-1, *self.size), strict=True):
+        for (start, count), view in zip(
+            places.reshape(-1, 2), views.reshape(-1, *self.size), strict=True
+        ):
             if count:
                 PACKING.decode(self.packed[start : start + count], view)
         return views
@@ -53,9 +60,12 @@ def inputs_path(store: Path, size: int, kind: InputKind = "geometry") -> Path:
     return store.with_name(f"{store.name}.{'inputs' if kind == 'geometry' else kind}{size}")
 
 
-def ready_inputs(path: Path, size: int, kind: InputKind = "geometry", track: Track = silently) -> PackedViews:
+def ready_inputs(
+    path: Path, size: int, kind: InputKind = "geometry", track: Track = silently
+) -> PackedViews:
     """The inputs of a store, (N, V, C, size, size) uint8, computed if they are not there."""
-    from nextview.learning.runs import is_first  # not above: the processes that compute inputs need no torch
+    # not above: the processes that compute inputs need no torch
+    from nextview.learning.runs import is_first
 
     target = inputs_path(path, size, kind)
     if is_first() and not target.exists():
@@ -78,7 +88,9 @@ def _compute(path: Path, target: Path, spec: InputSpec) -> Iterator[int]:
         with open(part / "views.lz4", "wb") as file:
             for done, (i, packed) in enumerate(each(partial(_packed, path, spec), chosen), 1):
                 if isinstance(packed, WorkerDied):
-                    raise DatasetError(f"{path}: the inputs of {store.names[i]} cannot be computed: {packed}")
+                    raise DatasetError(
+                        f"{path}: the inputs of {store.names[i]} cannot be computed: {packed}"
+                    )
                 counts = np.array([len(view) for view in packed])
                 places[i] = np.stack([file.tell() + np.cumsum(counts) - counts, counts], 1)
                 file.writelines(packed)
@@ -88,16 +100,21 @@ def _compute(path: Path, target: Path, spec: InputSpec) -> Iterator[int]:
 
 
 def _packed(path: Path, spec: InputSpec, i: int) -> list[bytes]:
-    return [PACKING.encode(np.ascontiguousarray(view)) for view in from_store(spec, ViewStore.open(path), i)]
+    return [
+        PACKING.encode(np.ascontiguousarray(view))
+        for view in from_store(spec, ViewStore.open(path), i)
+    ]
 
 
 def load_inputs(path: Path, size: int, kind: InputKind = "geometry") -> PackedViews:
     """The inputs of a store, (N, V, C, size, size) uint8, as ``ready_inputs`` computed them."""
-    target, store = inputs_path(path, size, kind), ViewStore.open(path)
+    target = inputs_path(path, size, kind)
+    store = ViewStore.open(path)
     file = target / "views.lz4"
     try:
         with np.load(target / "index.npz") as index:
-            places, shape = index["places"], tuple(index["size"].tolist())
+            places = index["places"]
+            shape = tuple(index["size"].tolist())
         packed = np.memmap(file, np.uint8, "r") if file.stat().st_size else np.zeros(0, np.uint8)
         if len(packed) != places[..., 1].sum():
             raise ValueError(f"{len(packed)} bytes of {places[..., 1].sum()}")

@@ -1,4 +1,6 @@
-"""Teach things: from a folder of meshes or captured frames to a memory that recognises them, without PyTorch."""
+"""Teach things: from a folder of meshes or captured frames to a memory that recognises them,
+without PyTorch.
+"""
 
 import glob
 import hashlib
@@ -58,9 +60,13 @@ from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 
 NAME = "memory"  # of the card in a folder of taught things, and of the file beside it
-CARD, WEIGHTS, PICTURE = f"{NAME}.json", f"{NAME}{MEMORY_SUFFIX}", "learned.png"
-JUDGED = "judged"  # folder beside these things, of the memory that things are shown to before it is finished
-PARTS = "things"  # the key of the things that a run that was stopped has taught, see ``files.unfinished``
+CARD = f"{NAME}.json"
+WEIGHTS = f"{NAME}{MEMORY_SUFFIX}"
+PICTURE = "learned.png"
+# folder beside these things, of the memory that things are shown to before it is finished
+JUDGED = "judged"
+# the key of the things that a run that was stopped has taught, see ``files.unfinished``
+PARTS = "things"
 Pair = tuple[Source, Arrays]  # a thing, and what is remembered of it
 
 
@@ -85,31 +91,46 @@ class Work:
 
 @dataclass(frozen=True)
 class Learned:
-    """What was learned."""
+    """What was learned.
 
-    out: Path  # the folder
-    things: int  # how many, of so many ``classes``
+    Attributes:
+        out: the folder.
+        things: how many, of so many ``classes``.
+        accuracy: share of the cases in which views are named right after 1, 2 and 3 of them, by
+            geometry where it is known, with weights that were fitted to other things, else after 1,
+            2, 3 and 5 held-out views by features and size; things of a class of several by the
+            others of that class.
+        confused: pairs of things that are most often taken for each other, with the share of the
+            cases.
+        notes: what there is to know, a sentence each.
+        left_out: what could not be learned and why, a phrase each.
+        by_features: where ``accuracy`` is by geometry: the same cases by features and size alone.
+        judged: how many things were shown to tell it by geometry.
+    """
+
+    out: Path
+    things: int
     classes: int
-    # share of the cases in which views are named right after 1, 2 and 3 of them, by geometry where it is known, with
-    # weights that were fitted to other things, else after 1, 2, 3 and 5 held-out views by features and size; things of
-    # a class of several by the others of that class
     accuracy: tuple[float, ...]
-    # pairs of things that are most often taken for each other, with the share of the cases
     confused: tuple[tuple[str, str, float], ...]
-    notes: tuple[str, ...]  # what there is to know, a sentence each
-    left_out: tuple[str, ...]  # what could not be learned and why, a phrase each
-    by_features: tuple[float, ...] = ()  # where ``accuracy`` is by geometry: the same cases by features and size alone
-    judged: int = 0  # how many things were shown to tell it by geometry
+    notes: tuple[str, ...]
+    left_out: tuple[str, ...]
+    by_features: tuple[float, ...] = ()
+    judged: int = 0
 
     def __str__(self) -> str:
         """In words."""
         classes = "" if self.classes == self.things else f" of {self.classes} classes"
         thing = "thing" if self.things == 1 else "things"
         lines = [f"{self.things} {thing}{classes} learned; {self._how_often()}"]
-        lines += [f"confused: {a} and {b} ({share:.0%} of the cases)" for a, b, share in self.confused[:5]]
+        lines += [
+            f"confused: {a} and {b} ({share:.0%} of the cases)" for a, b, share in self.confused[:5]
+        ]
         if len(self.confused) > 5:
             lines.append(f"and {len(self.confused) - 5} pairs less often")
-        return "\n".join(lines + [*self.notes] + [f"left out: {phrase}" for phrase in self.left_out])
+        return "\n".join(
+            lines + [*self.notes] + [f"left out: {phrase}" for phrase in self.left_out]
+        )
 
     def _how_often(self) -> str:
         """How often views are named right, in words."""
@@ -127,30 +148,42 @@ def _percent(shares: Sequence[float]) -> str:
 
 
 def learn(folder: str | Path, out: str | Path, **options: Any) -> Learned:
-    """Teach the things in a folder; options are those of ``How`` and of ``learn_things``, which says all."""
+    """Teach the things in a folder; options are those of ``How`` and of ``learn_things``, which
+    says all.
+    """
     how = {name: options.pop(name) for name in How.__dataclass_fields__ if name in options}
     return learn_things(Path(folder), Path(out), How(**how), **options)
 
 
 def learn_things(
-    folder: Path,  # what is to be taught
-    out: Path,  # folder to write
+    folder: Path,
+    out: Path,
     how: How = How(),
-    # put the things beside those that OUT knows, which are not looked at again; so FOLDER holds the new ones alone
     add: bool = False,
-    # forget the things of these names in OUT; nothing is added where FOLDER is OUT, too
     remove: tuple[str, ...] = (),
-    workers: int | None = None,  # processes; one for each core by default; 0 to work in this one
-    # address of a dask.distributed scheduler whose workers see the same files, to use instead
+    workers: int | None = None,
     scheduler: str | None = None,
-    overwrite: bool = False,  # replace what OUT knows
-    track: Track = silently,  # follows the things
+    overwrite: bool = False,
+    track: Track = silently,
 ) -> Learned:
     """Teach the things in a folder, and write a folder of models that recognises them.
 
-    Each mesh in the folder is a thing of its own name, as is each folder of captured depth frames with poses (BOP, TUM
-    RGB-D or 7-Scenes) or from a turntable; any other folder is a class, and the meshes in it are its things. A run that
-    was stopped goes on where it was. Use what it writes with --models OUT, or ``nextview.load(models=OUT)``.
+    Each mesh in the folder is a thing of its own name, as is each folder of captured depth frames
+    with poses (BOP, TUM RGB-D or 7-Scenes) or from a turntable; any other folder is a class, and
+    the meshes in it are its things. A run that was stopped goes on where it was. Use what it writes
+    with --models OUT, or ``nextview.load(models=OUT)``.
+
+    Args:
+        folder: what is to be taught.
+        out: folder to write.
+        add: put the things beside those that OUT knows, which are not looked at again; so FOLDER
+            holds the new ones alone.
+        remove: forget the things of these names in OUT; nothing is added where FOLDER is OUT, too.
+        workers: processes; one for each core by default; 0 to work in this one.
+        scheduler: address of a dask.distributed scheduler whose workers see the same files, to use
+            instead.
+        overwrite: replace what OUT knows.
+        track: follows the things.
 
     Raises:
         DatasetError: nothing can be taught; what is wrong, in one sentence.
@@ -177,7 +210,9 @@ def learn_things(
         if not taught and nothing_new:
             raise UsageError(f"{out}: would know nothing any more; delete it instead")
         if not taught:
-            raise DatasetError(f"{folder}: none of its things could be taught ({'; '.join(left_out[:3])})")
+            raise DatasetError(
+                f"{folder}: none of its things could be taught ({'; '.join(left_out[:3])})"
+            )
         taught.sort(key=lambda pair: (pair[0].label, pair[0].name))
         if not how.any_size:
             radii = np.concatenate([arrays["radii"] for _, arrays in taught])
@@ -187,7 +222,8 @@ def learn_things(
 
 
 def _check_places(out: Path, keeps: bool, overwrite: bool) -> None:
-    """Refuse, before any work is done, a folder that cannot be written, or a memory that must not be replaced.
+    """Refuse, before any work is done, a folder that cannot be written, or a memory that must not
+    be replaced.
 
     Raises:
         UsageError: there is a memory, and it is neither to be kept nor to be replaced.
@@ -195,7 +231,9 @@ def _check_places(out: Path, keeps: bool, overwrite: bool) -> None:
     """
     card = out / CARD
     if card.exists() and not keeps and not overwrite:
-        raise UsageError(f"{out}: knows things already; --add puts others beside them, --overwrite replaces them")
+        raise UsageError(
+            f"{out}: knows things already; --add puts others beside them, --overwrite replaces them"
+        )
     check_new(out, keeps or overwrite, folder=True)
     for place in (card, out / PICTURE):
         check_new(place, overwrite=True)
@@ -215,7 +253,10 @@ def _check_names(things: Sequence[Source], taught: Sequence[Pair]) -> None:
     names = {source.name for source, _ in taught}
     for thing in things:
         if thing.name in names:
-            raise UsageError(f"{thing.path}: something called {thing.name} is known already; --remove it, or rename it")
+            raise UsageError(
+                f"{thing.path}: something called {thing.name} is known already; --remove it, or"
+                " rename it"
+            )
 
 
 def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]:
@@ -238,7 +279,11 @@ def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]
         surface = memory.surfaces.surface(index, thing.name)
         if surface is not None:
             symmetries = np.array([(*one.axis, one.order) for one in thing.symmetries], np.float64)
-            arrays |= {VERTICES: surface.vertices, FACES: surface.faces, SYMMETRIES: symmetries.reshape(-1, 4)}
+            arrays |= {
+                VERTICES: surface.vertices,
+                FACES: surface.faces,
+                SYMMETRIES: symmetries.reshape(-1, 4),
+            }
         kept.append((Source(thing.name, label, Path(thing.source)), arrays))
     return kept
 
@@ -246,8 +291,12 @@ def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]
 PER_THING = ("held_out", "held_out_views", "radii", "pictures")
 
 
-def _teach(sources: Sequence[Source], work: Work, taught: list[Pair], left_out: list[str]) -> Iterator[int]:
-    """Teach things side by side, each into a file of its own; what is there from a run that was stopped is taken."""
+def _teach(
+    sources: Sequence[Source], work: Work, taught: list[Pair], left_out: list[str]
+) -> Iterator[int]:
+    """Teach things side by side, each into a file of its own; what is there from a run that was
+    stopped is taken.
+    """
     waiting = []
     for source in sources:
         stamp = _stamp(source, work.how)
@@ -256,7 +305,8 @@ def _teach(sources: Sequence[Source], work: Work, taught: list[Pair], left_out: 
             taught.append((source, _without_phrase(source, arrays, left_out)))
         else:
             waiting.append((source, stamp))
-    waiting.sort(key=lambda item: -item[0].path.stat().st_size)  # the longest first: none is left alone at the end
+    # the longest first: none is left alone at the end
+    waiting.sort(key=lambda item: -item[0].path.stat().st_size)
     # A thing alone takes all cores.
     threads = 1 if work.scheduler else max(1, count_workers(work.workers) // max(1, len(waiting)))
     teach_one = partial(_teach_one, work.how, work.part, threads)
@@ -283,8 +333,9 @@ def _without_phrase(source: Source, arrays: Arrays, left_out: list[str]) -> Arra
 def _stamp(source: Source, how: How) -> str:
     """What the part of a thing was made from: it is made anew if any of this has changed.
 
-    That is its path, the name, size and time of its file or of each file in its folder, the options, and the features.
-    The time of the folder itself does not tell: copying over its files leaves it as it was.
+    That is its path, the name, size and time of its file or of each file in its folder, the
+    options, and the features. The time of the folder itself does not tell: copying over its files
+    leaves it as it was.
     """
     content = hashlib.sha256()
     for file in _files_of(source.path):
@@ -296,7 +347,9 @@ def _stamp(source: Source, how: How) -> str:
         content.update(seen.encode(errors="surrogateescape"))
 
     features = find_card(FEATURES).sha256
-    return repr((str(source.path.resolve()), content.hexdigest(), replace(how, any_size=False), features))
+    return repr(
+        (str(source.path.resolve()), content.hexdigest(), replace(how, any_size=False), features)
+    )
 
 
 def _files_of(path: Path) -> Iterator[Path]:
@@ -314,13 +367,17 @@ def _files_of(path: Path) -> Iterator[Path]:
 
 
 def _part_of(part: Path, source: Source) -> Path:
-    """Where what is remembered of a thing is kept until all are taught; names may be too long for a file's."""
+    """Where what is remembered of a thing is kept until all are taught; names may be too long
+    for a file's.
+    """
     name = source.name.encode(errors="surrogateescape")
     return part / f"{hashlib.sha256(name).hexdigest()[:32]}.safetensors"
 
 
 def _finished(file: Path, stamp: str) -> Arrays | None:
-    """What an earlier run that was stopped has left of a thing; None if nothing, or it was of something else."""
+    """What an earlier run that was stopped has left of a thing; None if nothing, or it was of
+    something else.
+    """
     try:
         arrays = load_file(file)
     except (OSError, SafetensorError):  # missing, or damaged: it is made again
@@ -345,11 +402,14 @@ def _teach_one(how: How, part: Path, threads: int, item: tuple[Source, str]) -> 
     return arrays
 
 
-def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: ModelCard | None, work: Work) -> Learned:
+def _write(
+    out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: ModelCard | None, work: Work
+) -> Learned:
     """Fit what is fitted to all things together, and write memory and card.
 
-    The new memory gets a name of its own, with its hash. The card's renaming is what makes it the one that counts: a
-    run that is killed leaves the old memory or the new one. The old file is removed at the very end.
+    The new memory gets a name of its own, with its hash. The card's renaming is what makes it the
+    one that counts: a run that is killed leaves the old memory or the new one. The old file is
+    removed at the very end.
     """
     classes = tuple(dict.fromkeys(source.label for source, _ in taught))
     label = np.array([classes.index(source.label) for source, _ in taught])
@@ -365,14 +425,25 @@ def _write(out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: Mode
 
     with new_folder(out, overwrite=True, last=CARD) as part:
         weights = _save(part, card, memory)
-        draw_learned(part / PICTURE, {source.name: arrays["pictures"] for source, arrays in taught}, fit)
-        if _is_intact(out / weights.name, read_card(part / CARD).sha256):  # the very same memory again
+        draw_learned(
+            part / PICTURE, {source.name: arrays["pictures"] for source, arrays in taught}, fit
+        )
+        # the very same memory again
+        if _is_intact(out / weights.name, read_card(part / CARD).sha256):
             weights.unlink()
     _remove_old(out, weights.name)
 
     names = [source.name for source, _ in taught]
     confused_names = tuple((names[a], names[b], share) for a, b, share in fit.confused)
-    learned = Learned(out, len(taught), len(classes), fit.accuracy, confused_names, _notes(taught), tuple(left_out))
+    learned = Learned(
+        out,
+        len(taught),
+        len(classes),
+        fit.accuracy,
+        confused_names,
+        _notes(taught),
+        tuple(left_out),
+    )
     if verified is None:
         return learned
     return replace(learned, by_features=verified.by_features, judged=verified.things)
@@ -387,10 +458,13 @@ def _save(folder: Path, card: ModelCard, memory: Memory) -> Path:
     return weights
 
 
-def _verified(card: ModelCard, memory: Memory, old: ModelCard | None, work: Work) -> VerifiedFit | None:
+def _verified(
+    card: ModelCard, memory: Memory, old: ModelCard | None, work: Work
+) -> VerifiedFit | None:
     """Show things of known geometry, and fit to what is found; None if there are none.
 
-    All are shown, or a drawn part of very many. Where things are added to more than there were before, the new ones
+    All are shown, or a drawn part of very many. Where things are added to more than there were
+    before, the new ones
     alone: the weights stay, until there are GROWTH times as many things as they were fitted to.
     """
     if not memory.surfaces.counts.any():
@@ -415,14 +489,20 @@ def _verified(card: ModelCard, memory: Memory, old: ModelCard | None, work: Work
     return with_new_things(before, _shown(folder, new, len(labels), rng, work), labels, carried)
 
 
-def _shown(folder: Path, things: Sequence[int], known: int, rng: np.random.Generator, work: Work) -> list[Shown]:
-    """Show things to the memory in a folder, side by side; sorted, so that nothing depends on who is done first."""
+def _shown(
+    folder: Path, things: Sequence[int], known: int, rng: np.random.Generator, work: Work
+) -> list[Shown]:
+    """Show things to the memory in a folder, side by side; sorted, so that nothing depends on
+    who is done first.
+    """
     items = to_be_shown(things, known, rng)
     found = dict[tuple[int, int], list[Shown]]()
 
     def watched() -> Iterator[int]:
         show_one = partial(show, folder / CARD, work.how.sensor, work.how.seed)
-        for count, (item, result) in enumerate(each(show_one, items, work.workers, work.scheduler), 1):
+        for count, (item, result) in enumerate(
+            each(show_one, items, work.workers, work.scheduler), 1
+        ):
             if isinstance(result, WorkerDied):
                 raise DatasetError(f"{folder}: its things could not be shown ({result})")
             found[item] = result
@@ -434,7 +514,9 @@ def _shown(folder: Path, things: Sequence[int], known: int, rng: np.random.Gener
 
 
 def _with_verification(card: ModelCard, memory: Memory, verified: VerifiedFit) -> ModelCard:
-    """A card that says what was fitted to the surfaces; its residuals are of all things, 0 without geometry."""
+    """A card that says what was fitted to the surfaces; its residuals are of all things, 0
+    without geometry.
+    """
     about = card.memory
     assert about is not None
     verification = verified.verification
@@ -447,7 +529,9 @@ def _with_verification(card: ModelCard, memory: Memory, verified: VerifiedFit) -
     if verified.accuracy:
         scores["verified by geometry"] = _by_views(verified.accuracy)
         scores["the same by features"] = _by_views(verified.by_features)
-    return replace_record(card, memory=replace_record(about, verification=verification), scores=scores)
+    return replace_record(
+        card, memory=replace_record(about, verification=verification), scores=scores
+    )
 
 
 def _by_views(shares: Sequence[float]) -> dict[str, float]:
@@ -456,15 +540,22 @@ def _by_views(shares: Sequence[float]) -> dict[str, float]:
 
 
 def _fitted(taught: Sequence[Pair], label: NDArray[np.int64]) -> tuple[Memory, Fit]:
-    """The memory of things, and what is fitted to all of them together; ``label`` is the class of each."""
+    """The memory of things, and what is fitted to all of them together; ``label`` is the class
+    of each.
+    """
     poses = [len(arrays["views"]) for _, arrays in taught]
     thing = np.repeat(np.arange(len(taught)), poses)
     stacked = {name: np.stack([arrays[name] for _, arrays in taught]) for name in PER_THING}
     stacked["radii"] = stacked["radii"][:, 0]
-    joint = {name: np.concatenate([arrays[name] for _, arrays in taught]) for name in ("views", "rotations")}
+    joint = {
+        name: np.concatenate([arrays[name] for _, arrays in taught])
+        for name in ("views", "rotations")
+    }
     fit = fit_memory(joint["views"], thing, label, *(stacked[name] for name in PER_THING[:3]))
     surfaces = StoredSurfaces.of([_surface_of(source, arrays) for source, arrays in taught])
-    memory = Memory(thing=thing, head=fit.head, head_bias=fit.head_bias, surfaces=surfaces, **joint, **stacked)
+    memory = Memory(
+        thing=thing, head=fit.head, head_bias=fit.head_bias, surfaces=surfaces, **joint, **stacked
+    )
     return memory, fit
 
 
@@ -483,14 +574,18 @@ def _card(
     fit: Fit,
     commands: tuple[str, ...],
 ) -> ModelCard:
-    """The card of a memory, still without the hash of its file; ``commands`` made what it held before."""
+    """The card of a memory, still without the hash of its file; ``commands`` made what it held
+    before.
+    """
     poses = np.bincount(memory.thing)
     things = tuple(
         Thing(source.name, str(source.path), int(count), _symmetries_of(arrays))
         for (source, arrays), count in zip(taught, poses, strict=True)
     )
     features = find_card(FEATURES)
-    novelty, usual = (tuple(map(tuple, np.round(rows, 4).tolist())) for rows in (fit.quantiles, fit.usual))
+    novelty, usual = (
+        tuple(map(tuple, np.round(rows, 4).tolist())) for rows in (fit.quantiles, fit.usual)
+    )
     return ModelCard(
         NAME,
         "recogniser",
@@ -499,10 +594,16 @@ def _card(
         network="memory of views",
         classes=classes,
         azimuth_bins=AZIMUTHS,
-        calibration=Calibration(1.0, 1.0, None, fit.correlation, tuple(label[memory.thing].tolist())),
+        calibration=Calibration(
+            1.0, 1.0, None, fit.correlation, tuple(label[memory.thing].tolist())
+        ),
         size=size_evidence(memory.radii, label),
         training=Training(f"{len(taught)} things", commands=commands),
-        scores={"held-out views": {str(k): round(a, 4) for k, a in zip(VIEWS, fit.accuracy, strict=True)}},
+        scores={
+            "held-out views": {
+                str(k): round(a, 4) for k, a in zip(VIEWS, fit.accuracy, strict=True)
+            }
+        },
         memory=Taught(things, features.sha256, fit.weight, novelty=novelty, usual=usual),
     ).made_by(command())
 
@@ -520,12 +621,17 @@ def _is_intact(weights: Path, sha256: str) -> bool:
 def _remove_old(out: Path, kept: str) -> None:
     """Remove the files of memories that the card does not name any more.
 
-    Ours are those whose name holds their hash, and that of earlier versions, which has none, if it is a memory. A link
-    is removed, never what it points to.
+    Ours are those whose name holds their hash, and that of earlier versions, which has none, if it
+    is a memory. A link is removed, never what it points to.
     """
     for file in out.glob(f"{glob.escape(NAME)}-*{MEMORY_SUFFIX}"):
         digits = file.stem.removeprefix(f"{NAME}-")
-        if file.name != kept and len(digits) == SHORT_HASH and file.is_file() and sha256_of(file).startswith(digits):
+        if (
+            file.name != kept
+            and len(digits) == SHORT_HASH
+            and file.is_file()
+            and sha256_of(file).startswith(digits)
+        ):
             file.unlink()
 
     earlier = out / WEIGHTS
@@ -544,9 +650,13 @@ def _holds_views(file: Path) -> bool:
 
 def _notes(taught: Sequence[Pair]) -> tuple[str, ...]:
     """What there is to know of what was learned, a sentence each."""
-    names, notes = [source.name for source, _ in taught], []
+    names = [source.name for source, _ in taught]
+    notes = []
     if len(taught) == 1:
-        notes.append(f"{names[0]} is all it knows, so everything is that; teach what it may be mistaken for, too")
+        notes.append(
+            f"{names[0]} is all it knows, so everything is that; teach what it may be mistaken"
+            " for, too"
+        )
     first: dict[bytes, str] = {}
     for source, arrays in taught:
         # The picture is a render without errors: only the same mesh gives the very same one.
@@ -554,12 +664,16 @@ def _notes(taught: Sequence[Pair]) -> tuple[str, ...]:
         if (twin := first.setdefault(look, source.name)) != source.name:
             notes.append(f"{twin} and {source.name} look the same: one thing under two names?")
     for source, arrays in taught:
-        doubts = arrays.get("doubts", np.zeros(0, np.uint8))  # of what was taught now, from a mesh file
+        # of what was taught now, from a mesh file
+        doubts = arrays.get("doubts", np.zeros(0, np.uint8))
         notes.extend(f"{source.name}: {doubt}" for doubt in doubts.tobytes().decode().splitlines())
     for source, arrays in taught:
         if not arrays["held_out"].any():
             notes.append(f"{source.name}: the sensor sees nothing of it; is it in another unit?")
     unknown = [source.name for source, arrays in taught if not np.isfinite(arrays["radii"])]
     if unknown and len(taught) > 1:
-        notes.append(f"the size of {len(unknown)} of {len(taught)} things is not known; --unit makes it count")
+        notes.append(
+            f"the size of {len(unknown)} of {len(taught)} things is not known; --unit makes it"
+            " count"
+        )
     return tuple(notes)

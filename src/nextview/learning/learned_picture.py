@@ -15,7 +15,9 @@ PICTURE_WIDTH = 1.05  # inches, and as high
 GAP = 0.11  # between pictures, inches
 LINE = 0.22  # height of a name below a picture, inches
 MARGIN = 0.33
-COLUMNS, ROWS = 6, 2  # of things beside the bars
+# of things beside the bars
+COLUMNS = 6
+ROWS = 2
 ALL_COLUMNS = 9  # of things below the bars
 ROW = PICTURE_WIDTH + LINE + GAP
 TITLE_HEIGHT = 0.75
@@ -23,13 +25,16 @@ MOST_THINGS = 120  # of more an even choice is shown
 MOST_PAIRS = 4
 LONGEST_NAME = 18  # letters
 PIXELS_PER_INCH = 120
-INK, QUIET, BAR = "#1d1d1f", "#8a8a8e", "#2f6fde"
+INK = "#1d1d1f"
+QUIET = "#8a8a8e"
+BAR = "#2f6fde"
 
 Pictures = Mapping[str, NDArray[np.uint8]]
 
 
 def draw_learned(path: Path, pictures: Pictures, fit: Fit) -> None:
-    """Write the picture: the things, the share named right by the number of views, and the pairs confused most.
+    """Write the picture: the things, the share named right by the number of views, and the pairs
+    confused most.
 
     It is as high as what is on it.
 
@@ -46,7 +51,8 @@ def draw_learned(path: Path, pictures: Pictures, fit: Fit) -> None:
     height = TITLE_HEIGHT + rows * ROW + pairs_height + MARGIN
 
     figure = Figure(figsize=(PAGE_WIDTH, height), dpi=PIXELS_PER_INCH, facecolor="white")
-    page = figure.add_axes((0, 0, 1, 1))  # one for all pictures: axes take longer than what is in them
+    # one for all pictures: axes take longer than what is in them
+    page = figure.add_axes((0, 0, 1, 1))
     page.set_axis_off()
     page.set(xlim=(0, PAGE_WIDTH), ylim=(height, 0))  # inches from the top left corner
     _draw_things(page, pictures, shown)
@@ -103,18 +109,33 @@ def _draw_bars(figure: Figure, fit: Fit, height: float) -> None:
     axes.set_xlabel("views", size=10, color=INK)
 
 
-def _draw_pairs(page: Axes, pictures: Pictures, pairs: list[tuple[str, str, float]], top: float) -> None:
-    heading = "confused most, share of the cases after two views" if pairs else "no two things are confused"
+def _draw_pairs(
+    page: Axes, pictures: Pictures, pairs: list[tuple[str, str, float]], top: float
+) -> None:
+    heading = (
+        "confused most, share of the cases after two views"
+        if pairs
+        else "no two things are confused"
+    )
     page.text(MARGIN, top, heading, size=11, color=INK, weight="bold")
     each = (PAGE_WIDTH - 2 * MARGIN + GAP) / MOST_PAIRS
     for k, (first, second, share) in enumerate(pairs):
         left = MARGIN + k * each
         _draw_picture(page, left, top + 1.6 * LINE, pictures[first], first)
         _draw_picture(page, left + PICTURE_WIDTH + GAP, top + 1.6 * LINE, pictures[second], second)
-        page.text(left + PICTURE_WIDTH + GAP / 2, top + 1.3 * LINE, f"{share:.0%}", size=10, color=QUIET, ha="center")
+        page.text(
+            left + PICTURE_WIDTH + GAP / 2,
+            top + 1.3 * LINE,
+            f"{share:.0%}",
+            size=10,
+            color=QUIET,
+            ha="center",
+        )
 
 
-def _draw_picture(page: Axes, left: float, top: float, picture: NDArray[np.uint8], name: str) -> None:
+def _draw_picture(
+    page: Axes, left: float, top: float, picture: NDArray[np.uint8], name: str
+) -> None:
     """A small picture with its name below, at a place in inches."""
     shade = np.where(picture > 0, 60 + 0.7 * picture.astype(float), 255)
     extent = (left, left + PICTURE_WIDTH, top + PICTURE_WIDTH, top)
@@ -122,4 +143,6 @@ def _draw_picture(page: Axes, left: float, top: float, picture: NDArray[np.uint8
     words = name.replace("_", " ")
     short = words if len(words) <= LONGEST_NAME else f"{words[: LONGEST_NAME - 3]}..."
     middle = left + PICTURE_WIDTH / 2
-    page.text(middle, top + PICTURE_WIDTH + LINE / 2, short, size=7.5, color=INK, ha="center", va="center")
+    page.text(
+        middle, top + PICTURE_WIDTH + LINE / 2, short, size=7.5, color=INK, ha="center", va="center"
+    )

@@ -1,4 +1,6 @@
-"""The stage from a view store to a trained map network: it learns one value for every view of an object."""
+"""The stage from a view store to a trained map network: it learns one value for every view of an
+object.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +20,15 @@ from nextview.geometry.viewsphere import ViewSphere
 from nextview.learning.architectures import map_columns, map_network, orthogonality
 from nextview.learning.inputs import PackedViews, ready_inputs
 from nextview.learning.recipes import Hardware, MapRecipe
-from nextview.learning.runs import OwnBatches, fit, new_run, optimiser, read_run, start_from, train_once
+from nextview.learning.runs import (
+    OwnBatches,
+    fit,
+    new_run,
+    optimiser,
+    read_run,
+    start_from,
+    train_once,
+)
 from nextview.recognition.map_names import CONFIDENCE
 from nextview.recognition.network_input import cloud_input
 
@@ -32,17 +42,31 @@ Seen = NDArray[Any] | PackedViews  # of N objects from V views, what the network
 
 
 class Windows(OwnBatches):
-    """Batches of (what the network sees, map (B, rings, columns)) from values (N, V) of some objects, drawn anew."""
+    """Batches of (what the network sees, map (B, rings, columns)) from values (N, V) of some
+    objects, drawn anew.
+    """
 
     def __init__(
-        self, seen: Seen, values: NDArray, sphere: ViewSphere, objects: NDArray, recipe: MapRecipe, training: bool
+        self,
+        seen: Seen,
+        values: NDArray,
+        sphere: ViewSphere,
+        objects: NDArray,
+        recipe: MapRecipe,
+        training: bool,
     ) -> None:
-        self.seen, self.values, self.poses, self.objects = seen, values, sphere.poses, objects
-        steps, n = np.array(map_columns(recipe, sphere)), sphere.azimuths
+        self.seen = seen
+        self.values = values
+        self.poses = sphere.poses
+        self.objects = objects
+        steps = np.array(map_columns(recipe, sphere))
+        n = sphere.azimuths
         azimuths = (sphere.azimuth_index[:, None] + steps) % n
-        self.around = np.arange(sphere.rings)[None, :, None] * n + azimuths[:, None, :]  # (V, rings, columns)
+        # (V, rings, columns)
+        self.around = np.arange(sphere.rings)[None, :, None] * n + azimuths[:, None, :]
         self.mirror = [list(steps % n).index(-step % n) for step in steps]
-        self.recipe, self.training = recipe, training
+        self.recipe = recipe
+        self.training = training
         self.batch = min(recipe.batch, len(objects) * recipe.views_per_object)
 
     def __len__(self) -> int:
@@ -50,18 +74,28 @@ class Windows(OwnBatches):
 
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
         rng = np.random.default_rng([self.recipe.seed, self.epoch])
-        n, v, batch = len(self) * self.batch, len(self.poses), self.batch
-        if self.training:  # every object as often as any other, and each of its views before one comes again
+        n = len(self) * self.batch
+        v = len(self.poses)
+        batch = self.batch
+        # every object as often as any other, and each of its views before one comes again
+        if self.training:
             turns = np.argsort(rng.random((v, len(self.objects))), axis=0)
             views = np.resize(turns, (self.recipe.views_per_object, len(self.objects))).flatten()
-            objects, order = np.tile(self.objects, self.recipe.views_per_object), rng.permutation(len(views))[:n]
-            objects, views = objects[order], views[order]
+            objects = np.tile(self.objects, self.recipe.views_per_object)
+            order = rng.permutation(len(views))[:n]
+            objects = objects[order]
+            views = views[order]
         else:  # the same spread of views every time
-            objects, views = np.repeat(self.objects, self.recipe.views_per_object)[:n], (np.arange(n) * 7) % v
+            objects = np.repeat(self.objects, self.recipe.views_per_object)[:n]
+            views = (np.arange(n) * 7) % v
         mirrored = rng.random(n) < 0.5 * (self.training and self.recipe.mirror)
         for here in np.arange(n).reshape(-1, batch)[:, self.share]:
-            points = rng.permutation(1024)[: self.recipe.points] if self.training else np.arange(1024)
-            o, w, m = objects[here], views[here], mirrored[here]
+            points = (
+                rng.permutation(1024)[: self.recipe.points] if self.training else np.arange(1024)
+            )
+            o = objects[here]
+            w = views[here]
+            m = mirrored[here]
             seen: NDArray[Any] = np.stack([self.seen[i, k] for i, k in zip(o, w, strict=True)])
             target = self.values[o[:, None, None], self.around[w]]
             if self.recipe.input == "cloud":
@@ -76,19 +110,26 @@ class Windows(OwnBatches):
 
 
 def peak_loss(logits: Tensor, goal: Tensor, reach: int) -> Tensor:
-    """Mean negative log-likelihood that a cell drawn by its logit lies within ``reach`` of the highest of ``goal``."""
-    cells = torch.cartesian_prod(*(torch.arange(float(n), device=goal.device) for n in goal.shape[1:]))
+    """Mean negative log-likelihood that a cell drawn by its logit lies within ``reach`` of the
+    highest of ``goal``.
+    """
+    cells = torch.cartesian_prod(
+        *(torch.arange(float(n), device=goal.device) for n in goal.shape[1:])
+    )
     away = (cells - cells[goal.flatten(1).argmax(1), None]).norm(dim=2)
     likely = logits.flatten(1).log_softmax(1)
     return -likely.masked_fill(away > reach, -torch.inf).logsumexp(1).mean()
 
 
 class MapModule(L.LightningModule):
-    """AdamW on the squared error, plus the regulariser of the PointNet's transforms (thesis, section 2.2.3)."""
+    """AdamW on the squared error, plus the regulariser of the PointNet's transforms (thesis,
+    section 2.2.3).
+    """
 
     def __init__(self, recipe: MapRecipe, sphere: ViewSphere, steps: int) -> None:
         super().__init__()
-        self.recipe, self.steps = recipe, steps
+        self.recipe = recipe
+        self.steps = steps
         self.net = map_network(recipe, sphere)
         columns = [step % sphere.azimuths for step in map_columns(recipe, sphere)]
         self.window = [columns.index(step % sphere.azimuths) for step in (-1, 0, 1)]
@@ -100,8 +141,10 @@ class MapModule(L.LightningModule):
 
     def training_step(self, batch: tuple[Tensor, Tensor], _: int) -> Tensor:
         predicted, *transforms = self(batch[0])
-        predicted, true = predicted.float(), batch[1]
-        near, goal = predicted[..., self.window], true[..., self.window]
+        predicted = predicted.float()
+        true = batch[1]
+        near = predicted[..., self.window]
+        goal = true[..., self.window]
         error = F.mse_loss(near, goal)
         self.log("mse", error, prog_bar=True, on_step=False, on_epoch=True, sync_dist=True)
         if self.recipe.extent == "sphere":
@@ -109,7 +152,9 @@ class MapModule(L.LightningModule):
         if self.recipe.peak_weight:
             lost = peak_loss(near / self.recipe.peak_sharpness, goal, self.recipe.peak_reach)
             error = error + self.recipe.peak_weight * lost
-        return error + self.recipe.orthogonality_weight * sum(orthogonality(t.float()) for t in transforms)
+        return error + self.recipe.orthogonality_weight * sum(
+            orthogonality(t.float()) for t in transforms
+        )
 
     def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:
         error = F.mse_loss(self(batch[0])[0].float()[..., self.window], batch[1][..., self.window])
@@ -120,22 +165,31 @@ class MapModule(L.LightningModule):
 
 
 def train_map(
-    store: Path,  # view store made by nextview render, with the 40 views and the measure (nextview measure)
-    out: Path,  # folder for checkpoints, logs and network.pt, the network of the epoch with the lowest squared error
-    # for --measure confidence, of the store's training split, by the recogniser whose confidence is to be predicted
+    store: Path,
+    out: Path,
     predictions: Path | None = None,
-    # folder of a finished run of the same depth and input from which a ResNet starts: a recogniser's, or a map
-    # network's to go on with
     weights: Path | None = None,
     recipe: MapRecipe = MapRecipe(),
     hardware: Hardware = Hardware(),
     track: Track = silently,
 ) -> list[Path]:
-    """Train a network that predicts a measure of the views around one. Resumes if OUT holds a run that was cut off.
+    """Train a network that predicts a measure of the views around one. Resumes if OUT holds a run
+    that was cut off.
+
+    Args:
+        store: view store made by nextview render, with the 40 views and the measure (nextview
+            measure).
+        out: folder for checkpoints, logs and network.pt, the network of the epoch with the lowest
+            squared error.
+        predictions: for --measure confidence, of the store's training split, by the recogniser
+            whose confidence is to be predicted.
+        weights: folder of a finished run of the same depth and input from which a ResNet starts: a
+            recogniser's, or a map network's to go on with.
 
     Raises:
         DatasetError: the store lacks what it takes, or another process trains in the same folder.
-        ModelError, PredictionsError: weights or predictions cannot be used; or ``out`` holds another run.
+        ModelError, PredictionsError: weights or predictions cannot be used; or ``out`` holds
+            another run.
     """
     views = ViewStore.open(store)
     predicted = None if predictions is None else Predictions.load(predictions)
@@ -149,25 +203,42 @@ def train_map(
 
     def fitted() -> nn.Module:
         cloud = recipe.input == "cloud"
-        seen = views.rows("points") if cloud else ready_inputs(store, recipe.size, recipe.input, track)
-        windows, judging = (Windows(seen, values, views.sphere, part, recipe, part is training) for part in parts)
+        seen = (
+            views.rows("points") if cloud else ready_inputs(store, recipe.size, recipe.input, track)
+        )
+        windows, judging = (
+            Windows(seen, values, views.sphere, part, recipe, part is training) for part in parts
+        )
         L.seed_everything(recipe.seed, verbose=False)
         module = MapModule(recipe, views.sphere, recipe.epochs * len(windows))
         if weights and cloud:
             raise ModelError(f"{weights}: a PointNet cannot start from a ResNet")
         if weights:
-            start_from(module.net.resnet, weights, head=weights.is_dir() and "measure" in read_run(weights).recipe)
+            start_from(
+                module.net.resnet,
+                weights,
+                head=weights.is_dir() and "measure" in read_run(weights).recipe,
+            )
         return fit(module, windows, judging, out, "validation_mse", "min", hardware).net.eval()
 
     train_once(out, run, fitted)
     return [out]
 
 
-def target_of(measure: str, store: ViewStore, predictions: Predictions | None = None) -> tuple[NDArray, NDArray]:
-    """A measure of all views, scaled to 0 .. 1 over each object's, or the confidence; and which objects have it."""
+def target_of(
+    measure: str, store: ViewStore, predictions: Predictions | None = None
+) -> tuple[NDArray, NDArray]:
+    """A measure of all views, scaled to 0 .. 1 over each object's, or the confidence; and which
+    objects have it.
+    """
     if (measure == CONFIDENCE) != (predictions is not None):
-        alone = f"a map of {measure} is learned from the store alone: predictions are for a map of the {CONFIDENCE}"
-        of_them = "a map of the confidence is learned from predictions: give those of the recogniser"
+        alone = (
+            f"a map of {measure} is learned from the store alone: predictions are for a map of the"
+            f" {CONFIDENCE}"
+        )
+        of_them = (
+            "a map of the confidence is learned from predictions: give those of the recogniser"
+        )
         raise UsageError(of_them if predictions is None else alone)
     if predictions is None:
         return normalise_per_object(store.measure(measure)), store.done

@@ -1,4 +1,6 @@
-"""What is fitted to a memory as a whole: how much a likeness weighs, a head for classes, sizes, and novelty."""
+"""What is fitted to a memory as a whole: how much a likeness weighs, a head for classes, sizes,
+and novelty.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +18,9 @@ CORRELATIONS = (0.1, 0.3, 0.6)  # of two views, see ``Calibration.bin_correlatio
 HEADS = (0.0, 5.0, 15.0)  # weights of the head beside the nearest views
 RIDGE = 1.0
 MOST_THINGS = 150  # things whose held-out views are judged: a drawn part of more
-DRAWS, VIEWS, FOLDS = 4, (1, 2, 3, 5), 5
+DRAWS = 4
+VIEWS = (1, 2, 3, 5)
+FOLDS = 5
 LEVELS = 101
 SIZE_ERROR = 0.05  # deviation of the logarithm of a radius that a sensor measures
 FAR = -1e3
@@ -24,32 +28,47 @@ FAR = -1e3
 
 @dataclass(frozen=True)
 class Fit:
-    """What was fitted; ``accuracy`` after as many held-out views as VIEWS says; ``confused`` (thing, thing, share)."""
+    """What was fitted; ``accuracy`` after as many held-out views as VIEWS says; ``confused``
+    (thing, thing, share).
+
+    Attributes:
+        usual: see ``recognition.novelty.Quantiles``.
+    """
 
     weight: float
     correlation: float
     head: Float
     head_bias: Float
     quantiles: Float
-    usual: Float  # see ``recognition.novelty.Quantiles``
+    usual: Float
     accuracy: tuple[float, ...]
     confused: tuple[tuple[int, int, float], ...]
 
 
 def fit_memory(
-    views: Float,  # (H, rings, azimuths, F), remembered, unit vectors
-    thing: Index,  # of each resting pose, (H,)
-    label: Index,  # class of each thing, ascending, (T,)
-    held_out: Float,  # embeddings of views that are not remembered, (T, K, F)
-    held_out_views: Float,  # their elevations and azimuths, radians, (T, K, 2)
-    radii: Float,  # object radius of each thing, metres, (T,); NaN where it is not known
+    views: Float,
+    thing: Index,
+    label: Index,
+    held_out: Float,
+    held_out_views: Float,
+    radii: Float,
 ) -> Fit:
     """Fit by the held-out views of the things, most likely after 1, 2, 3 and 5 of them.
 
-    A thing that has others of its class is judged by these alone, in folds over things: whoever teaches a class will
-    meet other things of it. A thing that is a class of its own is judged by what is remembered of itself.
+    A thing that has others of its class is judged by these alone, in folds over things: whoever
+    teaches a class will meet other things of it. A thing that is a class of its own is judged by
+    what is remembered of itself.
+
+    Args:
+        views: (H, rings, azimuths, F), remembered, unit vectors.
+        thing: of each resting pose, (H,).
+        label: class of each thing, ascending, (T,).
+        held_out: embeddings of views that are not remembered, (T, K, F).
+        held_out_views: their elevations and azimuths, radians, (T, K, 2).
+        radii: object radius of each thing, metres, (T,); NaN where it is not known.
     """
-    views, held_out = np.asarray(views, np.float32), np.asarray(held_out, np.float32)
+    views = np.asarray(views, np.float32)
+    held_out = np.asarray(held_out, np.float32)
     rng = np.random.default_rng(0)
     several = np.bincount(label)[label] > 1
     judged = np.sort(rng.permutation(len(label))[:MOST_THINGS])
@@ -62,14 +81,22 @@ def fit_memory(
     size = size_evidence(radii, label)
     measured = radii * np.exp(rng.normal(0, SIZE_ERROR, len(radii)))  # as a sensor would measure it
     sizes = np.float32(0) if size is None else size.logits(measured)[judged, None]
-    drawn = np.stack([np.stack([rng.permutation(held_out.shape[1]) for _ in range(DRAWS)]) for _ in judged])
-    where, of_class, scored = held_out_views[judged], label[thing], []
+    drawn = np.stack(
+        [np.stack([rng.permutation(held_out.shape[1]) for _ in range(DRAWS)]) for _ in judged]
+    )
+    where = held_out_views[judged]
+    of_class = label[thing]
+    scored = []
     for h in HEADS if several.any() else (0.0,):
         for w in WEIGHTS:
             sums = _sums(w * alike, h * heads + sizes, where, drawn, VIEWS)
-            scored += [(_belief(sums, heads.shape[-1], of_class, c), (w, c, h)) for c in CORRELATIONS]
+            scored += [
+                (_belief(sums, heads.shape[-1], of_class, c), (w, c, h)) for c in CORRELATIONS
+            ]
     truth = label[judged]
-    loss = [-np.mean([of_true_class(logs, truth).mean() for logs in beliefs]) for beliefs, _ in scored]
+    loss = [
+        -np.mean([of_true_class(logs, truth).mean() for logs in beliefs]) for beliefs, _ in scored
+    ]
     beliefs, (weight, correlation, head) = scored[int(np.argmin(loss))]
     accuracy = tuple(float((logs.argmax(-1) == truth[:, None]).mean()) for logs in beliefs)
     sums = _sums(weight * alike, head * heads + sizes, where, drawn, range(1, 1 + max(VIEWS)))
@@ -78,15 +105,19 @@ def fit_memory(
     scores = [-logs.max(-1) - own[logs.argmax(-1)] for logs, own in zip(each, usual, strict=True)]
     quantiles = np.quantile(scores, np.linspace(0, 1, LEVELS), axis=(1, 2)).T
     confused = _confused(beliefs[1], truth, judged, label)
-    return Fit(weight, correlation, head * whole[0], head * whole[1], quantiles, usual, accuracy, confused)
+    return Fit(
+        weight, correlation, head * whole[0], head * whole[1], quantiles, usual, accuracy, confused
+    )
 
 
 def _usual(logs: Float, truth: Index) -> Float:
-    """How much more novel than all the things of each class are, (C,), by log-belief, (T, draws, C); 0 if not known.
+    """How much more novel than all the things of each class are, (C,), by log-belief, (T, draws,
+    C); 0 if not known.
 
     Half of it: eight views, through one setup of a sensor, do not tell more.
     """
-    scores, found = -logs.max(-1), np.zeros(logs.shape[-1])
+    scores = -logs.max(-1)
+    found = np.zeros(logs.shape[-1])
     for c in np.unique(truth):
         found[c] = (scores[truth == c].mean() - scores.mean()) / 2
     return found
@@ -94,19 +125,31 @@ def _usual(logs: Float, truth: Index) -> Float:
 
 def _judged(views: Float, thing: Index, held_out: Float, where: Float) -> NDArray[np.float32]:
     """How alike each held-out view is to each resting pose and azimuth, (T, K, H, azimuths)."""
-    flat = similarities(by_ring(views), held_out.reshape(-1, held_out.shape[-1]), where[..., 0].ravel())
+    flat = similarities(
+        by_ring(views), held_out.reshape(-1, held_out.shape[-1]), where[..., 0].ravel()
+    )
     return flat.reshape(*held_out.shape[:2], len(thing), AZIMUTHS)
 
 
 def _heads(
-    views: Float, thing: Index, label: Index, several: NDArray[np.bool_], fold: Index, held_out: Float, judged: Index
+    views: Float,
+    thing: Index,
+    label: Index,
+    several: NDArray[np.bool_],
+    fold: Index,
+    held_out: Float,
+    judged: Index,
 ) -> tuple[NDArray[np.float32], tuple[Float, Float]]:
-    """What heads that have not seen a thing say of its held-out views, (T, K, C); and the head of all things."""
-    classes, f = int(label.max()) + 1, views.shape[-1]
+    """What heads that have not seen a thing say of its held-out views, (T, K, C); and the head
+    of all things.
+    """
+    classes = int(label.max()) + 1
+    f = views.shape[-1]
     found = np.zeros((len(judged), held_out.shape[1], classes), np.float32)
     if not several.any():
         return found, (np.zeros((f, classes), np.float32), np.zeros(classes, np.float32))
-    x, y = views[:, :, ::4].reshape(len(thing), -1, f), label[thing]
+    x = views[:, :, ::4].reshape(len(thing), -1, f)
+    y = label[thing]
     for k in range(FOLDS):
         others = (fold[thing] != k) | ~several[thing]
         weights, bias = _ridge(x[others], y[others], classes)
@@ -116,10 +159,15 @@ def _heads(
 
 
 def _ridge(x: Float, y: Index, classes: int) -> tuple[Float, Float]:
-    """Ridge regression from views, (H, n, F), of classes (H,), to one-hot classes, each class weighted evenly."""
+    """Ridge regression from views, (H, n, F), of classes (H,), to one-hot classes, each class
+    weighted evenly.
+    """
     h, n, f = x.shape
-    rows, target = x.reshape(h * n, f), np.repeat(np.eye(classes, dtype=np.float32)[y], n, 0)
-    weight = np.repeat(1 / np.maximum(np.bincount(y, minlength=classes), 1)[y] / n, n).astype(np.float32)[:, None]
+    rows = x.reshape(h * n, f)
+    target = np.repeat(np.eye(classes, dtype=np.float32)[y], n, 0)
+    weight = np.repeat(1 / np.maximum(np.bincount(y, minlength=classes), 1)[y] / n, n).astype(
+        np.float32
+    )[:, None]
     middle = (weight * rows).sum(0) / weight.sum()
     centred = rows - middle
     gram = centred.T @ (weight * centred) + RIDGE * 0.01 * np.eye(f, dtype=np.float32)
@@ -127,50 +175,74 @@ def _ridge(x: Float, y: Index, classes: int) -> tuple[Float, Float]:
     return found.astype(np.float32), (-middle @ found).astype(np.float32)
 
 
-def _sums(alike: Float, logits: Float, where: Float, drawn: Index, after: Sequence[int]) -> dict[int, Float]:
+def _sums(
+    alike: Float, logits: Float, where: Float, drawn: Index, after: Sequence[int]
+) -> dict[int, Float]:
     """Sums of log-evidence ``after`` so many drawn views, (T, draws, ...) each."""
     total = [log_evidence_of(x, a, z) for x, a, z in zip(logits, alike, where[..., 1], strict=True)]
-    return {k: np.stack([t[d[:, :k]].sum(1) for t, d in zip(total, drawn, strict=True)]) for k in after}
+    return {
+        k: np.stack([t[d[:, :k]].sum(1) for t, d in zip(total, drawn, strict=True)]) for k in after
+    }
 
 
-def _belief(sums: dict[int, Float], classes: int, hypotheses: Index, correlation: float) -> list[NDArray[np.float64]]:
-    """Log-belief by sums of log-evidence of so many views, up to a constant, (T, draws, classes) each."""
+def _belief(
+    sums: dict[int, Float], classes: int, hypotheses: Index, correlation: float
+) -> list[NDArray[np.float64]]:
+    """Log-belief by sums of log-evidence of so many views, up to a constant, (T, draws, classes)
+    each.
+    """
     calibration = Calibration(1.0, 1.0, None, correlation, tuple(hypotheses.tolist()))
     return [calibration.log_belief(total, k, classes) for k, total in sums.items()]
 
 
-def _confused(logs: Float, truth: Index, judged: Index, label: Index) -> tuple[tuple[int, int, float], ...]:
-    """Pairs of things by the share of the cases in which one is named as the class of the other, the worst first."""
-    answers, pairs = logs.argmax(-1), dict[tuple[int, int], float]()
+def _confused(
+    logs: Float, truth: Index, judged: Index, label: Index
+) -> tuple[tuple[int, int, float], ...]:
+    """Pairs of things by the share of the cases in which one is named as the class of the other,
+    the worst first.
+    """
+    answers = logs.argmax(-1)
+    pairs = dict[tuple[int, int], float]()
     first = {int(c): int(np.flatnonzero(label == c)[0]) for c in np.unique(label)}
     for row, t in enumerate(judged):
         for answer in answers[row][answers[row] != truth[row]]:
             other = first[int(answer)]
             pair = min(int(t), other), max(int(t), other)
             pairs[pair] = pairs.get(pair, 0) + 0.5 / answers.shape[1]
-    return tuple((a, b, share) for (a, b), share in sorted(pairs.items(), key=lambda item: -item[1]))
+    return tuple(
+        (a, b, share) for (a, b), share in sorted(pairs.items(), key=lambda item: -item[1])
+    )
 
 
 def size_evidence(radii: Float, label: Index) -> SizeEvidence | None:
     """How likely each size is for the things of each class; None where no size is known.
 
-    Each thing of a class adds a normal distribution of the logarithm of its radius, and a tenth of a wide one: half
-    hidden things look smaller. A class of which no size is known has none.
+    Each thing of a class adds a normal distribution of the logarithm of its radius, and a tenth of
+    a wide one: half hidden things look smaller. A class of which no size is known has none.
     """
     known = np.isfinite(radii)
     if not known.any():
         return None
-    low, high = np.log(radii[known].min()) - 0.7, np.log(radii[known].max()) + 0.7
+    low = np.log(radii[known].min()) - 0.7
+    high = np.log(radii[known].max()) + 0.7
     grid = np.linspace(low, high, int((high - low) / 0.03) + 2)
     density = np.zeros((int(label.max()) + 1, len(grid)))
     for c in range(len(density)):
         own = np.log(radii[known & (label == c)])
         # Things of a class differ in size, and the fewer are known the wider their sizes may lie.
-        wide = SIZE_ERROR if (label == c).sum() == 1 else max(SIZE_ERROR, 0.5 * own.std() if len(own) > 1 else 0.3)
+        wide = (
+            SIZE_ERROR
+            if (label == c).sum() == 1
+            else max(SIZE_ERROR, 0.5 * own.std() if len(own) > 1 else 0.3)
+        )
         if len(own):
             off = (grid[:, None] - own) / wide
-            density[c] = np.log((0.9 * np.exp(-(off**2) / 2) + 0.1 / 4 * np.exp(-(off**2) / 32)).mean(1) / wide + 1e-9)
+            density[c] = np.log(
+                (0.9 * np.exp(-(off**2) / 2) + 0.1 / 4 * np.exp(-(off**2) / 32)).mean(1) / wide
+                + 1e-9
+            )
     density -= density.max()  # a usual size is no evidence against what is known
     density[~np.isin(np.arange(len(density)), label[known])] = 0
-    short = np.array([float(f"{radius:.5g}") for radius in np.exp(grid)])  # a card is read by people, too
+    # a card is read by people, too
+    short = np.array([float(f"{radius:.5g}") for radius in np.exp(grid)])
     return SizeEvidence.from_arrays(short, np.round(density, 3), 1.0)

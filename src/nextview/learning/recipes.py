@@ -1,4 +1,7 @@
-"""How the bundled models are trained; a comment beside a field is its help. No torch: the command line reads it."""
+"""How the bundled models are trained; a comment beside a field is its help.
+
+No torch: the command line reads it.
+"""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -8,11 +11,17 @@ from nextview.checks import number, whole
 
 @dataclass(frozen=True)
 class Hardware:
-    """Devices and precision; see docs/training.md for several devices."""
+    """Devices and precision; see docs/training.md for several devices.
 
-    devices: int = 1  # processes, each with its own GPU where there are any; they share every batch out
-    accelerator: Literal["auto", "cpu", "gpu"] = "auto"  # "auto" takes GPUs where there are any
-    precision: Literal["bf16-mixed", "16-mixed", "32-true"] = "bf16-mixed"  # 16-mixed on GPUs older than Ampere
+    Attributes:
+        devices: processes, each with its own GPU where there are any; they share every batch out.
+        accelerator: "auto" takes GPUs where there are any.
+        precision: 16-mixed on GPUs older than Ampere.
+    """
+
+    devices: int = 1
+    accelerator: Literal["auto", "cpu", "gpu"] = "auto"
+    precision: Literal["bf16-mixed", "16-mixed", "32-true"] = "bf16-mixed"
 
 
 POLICY_INPUTS = ("belief", "view", "place", "lem-sphere", "azimuth_bin")  # of the bundled policy
@@ -28,38 +37,67 @@ def _check(recipe: Any, at_least_one: tuple[str, ...], shares: tuple[str, ...] =
 
 @dataclass(frozen=True)
 class RecogniserRecipe:
-    """How the recogniser is trained."""
+    """How the recogniser is trained.
 
-    network: Literal["resnet", "lite0"] = "resnet"  # or EfficientNet-Lite0, a fifth of a ResNet-18's arithmetic
-    layers: Layers = 18  # of the ResNet
-    # of EfficientNet-Lite0: chance that a pooled feature is dropped; the chance that a block is skipped for a view
-    # rises from 0 at the first towards it at the last
+    Attributes:
+        network: or EfficientNet-Lite0, a fifth of a ResNet-18's arithmetic.
+        layers: of the ResNet.
+        dropout: of EfficientNet-Lite0: chance that a pooled feature is dropped; the chance that a
+            block is skipped for a view rises from 0 at the first towards it at the last.
+        size: side of the input image, pixels.
+        epochs: passes over the training objects.
+        views_per_object: of each object in one epoch, drawn at random.
+        batch: views a step.
+        lr: peak learning rate of AdamW.
+        weight_decay: of AdamW.
+        smoothing: of the labels.
+        azimuth_bins_weight: weight of the loss for the azimuth bin from which the object is seen,
+            beside that of its class; 0 does without. All objects of a class have to face the same
+            way in their files, as ModelNet10's do.
+        validation_share: part of the training split held out for validation.
+        deformed_share: chance that a view is drawn from the deformed objects, where they are given.
+        seed: decides everything random.
+        ensemble_seed: of one network of an ensemble: its first weights and draws; --seed: what
+            validates all.
+        input: what the network sees: a depth camera's, or the shaded image.
+        augment: by default views are varied: mirrored, shifted, scaled, partly hidden.
+        balanced: by default rare classes are drawn more often; else every view comes once in turn.
+        lr_schedule: of the rate: up and down, or halved every fifth epoch.
+        patience: stop after so many epochs without a better class mean on validation; 0 never stops
+            early.
+        interpolation: how far the parameters go in the end, from the first to the trained ones.
+            Less than 1 keeps more of what the network learned before (Wortsman et al., "Robust
+            fine-tuning of zero-shot models", CVPR 2022).
+    """
+
+    network: Literal["resnet", "lite0"] = "resnet"
+    layers: Layers = 18
     dropout: float = 0.0
-    size: int = 112  # side of the input image, pixels
-    epochs: int = 12  # passes over the training objects
-    views_per_object: int = 8  # of each object in one epoch, drawn at random
-    batch: int = 64  # views a step
-    lr: float = 2e-3  # peak learning rate of AdamW
-    weight_decay: float = 0.05  # of AdamW
-    smoothing: float = 0.1  # of the labels
-    # weight of the loss for the azimuth bin from which the object is seen, beside that of its class; 0 does without.
-    # All objects of a class have to face the same way in their files, as ModelNet10's do
+    size: int = 112
+    epochs: int = 12
+    views_per_object: int = 8
+    batch: int = 64
+    lr: float = 2e-3
+    weight_decay: float = 0.05
+    smoothing: float = 0.1
     azimuth_bins_weight: float = 0.0
-    validation_share: float = 0.1  # part of the training split held out for validation
-    deformed_share: float = 0.5  # chance that a view is drawn from the deformed objects, where they are given
-    seed: int = 0  # decides everything random
-    ensemble_seed: int = 0  # of one network of an ensemble: its first weights and draws; --seed: what validates all
-    input: Literal["geometry", "image"] = "geometry"  # what the network sees: a depth camera's, or the shaded image
-    augment: bool = True  # by default views are varied: mirrored, shifted, scaled, partly hidden
-    balanced: bool = True  # by default rare classes are drawn more often; else every view comes once in turn
-    lr_schedule: Literal["one-cycle", "halving"] = "one-cycle"  # of the rate: up and down, or halved every fifth epoch
-    patience: int = 0  # stop after so many epochs without a better class mean on validation; 0 never stops early
-    # how far the parameters go in the end, from the first to the trained ones. Less than 1 keeps more of what the
-    # network learned before (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022)
+    validation_share: float = 0.1
+    deformed_share: float = 0.5
+    seed: int = 0
+    ensemble_seed: int = 0
+    input: Literal["geometry", "image"] = "geometry"
+    augment: bool = True
+    balanced: bool = True
+    lr_schedule: Literal["one-cycle", "halving"] = "one-cycle"
+    patience: int = 0
     interpolation: float = 1.0
 
     def __post_init__(self) -> None:
-        _check(self, ("size", "epochs", "views_per_object", "batch"), ("dropout", "smoothing", "validation_share"))
+        _check(
+            self,
+            ("size", "epochs", "views_per_object", "batch"),
+            ("dropout", "smoothing", "validation_share"),
+        )
 
 
 THESIS_RECOGNISER = RecogniserRecipe(
@@ -77,41 +115,66 @@ THESIS_RECOGNISER = RecogniserRecipe(
     balanced=False,
     lr_schedule="halving",
 )
-"""As published (thesis, section 5.1). The epochs and the validation part are ours: the text names neither, and its map
-networks settle around the tenth epoch (section 6.2.2)."""
+"""As published (thesis, section 5.1). The epochs and the validation part are ours: the text names
+neither, and its map networks settle around the tenth epoch (section 6.2.2)."""
 
 
 @dataclass(frozen=True)
 class MapRecipe:
-    """How a map network is trained."""
+    """How a map network is trained.
 
-    # of views, whose map it predicts: one that the store holds (nextview measure), or "confidence", the recogniser's
-    # where it is right, which takes predictions
+    Attributes:
+        measure: of views, whose map it predicts: one that the store holds (nextview measure), or
+            "confidence", the recogniser's where it is right, which takes predictions.
+        input: what the network sees: the geometry of the view, through a ResNet; or the partial
+            cloud, through a PointNet, as published.
+        layers: of the ResNet.
+        size: side of the ResNet's input image, pixels.
+        points: drawn from each cloud in training; validation and use take all 1,024.
+        extent: what it predicts: the local window alone, or all views.
+        epochs: passes over the training objects.
+        views_per_object: of each object in one epoch, drawn at random.
+        batch: views a step.
+        lr: peak learning rate of AdamW.
+        weight_decay: of AdamW.
+        orthogonality_weight: of the orthogonality terms of the PointNet's transforms.
+        peak_weight: of the cross-entropy of the window's highest cell, beside the squared error of
+            all.
+        peak_sharpness: of --peak-weight: values are divided by it to give log-odds.
+        peak_reach: of --peak-weight: 0 for the highest cell itself, 1 for its four neighbours too.
+        mirror: by default left and right are exchanged in half of the views, in the map too.
+        lr_schedule: of the rate: up and down, or a tenth every fifth epoch.
+        validation_share: part of the training split held out for validation.
+        seed: decides everything random.
+        patience: stop after so many epochs without a lower error on validation; 0 never stops
+            early.
+    """
+
     measure: str = "depth_entropy"
-    # what the network sees: the geometry of the view, through a ResNet; or the partial cloud, through a PointNet, as
-    # published
     input: Literal["geometry", "cloud"] = "geometry"
-    layers: Layers = 18  # of the ResNet
-    size: int = 56  # side of the ResNet's input image, pixels
-    points: int = 256  # drawn from each cloud in training; validation and use take all 1,024
-    extent: Literal["window", "sphere"] = "sphere"  # what it predicts: the local window alone, or all views
-    epochs: int = 8  # passes over the training objects
-    views_per_object: int = 12  # of each object in one epoch, drawn at random
-    batch: int = 64  # views a step
-    lr: float = 2e-3  # peak learning rate of AdamW
-    weight_decay: float = 0.05  # of AdamW
-    orthogonality_weight: float = 1e-4  # of the orthogonality terms of the PointNet's transforms
-    peak_weight: float = 0.0  # of the cross-entropy of the window's highest cell, beside the squared error of all
-    peak_sharpness: float = 0.05  # of --peak-weight: values are divided by it to give log-odds
-    peak_reach: int = 0  # of --peak-weight: 0 for the highest cell itself, 1 for its four neighbours too
-    mirror: bool = True  # by default left and right are exchanged in half of the views, in the map too
-    lr_schedule: Literal["one-cycle", "tenth"] = "one-cycle"  # of the rate: up and down, or a tenth every fifth epoch
-    validation_share: float = 0.1  # part of the training split held out for validation
-    seed: int = 0  # decides everything random
-    patience: int = 0  # stop after so many epochs without a lower error on validation; 0 never stops early
+    layers: Layers = 18
+    size: int = 56
+    points: int = 256
+    extent: Literal["window", "sphere"] = "sphere"
+    epochs: int = 8
+    views_per_object: int = 12
+    batch: int = 64
+    lr: float = 2e-3
+    weight_decay: float = 0.05
+    orthogonality_weight: float = 1e-4
+    peak_weight: float = 0.0
+    peak_sharpness: float = 0.05
+    peak_reach: int = 0
+    mirror: bool = True
+    lr_schedule: Literal["one-cycle", "tenth"] = "one-cycle"
+    validation_share: float = 0.1
+    seed: int = 0
+    patience: int = 0
 
     def __post_init__(self) -> None:
-        _check(self, ("size", "points", "epochs", "views_per_object", "batch"), ("validation_share",))
+        _check(
+            self, ("size", "points", "epochs", "views_per_object", "batch"), ("validation_share",)
+        )
 
 
 THESIS_MAP = MapRecipe(
@@ -126,30 +189,48 @@ THESIS_MAP = MapRecipe(
     mirror=False,
     lr_schedule="tenth",
 )
-"""As published (thesis, sections 2.2.3 and 5.1): PointNet, every view once an epoch. The epochs are ours."""
+"""As published (thesis, sections 2.2.3 and 5.1): PointNet, every view once an epoch.
+
+The epochs are ours.
+"""
 
 
 @dataclass(frozen=True)
 class GainRecipe:
-    """How the gain policy is trained."""
+    """How the gain policy is trained.
 
-    # of the networks: belief, view, place, azimuth_bin and any maps of the predictions; in scenes visibility too, the
-    # share of the object that is expected to show from each view
+    Attributes:
+        inputs: of the networks: belief, view, place, azimuth_bin and any maps of the predictions;
+            in scenes visibility too, the share of the object that is expected to show from each
+            view.
+        frame: from where azimuths are counted: from the camera's, or from the object's azimuth bin
+            0, which takes a recogniser with azimuth bins.
+        objective: value of a view: the belief in the true class after it, its logarithm, or whether
+            the answer is right.
+        max_views: the values of views 2 to this one are learned.
+        hidden: width of the two hidden layers.
+        networks_per_fold: averaged, of each fold; each weighs the objects by a bootstrap draw of
+            its own.
+        epochs: each over new episodes of all objects.
+        episodes: of each object in an epoch.
+        batch: states in a step.
+        lr: AdamW's learning rate at its peak (one-cycle).
+        weight_decay: AdamW's.
+        seed: of everything random.
+    """
+
     inputs: tuple[str, ...] = POLICY_INPUTS
-    # from where azimuths are counted: from the camera's, or from the object's azimuth bin 0, which takes a recogniser
-    # with azimuth bins
     frame: Literal["camera", "object"] = "object"
-    # value of a view: the belief in the true class after it, its logarithm, or whether the answer is right
     objective: Literal["belief", "log-belief", "right"] = "log-belief"
-    max_views: int = 5  # the values of views 2 to this one are learned
-    hidden: int = 32  # width of the two hidden layers
-    networks_per_fold: int = 2  # averaged, of each fold; each weighs the objects by a bootstrap draw of its own
-    epochs: int = 15  # each over new episodes of all objects
-    episodes: int = 8  # of each object in an epoch
-    batch: int = 1024  # states in a step
-    lr: float = 3e-3  # AdamW's learning rate at its peak (one-cycle)
-    weight_decay: float = 0.1  # AdamW's
-    seed: int = 0  # of everything random
+    max_views: int = 5
+    hidden: int = 32
+    networks_per_fold: int = 2
+    epochs: int = 15
+    episodes: int = 8
+    batch: int = 1024
+    lr: float = 3e-3
+    weight_decay: float = 0.1
+    seed: int = 0
 
     def __post_init__(self) -> None:
         _check(self, ("hidden", "networks_per_fold", "epochs", "episodes", "batch"))

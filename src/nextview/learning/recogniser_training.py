@@ -32,21 +32,38 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Source:
-    """Where views of the training objects come from: their own store or one of deformed copies."""
+    """Where views of the training objects come from: their own store or one of deformed copies.
 
-    inputs: NDArray[np.uint8] | PackedViews  # (rows, V, C, S, S)
-    row: Indices  # of each object in the inputs, -1 for none
-    azimuth_bins: NDArray[np.float32] | None = None  # (rows, V)
+    Attributes:
+        inputs: (rows, V, C, S, S).
+        row: of each object in the inputs, -1 for none.
+        azimuth_bins: (rows, V).
+    """
+
+    inputs: NDArray[np.uint8] | PackedViews
+    row: Indices
+    azimuth_bins: NDArray[np.float32] | None = None
 
 
 class Views(OwnBatches):
-    """Batches of (input (B, C, S, S) uint8, label (B,), and azimuth bin (B,) where sources have it), new each epoch."""
+    """Batches of (input (B, C, S, S) uint8, label (B,), and azimuth bin (B,) where sources have
+    it), new each epoch.
+    """
 
-    def __init__(self, sources: list[Source], objects: Indices, labels: Indices, recipe: RecogniserRecipe) -> None:
-        self.sources, self.objects, self.labels, self.recipe = sources, objects, labels, recipe
+    def __init__(
+        self, sources: list[Source], objects: Indices, labels: Indices, recipe: RecogniserRecipe
+    ) -> None:
+        self.sources = sources
+        self.objects = objects
+        self.labels = labels
+        self.recipe = recipe
         count = np.bincount(labels[objects])[labels[objects]]
         self.weights = count**-0.5 / (count**-0.5).sum()
-        views = recipe.views_per_object if recipe.balanced else min(recipe.views_per_object, sources[0].inputs.shape[1])
+        views = (
+            recipe.views_per_object
+            if recipe.balanced
+            else min(recipe.views_per_object, sources[0].inputs.shape[1])
+        )
         self.drawn = len(objects) * views
         self.batch = min(recipe.batch, self.drawn)
 
@@ -55,13 +72,15 @@ class Views(OwnBatches):
 
     def __iter__(self) -> Iterator[tuple[Tensor, ...]]:
         rng = np.random.default_rng([self.recipe.seed, self.epoch, self.recipe.ensemble_seed])
-        n, v = len(self) * self.batch, self.sources[0].inputs.shape[1]
+        n = len(self) * self.batch
+        v = self.sources[0].inputs.shape[1]
         if self.recipe.balanced:
             objects = rng.choice(self.objects, n, p=self.weights)
             turn = rng.random(n)  # of the view, as a part of all views
         else:
             objects, views = np.divmod(rng.permutation(len(self.objects) * v)[:n], v)
-            objects, turn = self.objects[objects], (views + 0.5) / v
+            objects = self.objects[objects]
+            turn = (views + 0.5) / v
         deformed = (rng.random(n) < self.recipe.deformed_share) & (len(self.sources) > 1)
         source = np.where(deformed, rng.integers(1, max(2, len(self.sources)), n), 0)
         rows = np.stack([own.row for own in self.sources])
@@ -72,12 +91,16 @@ class Views(OwnBatches):
             images = [self.sources[source[k]].inputs[row[k], view[k]] for k in batch]
             drawn = [np.stack(images), self.labels[objects[batch]]]
             if self.sources[0].azimuth_bins is not None:
-                drawn.append(np.array([self.sources[source[k]].azimuth_bins[row[k], view[k]] for k in batch]))
+                drawn.append(
+                    np.array([self.sources[source[k]].azimuth_bins[row[k], view[k]] for k in batch])
+                )
             yield tuple(map(torch.from_numpy, drawn))
 
 
 def augment(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Vary inputs (B, C, S, S) in 0 .. 1: mirror, shift, stretch, roll, hide a part, add noise; and which were."""
+    """Vary inputs (B, C, S, S) in 0 .. 1: mirror, shift, stretch, roll, hide a part, add noise;
+    and which were.
+    """
     (b, _, _, s), on = x.shape, {"device": x.device}
     scale = torch.empty(b, 2, **on).uniform_(0.8, 1.25)
     mirrored = torch.randint(0, 2, (b,), **on) == 0
@@ -87,7 +110,9 @@ def augment(x: Tensor) -> tuple[Tensor, Tensor]:
     theta[:, 0, 0], theta[:, 0, 1] = scale[:, 0] * roll.cos(), -scale[:, 0] * roll.sin()
     theta[:, 1, 0], theta[:, 1, 1] = scale[:, 1] * roll.sin(), scale[:, 1] * roll.cos()
     theta[:, :, 2] = torch.empty(b, 2, **on).uniform_(-0.1, 0.1)
-    x = F.grid_sample(x, F.affine_grid(theta, list(x.shape), align_corners=False), align_corners=False)
+    x = F.grid_sample(
+        x, F.affine_grid(theta, list(x.shape), align_corners=False), align_corners=False
+    )
     # A rectangle of background, in half of the images, as if something stood in front.
     side = torch.empty(b, 2, **on).uniform_(0.1, 0.4)
     corner = torch.rand(b, 2, **on) * (1 - side)
@@ -102,15 +127,21 @@ def augment(x: Tensor) -> tuple[Tensor, Tensor]:
 class RecogniserModule(L.LightningModule):
     """AdamW on cross-entropy; validates on the class mean of single-view accuracy."""
 
-    def __init__(self, recipe: RecogniserRecipe, classes: int, steps: int, azimuths: int = 0) -> None:
+    def __init__(
+        self, recipe: RecogniserRecipe, classes: int, steps: int, azimuths: int = 0
+    ) -> None:
         super().__init__()
-        self.recipe, self.steps = recipe, steps
-        self.net = recogniser_network(recipe, classes, azimuths).to(memory_format=torch.channels_last)
+        self.recipe = recipe
+        self.steps = steps
+        self.net = recogniser_network(recipe, classes, azimuths).to(
+            memory_format=torch.channels_last
+        )
         for name in ("hits", "seen", "lost"):  # of each class in validation
             self.register_buffer(name, torch.zeros(classes), persistent=False)
 
     def training_step(self, batch: tuple[Tensor, ...], _: int) -> Tensor:
-        x, label = batch[0].float() / 255, batch[1]
+        x = batch[0].float() / 255
+        label = batch[1]
         mirrored = torch.zeros_like(label, dtype=torch.bool)
         if self.recipe.augment:
             x, mirrored = augment(x)
@@ -118,22 +149,40 @@ class RecogniserModule(L.LightningModule):
         logits, *likely = self.net(x)
         loss = F.cross_entropy(logits.float(), label, label_smoothing=self.recipe.smoothing)
         if likely:
-            lost = side_loss(likely[0].float(), label, torch.where(mirrored, -batch[2] % likely[0].shape[2], batch[2]))
-            self.log("side_loss", lost, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(x))
+            lost = side_loss(
+                likely[0].float(),
+                label,
+                torch.where(mirrored, -batch[2] % likely[0].shape[2], batch[2]),
+            )
+            self.log(
+                "side_loss", lost, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(x)
+            )
             loss = loss + self.recipe.azimuth_bins_weight * lost
-        self.log("loss", loss, prog_bar=True, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(x))
+        self.log(
+            "loss",
+            loss,
+            prog_bar=True,
+            on_step=False,
+            on_epoch=True,
+            sync_dist=True,
+            batch_size=len(x),
+        )
         return loss
 
     def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:
         x = (batch[0].float() / 255).to(memory_format=torch.channels_last)
-        logits, label = self.net(x)[0].float(), batch[1]
+        logits = self.net(x)[0].float()
+        label = batch[1]
         right = (logits.argmax(1) == label).float()
         self.hits.scatter_add_(0, label, right)
         self.seen.scatter_add_(0, label, torch.ones_like(right))
         self.lost.scatter_add_(0, label, F.cross_entropy(logits, label, reduction="none"))
 
     def on_validation_epoch_end(self) -> None:
-        hits, seen, lost = (self.trainer.strategy.reduce(x, reduce_op="sum") for x in (self.hits, self.seen, self.lost))
+        hits, seen, lost = (
+            self.trainer.strategy.reduce(x, reduce_op="sum")
+            for x in (self.hits, self.seen, self.lost)
+        )
         self.log("class_accuracy", (hits / seen)[seen > 0].mean(), prog_bar=True)
         self.log("validation_loss", lost.sum() / seen.sum())
         for total in (self.hits, self.seen, self.lost):
@@ -141,15 +190,24 @@ class RecogniserModule(L.LightningModule):
 
     def configure_optimizers(self) -> dict[str, Any]:
         plain = [p for p in self.net.parameters() if p.ndim <= 1]
-        groups = [{"params": [p for p in self.net.parameters() if p.ndim > 1]}, {"params": plain, "weight_decay": 0.0}]
+        groups = [
+            {"params": [p for p in self.net.parameters() if p.ndim > 1]},
+            {"params": plain, "weight_decay": 0.0},
+        ]
         return optimiser(groups, self.recipe, self.steps, 0.5)
 
 
 class ValidationViews(OwnBatches):
-    """Every fifth view of the validation objects, shifted by one from object to object: all views get their turn."""
+    """Every fifth view of the validation objects, shifted by one from object to object: all
+    views get their turn.
+    """
 
-    def __init__(self, inputs: NDArray[np.uint8] | PackedViews, objects: Indices, labels: Indices) -> None:
-        self.inputs, self.objects, self.labels = inputs, objects, labels
+    def __init__(
+        self, inputs: NDArray[np.uint8] | PackedViews, objects: Indices, labels: Indices
+    ) -> None:
+        self.inputs = inputs
+        self.objects = objects
+        self.labels = labels
 
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
         for k, i in list(enumerate(self.objects))[self.share]:
@@ -167,7 +225,9 @@ def fit_recogniser(
     hardware: Hardware = Hardware(),
     azimuths: int = 0,
 ) -> nn.Module:
-    """Train and return the network of the best epoch; checkpoints in ``out``, from which a second call resumes."""
+    """Train and return the network of the best epoch; checkpoints in ``out``, from which a
+    second call resumes.
+    """
     own = np.random.SeedSequence([recipe.seed, recipe.ensemble_seed])
     L.seed_everything(int(own.generate_state(1)[0]), verbose=False)
     views = Views(sources, parts[0], labels, recipe)
@@ -178,7 +238,9 @@ def fit_recogniser(
     validation = ValidationViews(sources[0].inputs, parts[1], labels)
     best = fit(module, views, validation, out, "class_accuracy", "max", hardware)
     way = {
-        name: torch.lerp(start[name].to(values), values, recipe.interpolation) if values.is_floating_point() else values
+        name: torch.lerp(start[name].to(values), values, recipe.interpolation)
+        if values.is_floating_point()
+        else values
         for name, values in best.net.state_dict().items()  # counters stay those of the end
     }
     best.net.load_state_dict(way)
@@ -186,7 +248,9 @@ def fit_recogniser(
 
 
 def mirror_planes(store: ViewStore, objects: Indices) -> Float:
-    """Azimuth of the plane of symmetry of each class, steps of the store's viewpoints, (classes,)."""
+    """Azimuth of the plane of symmetry of each class, steps of the store's viewpoints,
+    (classes,).
+    """
     n = store.sphere.azimuths
     measured = store.measure()[objects].reshape(len(objects), -1, n).astype(np.float64)
     measured -= measured.mean((1, 2), keepdims=True)
@@ -198,7 +262,9 @@ def mirror_planes(store: ViewStore, objects: Indices) -> Float:
 
 
 def azimuth_bins(store: ViewStore, azimuths: int, planes: Float) -> NDArray[np.float32]:
-    """The azimuth bin, 0 .. azimuths, from which each view sees its object, (N, V), given the ``mirror_planes``."""
+    """The azimuth bin, 0 .. azimuths, from which each view sees its object, (N, V), given the
+    ``mirror_planes``.
+    """
     sphere = store.sphere
     steps = sphere.azimuth_index * (azimuths / sphere.azimuths)
     rotated = rotations(store) * azimuths / (2 * np.pi) + planes[store.labels]
@@ -206,39 +272,52 @@ def azimuth_bins(store: ViewStore, azimuths: int, planes: Float) -> NDArray[np.f
 
 
 def side_loss(likely: Tensor, label: Tensor, side: Tensor) -> Tensor:
-    """Mean cross-entropy of the azimuth bin given the true class; between two bins, both count by their nearness."""
+    """Mean cross-entropy of the azimuth bin given the true class; between two bins, both count
+    by their nearness.
+    """
     own = likely[torch.arange(len(label), device=label.device), label]
-    low, n = side.floor().long()[:, None], own.shape[1]
+    low = side.floor().long()[:, None]
+    n = own.shape[1]
     share = side[:, None] - low
     return -((1 - share) * own.gather(1, low % n) + share * own.gather(1, (low + 1) % n)).mean()
 
 
 def train_recogniser(
-    store: Path,  # view store made by nextview render
-    out: Path,  # folder for checkpoints, logs and network.pt, the network of the epoch with the best class mean
-    # stores of the same objects or some of them, stretched and rotated (nextview render --stretch .25 --rotated --seed
-    # 1 and so on) or through sensors (--sensor mix); their views may be others
+    store: Path,
+    out: Path,
     deformed: tuple[Path, ...] = (),
-    # start from a published checkpoint, torchvision's of the same depth or EfficientNet-Lite0's, or go on from the run
-    # in this folder, on other data or for longer
     weights: Path | None = None,
     recipe: RecogniserRecipe = RecogniserRecipe(),
     hardware: Hardware = Hardware(),
     track: Track = silently,
 ) -> list[Path]:
-    """Train the recogniser on a store's training split. Resumes if OUT holds a run that was cut off.
+    """Train the recogniser on a store's training split. Resumes if OUT holds a run that was cut
+    off.
+
+    Args:
+        store: view store made by nextview render.
+        out: folder for checkpoints, logs and network.pt, the network of the epoch with the best
+            class mean.
+        deformed: stores of the same objects or some of them, stretched and rotated (nextview render
+            --stretch .25 --rotated --seed 1 and so on) or through sensors (--sensor mix); their
+            views may be others.
+        weights: start from a published checkpoint, torchvision's of the same depth or
+            EfficientNet-Lite0's, or go on from the run in this folder, on other data or for longer.
 
     Raises:
         DatasetError: a store cannot be used, or another process trains in the same folder.
-        ModelError: the weights cannot be used, or have seen what is held out; or ``out`` holds another run.
+        ModelError: the weights cannot be used, or have seen what is held out; or ``out`` holds
+            another run.
     """
     views = ViewStore.open(store)
     training, validation = split_training(views, recipe.validation_share, recipe.seed)
     check_any(views, training, validation)
     validating = deduplicate(views, validation)  # copies of one mesh count once
-    azimuths, planes = 0, None
+    azimuths = 0
+    planes = None
     if recipe.azimuth_bins_weight:
-        azimuths, planes = views.sphere.azimuths, mirror_planes(views, training)
+        azimuths = views.sphere.azimuths
+        planes = mirror_planes(views, training)
     stores = [views, *map(ViewStore.open, deformed)]
     run = new_run(recipe, weights, [views.names[i] for i in validation], stores)
     sources = [_source(each, views, training, recipe, planes, track) for each in stores]
@@ -248,11 +327,18 @@ def train_recogniser(
 
 
 def _source(
-    store: ViewStore, views: ViewStore, needed: Indices, recipe: RecogniserRecipe, planes: Float | None, track: Track
+    store: ViewStore,
+    views: ViewStore,
+    needed: Indices,
+    recipe: RecogniserRecipe,
+    planes: Float | None,
+    track: Track,
 ) -> Source:
     """Inputs of a store, and the row of each object of ``views`` in them, -1 for none."""
     rows = store.rows_of(views.names)
     if (rows[needed] < 0).all():
         raise DatasetError(f"{store.path}: holds none of the training objects")
     inputs = ready_inputs(store.path, recipe.size, recipe.input, track)
-    return Source(inputs, rows, None if planes is None else azimuth_bins(store, views.sphere.azimuths, planes))
+    return Source(
+        inputs, rows, None if planes is None else azimuth_bins(store, views.sphere.azimuths, planes)
+    )

@@ -1,4 +1,6 @@
-"""Decision states on the way of a policy, and the value of every next view there, by replay of predictions."""
+"""Decision states on the way of a policy, and the value of every next view there, by replay of
+predictions.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -20,12 +22,15 @@ from nextview.recognition.belief import FixedLength, of_true_class
 from nextview.session.episode import run_episodes
 
 Float = NDArray[np.float64]
-OBJECTIVES = ("belief", "log-belief", "right")  # belief in the truth, its logarithm, or whether the answer is right
+# belief in the truth, its logarithm, or whether the answer is right
+OBJECTIVES = ("belief", "log-belief", "right")
 
 
 @dataclass(frozen=True)
 class ReplayTable:
-    """What held-out models say of N objects, by a calibrated recogniser, and the scenes that these stand in."""
+    """What held-out models say of N objects, by a calibrated recogniser, and the scenes that
+    these stand in.
+    """
 
     data: Predictions
     scenes: SceneSight | None = None
@@ -39,11 +44,14 @@ class ReplayTable:
         sensed: Sequence[Predictions] = (),
         scenes: SceneSight | None = None,
     ) -> "ReplayTable":
-        """Some of the objects of predictions, by index; calibrated here where their recogniser is not."""
+        """Some of the objects of predictions, by index; calibrated here where their recogniser
+        is not.
+        """
         if len(kept) == 0:
             raise PredictionsError("no object is left to learn from")
         parts = [for_fitting(part.of_objects(kept)) for part in (predictions, *sensed)]
-        data, scenes = Predictions.joined(parts), scenes or scenes_of(predictions)
+        data = Predictions.joined(parts)
+        scenes = scenes or scenes_of(predictions)
         data = replace(data, calibration=calibration_of(data, rng))
         return cls(data, None if scenes is None else scenes.of_scenes(np.tile(kept, len(parts))))
 
@@ -61,20 +69,32 @@ class DecisionState:
 def rollout(
     table: ReplayTable, policy: Policy, n_views: int, rng: Generator, visibility: bool = False
 ) -> Iterator[DecisionState]:
-    """Every object once, from a random first view to where the policy leads: the decision state after each view."""
-    data, sphere, everything = table.data, table.data.sphere, np.arange(len(table.data))
+    """Every object once, from a random first view to where the policy leads: the decision state
+    after each view.
+    """
+    data = table.data
+    sphere = table.data.sphere
+    everything = np.arange(len(table.data))
     starts = rng.integers(len(sphere), size=len(data))
     if table.scenes is not None:
-        starts = np.where(table.scenes.reachable, rng.random(table.scenes.reachable.shape), -1).argmax(1)
+        starts = np.where(
+            table.scenes.reachable, rng.random(table.scenes.reachable.shape), -1
+        ).argmax(1)
     constrain, visible = sight_of(table.scenes, everything)
     length = FixedLength(max_views=n_views)
-    run = run_episodes(data.evidence, sphere, policy, starts, length, rng, data.calibration, constrain, visible)
-    visited, travel = np.zeros((len(data), len(sphere)), bool), np.zeros(len(data))
+    run = run_episodes(
+        data.evidence, sphere, policy, starts, length, rng, data.calibration, constrain, visible
+    )
+    visited = np.zeros((len(data), len(sphere)), bool)
+    travel = np.zeros(len(data))
     for k, step in enumerate(run.steps, 1):
         visited[step.episodes, step.views] = True
-        azimuth, seen = sphere.azimuth[step.views], np.maximum(step.seen, 1)
+        azimuth = sphere.azimuth[step.views]
+        seen = np.maximum(step.seen, 1)
         azimuth_bins = data.calibration.azimuth_bins(step.total, seen, len(data.classes), azimuth)
-        state = EpisodeState(step.views, visited.copy(), step.belief, step.evidence, k, step.episodes, azimuth_bins)
+        state = EpisodeState(
+            step.views, visited.copy(), step.belief, step.evidence, k, step.episodes, azimuth_bins
+        )
         state = constrain(replace(state, visibility=visible(state) if visibility else None))
         yield DecisionState(state, step.total, travel, step.seen)
         if k < len(run.steps):
@@ -82,8 +102,14 @@ def rollout(
 
 
 def value_after(table: ReplayTable, total: Float, n_views: NDArray | int, kind: str) -> Float:
-    """The value, (N, ...), of sums of the log-evidence, (N, ..., D), after ``n_views`` views, by one of OBJECTIVES."""
-    return value_of(table.data.calibration.log_belief(total, n_views, len(table.data.classes)), table.data.labels, kind)
+    """The value, (N, ...), of sums of the log-evidence, (N, ..., D), after ``n_views`` views, by
+    one of OBJECTIVES.
+    """
+    return value_of(
+        table.data.calibration.log_belief(total, n_views, len(table.data.classes)),
+        table.data.labels,
+        kind,
+    )
 
 
 def value_of(logs: Float, labels: NDArray[np.int64], kind: str) -> Float:
@@ -96,21 +122,29 @@ def value_of(logs: Float, labels: NDArray[np.int64], kind: str) -> Float:
 
 def candidate_values(table: ReplayTable, moment: DecisionState, kind: str) -> Float:
     """The value of looking from every view next, (N, V) float64."""
-    counts = table.data.seen.astype(np.float64)  # a view in which nothing is seen has no weight in the sum
+    # a view in which nothing is seen has no weight in the sum
+    counts = table.data.seen.astype(np.float64)
     n_views = np.maximum(moment.seen[:, None] + counts, 1)
-    return value_after(table, moment.total[:, None] + counts[..., None] * table.data.log_evidence, n_views, kind)
+    return value_after(
+        table, moment.total[:, None] + counts[..., None] * table.data.log_evidence, n_views, kind
+    )
 
 
 class Value(NamedTuple):
-    """Mean objective, and travel in cells, after 2, 3, ... views, (views - 1,); classes weighted evenly."""
+    """Mean objective, and travel in cells, after 2, 3, ... views, (views - 1,); classes weighted
+    evenly.
+    """
 
     mean: Float
     travel: Float
 
 
-def judge(table: ReplayTable, policy: Policy, n_views: int, kind: str, rng: Generator, rounds: int = 8) -> Value:
+def judge(
+    table: ReplayTable, policy: Policy, n_views: int, kind: str, rng: Generator, rounds: int = 8
+) -> Value:
     """Follow a policy ``rounds`` times over every object."""
-    weights, reached = table.data.weights / len(table.data) / rounds, np.zeros((2, n_views - 1))
+    weights = table.data.weights / len(table.data) / rounds
+    reached = np.zeros((2, n_views - 1))
     for _ in range(rounds):
         for moment in rollout(table, policy, n_views, rng):
             k = moment.state.step
@@ -120,20 +154,46 @@ def judge(table: ReplayTable, policy: Policy, n_views: int, kind: str, rng: Gene
     return Value(*reached)
 
 
-Judged = Sequence[tuple[ReplayTable, Policy]]  # tables, each with the policy that is followed over its objects
-TRAVEL_WEIGHTS = (0.0, 0.0005, 0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.012, 0.015, 0.02, 0.03, 0.05, 0.1)
+# tables, each with the policy that is followed over its objects
+Judged = Sequence[tuple[ReplayTable, Policy]]
+TRAVEL_WEIGHTS = (
+    0.0,
+    0.0005,
+    0.001,
+    0.002,
+    0.003,
+    0.005,
+    0.007,
+    0.01,
+    0.012,
+    0.015,
+    0.02,
+    0.03,
+    0.05,
+    0.1,
+)
 """Of a grid cell of travel, in the unit of the objective."""
 
 
-def judge_all(judged: Judged, n_views: int, kind: str, seed: int | list[int], rounds: int = 8) -> Value:
-    """Mean value over the objects of all tables, each followed by a policy of its own; see ``judge``."""
+def judge_all(
+    judged: Judged, n_views: int, kind: str, seed: int | list[int], rounds: int = 8
+) -> Value:
+    """Mean value over the objects of all tables, each followed by a policy of its own; see
+    ``judge``.
+    """
     values = [judge(*pair, n_views, kind, np.random.default_rng(seed), rounds) for pair in judged]
     return Value(*np.average(values, 0, [len(table.data) for table, _ in judged]))
 
 
-def fit_travel_weight(judged: Sequence[tuple[ReplayTable, Gain]], n_views: int, kind: str, seed: int) -> float:
-    """The lowest of TRAVEL_WEIGHTS at which policies never travel farther than a random walk in the local window."""
-    limit = judge_all([(table, Random(table.data.sphere)) for table, _ in judged], n_views, kind, seed).travel
+def fit_travel_weight(
+    judged: Sequence[tuple[ReplayTable, Gain]], n_views: int, kind: str, seed: int
+) -> float:
+    """The lowest of TRAVEL_WEIGHTS at which policies never travel farther than a random walk in
+    the local window.
+    """
+    limit = judge_all(
+        [(table, Random(table.data.sphere)) for table, _ in judged], n_views, kind, seed
+    ).travel
     for weight in TRAVEL_WEIGHTS:
         paying = [(table, replace(policy, travel_weight=weight)) for table, policy in judged]
         if (judge_all(paying, n_views, kind, seed).travel <= limit).all():

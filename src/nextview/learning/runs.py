@@ -1,4 +1,6 @@
-"""A training run, which all networks share: its folder, checkpoints, exact epochs after a resume, first weights."""
+"""A training run, which all networks share: its folder, checkpoints, exact epochs after a
+resume, first weights.
+"""
 
 import csv
 import io
@@ -20,7 +22,15 @@ from nextview.checks import extras
 from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
 from nextview.errors import DAMAGED, ModelError
-from nextview.files import command, decode_record, new_file, only_one, read_record, sha256_of, write_record
+from nextview.files import (
+    command,
+    decode_record,
+    new_file,
+    only_one,
+    read_record,
+    sha256_of,
+    write_record,
+)
 from nextview.learning.architectures import LiteNet, ResNet
 from nextview.learning.recipes import Hardware
 
@@ -38,7 +48,9 @@ N = TypeVar("N", bound=nn.Module)
 
 
 class OwnBatches(IterableDataset):
-    """A data set that makes its own batches, from the epoch and the share of each batch that is this device's."""
+    """A data set that makes its own batches, from the epoch and the share of each batch that is
+    this device's.
+    """
 
     epoch = 0
     share = slice(None)
@@ -49,10 +61,13 @@ class Batches(L.LightningDataModule):
 
     def __init__(self, training: IterableDataset, validation: IterableDataset) -> None:
         super().__init__()
-        self.training, self.validation = training, validation
+        self.training = training
+        self.validation = validation
 
     def setup(self, stage: str) -> None:
-        self.training.share = self.validation.share = slice(self.trainer.global_rank, None, self.trainer.world_size)
+        self.training.share = self.validation.share = slice(
+            self.trainer.global_rank, None, self.trainer.world_size
+        )
 
     def train_dataloader(self) -> DataLoader:
         self.training.epoch = self.trainer.current_epoch
@@ -63,23 +78,34 @@ class Batches(L.LightningDataModule):
 
 
 def _loader(batches: IterableDataset) -> DataLoader:
-    gpu = torch.cuda.is_available()  # on a CPU a batch takes milliseconds to make, and a second to learn from
-    ahead: dict[str, Any] = {"num_workers": 1, "prefetch_factor": 4, "pin_memory": True} if gpu else {}
+    # on a CPU a batch takes milliseconds to make, and a second to learn from
+    gpu = torch.cuda.is_available()
+    ahead: dict[str, Any] = (
+        {"num_workers": 1, "prefetch_factor": 4, "pin_memory": True} if gpu else {}
+    )
     return DataLoader(batches, batch_size=None, **ahead)
 
 
 class StepSeed(L.Callback):
-    """Seeds torch by epoch, step and device, so that a resumed run augments as an uninterrupted one would."""
+    """Seeds torch by epoch, step and device, so that a resumed run augments as an uninterrupted
+    one would.
+    """
 
-    def on_train_batch_start(self, trainer: L.Trainer, pl_module: Any, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_start(
+        self, trainer: L.Trainer, pl_module: Any, batch: Any, batch_idx: int
+    ) -> None:
         step = [pl_module.recipe.seed, trainer.current_epoch, batch_idx, trainer.global_rank]
         torch.manual_seed(int(np.random.SeedSequence(step).generate_state(1, np.uint64)[0]))
 
 
 class WholeCheckpoints(TorchCheckpointIO):
-    """Lightning moves checkpoints from the system's temporary folder: a kill in that copy would cost the old one."""
+    """Lightning moves checkpoints from the system's temporary folder: a kill in that copy would
+    cost the old one.
+    """
 
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
+    ) -> None:
         save_whole(checkpoint, Path(path))
 
 
@@ -92,7 +118,9 @@ def save_whole(values: dict[str, Any], path: Path) -> None:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """What ``save_whole`` wrote, by torch's reader that makes nothing but tensors and containers."""
+    """What ``save_whole`` wrote, by torch's reader that makes nothing but tensors and
+    containers.
+    """
     try:
         with warnings.catch_warnings():
             # Torch warns of pickles that are not its own before it refuses them.
@@ -102,14 +130,19 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         raise ModelError(f"{path}: there is no such checkpoint") from None
     except (*DAMAGED, pickle.UnpicklingError) as error:
         what = f"a damaged checkpoint or one that torch cannot read safely ({type(error).__name__})"
-        raise ModelError(f"{path}: {what}; give another, or delete it to begin this training anew") from None
+        raise ModelError(
+            f"{path}: {what}; give another, or delete it to begin this training anew"
+        ) from None
 
 
 class Log(L.Callback):
-    """A row for every epoch in log/metrics.csv and in the checkpoint; Lightning's own log begins anew on a resume."""
+    """A row for every epoch in log/metrics.csv and in the checkpoint; Lightning's own log begins
+    anew on a resume.
+    """
 
     def __init__(self, out: Path) -> None:
-        self.path, self.rows = out / "log/metrics.csv", list[dict[str, float]]()
+        self.path = out / "log/metrics.csv"
+        self.rows = list[dict[str, float]]()
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self.began = time.perf_counter()
@@ -121,7 +154,10 @@ class Log(L.Callback):
         row["seconds"] = round(time.perf_counter() - self.began, 3)
         self.rows.append(row)
         if trainer.is_global_zero:
-            with new_file(self.path, overwrite=True) as part, part.open("w", newline="", encoding="utf-8") as file:
+            with (
+                new_file(self.path, overwrite=True) as part,
+                part.open("w", newline="", encoding="utf-8") as file,
+            ):
                 table = csv.DictWriter(file, list(self.rows[0]))
                 table.writeheader()
                 table.writerows(self.rows)
@@ -144,7 +180,9 @@ class Checkpoint(ModelCheckpoint):
 
 
 class Patience(EarlyStopping):
-    """Stops when the score has not improved for so many epochs; a run that was stopped so stays stopped."""
+    """Stops when the score has not improved for so many epochs; a run that was stopped so stays
+    stopped.
+    """
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         trainer.should_stop = self.wait_count >= self.patience
@@ -162,12 +200,18 @@ def fit(
     """Train a module by its ``recipe`` and return it as it was after its best epoch."""
     recipe: Any = module.recipe
     # The last checkpoint comes last: it holds the states of the others.
-    callbacks = [StepSeed(), Log(out), Checkpoint(out, "best", select, mode), Checkpoint(out, "last")]
+    callbacks = [
+        StepSeed(),
+        Log(out),
+        Checkpoint(out, "best", select, mode),
+        Checkpoint(out, "last"),
+    ]
     if recipe.patience:
         callbacks.append(Patience(select, patience=recipe.patience, mode=mode, verbose=False))
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     with warnings.catch_warnings():
-        # All of them describe what is meant here: a run that resumes, and data sets that make their own batches.
+        # All of them describe what is meant here: a run that resumes, and data sets that make their
+        # own batches.
         warnings.filterwarnings("ignore", module="lightning")
         warnings.filterwarnings("ignore", message=".*LeafSpec")
         trainer = L.Trainer(
@@ -176,7 +220,9 @@ def fit(
             accelerator=hardware.accelerator,
             devices=hardware.devices,
             # Batch norm sees the whole batch, as on one device; torch has this for GPUs alone.
-            sync_batchnorm=hardware.devices > 1 and hardware.accelerator != "cpu" and torch.cuda.is_available(),
+            sync_batchnorm=hardware.devices > 1
+            and hardware.accelerator != "cpu"
+            and torch.cuda.is_available(),
             logger=False,
             callbacks=callbacks,
             plugins=[WholeCheckpoints()],
@@ -185,21 +231,30 @@ def fit(
             reload_dataloaders_every_n_epochs=1,
             log_every_n_steps=1,
         )
-        last, best = out / "last.ckpt", out / "best.ckpt"
+        last = out / "last.ckpt"
+        best = out / "best.ckpt"
         resume = last if last.exists() and read_checkpoint(last) else None
         try:
             # Numbers too small for the normal format are slow on CPUs and mean nothing here.
             torch.set_flush_denormal(True)
-            trainer.fit(module, datamodule=Batches(training, validation), ckpt_path=resume, weights_only=True)
+            trainer.fit(
+                module,
+                datamodule=Batches(training, validation),
+                ckpt_path=resume,
+                weights_only=True,
+            )
         finally:
             torch.set_flush_denormal(False)  # it holds for the whole process
-    # Too few objects for one batch of validation leave nothing to choose by: the last epoch is kept.
+    # Too few objects for one batch of validation leave nothing to choose by: the last epoch is
+    # kept.
     module.load_state_dict(read_checkpoint(best if best.exists() else last)["state_dict"])
     return module
 
 
 def optimiser(parameters: Any, recipe: Any, steps: int, falls: float) -> dict[str, Any]:
-    """AdamW, by one cycle over all steps, or with a rate that falls to such a part every fifth epoch."""
+    """AdamW, by one cycle over all steps, or with a rate that falls to such a part every fifth
+    epoch.
+    """
     adam = torch.optim.AdamW(parameters, lr=recipe.lr, weight_decay=recipe.weight_decay)
     if recipe.lr_schedule == "one-cycle":
         cycle = torch.optim.lr_scheduler.OneCycleLR(adam, recipe.lr, steps, pct_start=0.2)
@@ -223,39 +278,66 @@ class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     commands: tuple[str, ...]
 
 
-def new_run(recipe: Any, weights: Path | None, held_out: Sequence[str], made: Iterable[ViewStore | Predictions]) -> Run:
-    """A run by the command that runs now, from stores and predictions; what is held out validates it."""
+def new_run(
+    recipe: Any,
+    weights: Path | None,
+    held_out: Sequence[str],
+    made: Iterable[ViewStore | Predictions],
+) -> Run:
+    """A run by the command that runs now, from stores and predictions; what is held out
+    validates it.
+    """
     before = [line for source in made for line in source.commands]
     if weights is not None and weights.is_dir():
-        earlier, own = read_run(weights), set(held_out)
+        earlier = read_run(weights)
+        own = set(held_out)
         seen = sorted(own - set(earlier.held_out))
         if 0 < len(seen) < len(own):
-            what = f"{len(seen)} of the {len(own)} objects that this network must not have seen, {seen[0]} among them"
-            raise ModelError(f"{weights}: was trained on {what}; take its --seed and --validation-share")
+            what = (
+                f"{len(seen)} of the {len(own)} objects that this network must not have seen,"
+                f" {seen[0]} among them"
+            )
+            raise ModelError(
+                f"{weights}: was trained on {what}; take its --seed and --validation-share"
+            )
         before += earlier.commands
         weights /= "network.pt"
     if weights is not None and not weights.is_file():
         raise ModelError(f"{weights}: there is no such checkpoint")
-    sha256, names = None if weights is None else sha256_of(weights), tuple(held_out)
+    sha256 = None if weights is None else sha256_of(weights)
+    names = tuple(held_out)
     return Run(asdict(recipe), sha256, names, names, tuple(dict.fromkeys((*before, command()))))
 
 
 def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
-    """Train a network into a run's folder unless it is there; alone, or with the other devices of this run."""
+    """Train a network into a run's folder unless it is there; alone, or with the other devices
+    of this run.
+    """
     with only_one(out) if is_first() else nullcontext():
         if (out / "run.json").exists():
-            before, recipe = read_record(out / "run.json", Run, "a training run"), msgspec.to_builtins(run.recipe)
+            before = read_record(out / "run.json", Run, "a training run")
+            recipe = msgspec.to_builtins(run.recipe)
             changed = [name for name, value in recipe.items() if before.recipe.get(name) != value]
-            faults = [f"another recipe ({name} was {before.recipe.get(name)}, not {recipe[name]})" for name in changed]
+            faults = [
+                f"another recipe ({name} was {before.recipe.get(name)}, not {recipe[name]})"
+                for name in changed
+            ]
             faults += ["other first weights"] * (before.weights != run.weights)
             faults += ["other objects"] * (before.held_out != run.held_out)
             if faults:
                 again = "give the same options to resume it, or another folder"
                 raise ModelError(f"{out}: holds a run of {faults[0]}; {again}")
         elif is_first():
-            other = [path.name for path in (out.iterdir() if out.is_dir() else ()) if not path.name.startswith(".")]
+            other = [
+                path.name
+                for path in (out.iterdir() if out.is_dir() else ())
+                if not path.name.startswith(".")
+            ]
             if other:
-                raise ModelError(f"{out}: holds {other[0]} and no training run; give a new folder, or an empty one")
+                raise ModelError(
+                    f"{out}: holds {other[0]} and no training run; give a new folder, or an"
+                    " empty one"
+                )
             write_record(out / "run.json", run)
         if not (out / "network.pt").exists():
             save_whole(train().state_dict(), out / "network.pt")
@@ -285,11 +367,14 @@ def load_run(network: N, run: Path) -> N:
     try:
         network.load_state_dict(_read_state(path))
     except RuntimeError:  # names every parameter that is missing, foreign or of another shape
-        raise ModelError(f"{path}: not the weights of the network that {run}/run.json describes") from None
+        raise ModelError(
+            f"{path}: not the weights of the network that {run}/run.json describes"
+        ) from None
     return network.eval()
 
 
-LITE_NAMES = {  # names of parts in ports of EfficientNet to PyTorch, as patterns, and in a ``LiteNet``
+# names of parts in ports of EfficientNet to PyTorch, as patterns, and in a ``LiteNet``
+LITE_NAMES = {
     r"^_conv_": "",
     "^_blocks": "stages",
     r"\._(expand|depthwise|project)_conv": r".\1",
@@ -299,31 +384,40 @@ LITE_NAMES = {  # names of parts in ports of EfficientNet to PyTorch, as pattern
 
 
 def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> None:
-    """Give a network its first parameters: of a finished run (a folder), or of a published checkpoint.
+    """Give a network its first parameters: of a finished run (a folder), or of a published
+    checkpoint.
 
-    Its own last layers stay where those of the checkpoint are of another shape, or ``head`` is false.
+    Its own last layers stay where those of the checkpoint are of another shape, or ``head`` is
+    false.
     """
     path = weights / "network.pt" if weights.is_dir() else weights
     state = {name.removeprefix("resnet."): value for name, value in _read_state(path).items()}
     lite = isinstance(network, LiteNet)
     for theirs, ours in LITE_NAMES.items() if lite and path == weights else ():
         state = {re.sub(theirs, ours, name): value for name, value in state.items()}
-    own, first = network.state_dict(), "stem.weight" if lite else "conv1.weight"
+    own = network.state_dict()
+    first = "stem.weight" if lite else "conv1.weight"
     for name, value in own.items():
         # Files from before PyTorch 0.4.1, some of torchvision's among them, do not count batches.
         lacks = name not in state and (name.endswith("_tracked") or name.startswith("side."))
         other = name in state and state[name].shape != value.shape
         if lacks or (name.startswith(("fc.", "side.")) and (other or not head)):
             state[name] = value
-    state = {name: value for name, value in state.items() if name in own or not name.startswith("side.")}
+    state = {
+        name: value for name, value in state.items() if name in own or not name.startswith("side.")
+    }
     if first in state and state[first].ndim == 4 and state[first].shape != own[first].shape:
-        colours, channels = state[first].shape[1], own[first].shape[1]
-        turn = torch.arange(max(colours, channels))  # each colour's kernel is dealt out to the channels in turn
+        colours = state[first].shape[1]
+        channels = own[first].shape[1]
+        # each colour's kernel is dealt out to the channels in turn
+        turn = torch.arange(max(colours, channels))
         share = torch.zeros(colours, channels)
         share[turn % colours, turn % channels] = 1
         share /= share.sum(1, keepdim=True)
         state[first] = torch.einsum("okhw,kc->ochw", state[first], share)
-    wanted, given = ({name: tuple(value.shape) for name, value in values.items()} for values in (own, state))
+    wanted, given = (
+        {name: tuple(value.shape) for name, value in values.items()} for values in (own, state)
+    )
     faults = [f"it lacks {name}" for name in sorted(wanted.keys() - given.keys())]
     faults += [f"it holds {name}" for name in sorted(given.keys() - wanted.keys())]
     both = ((name, shape, given[name]) for name, shape in wanted.items() if name in given)
@@ -332,12 +426,16 @@ def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> N
         raise ModelError(f"{path}: not the weights of this {network.name} ({faults[0]})")
     for name, value in state.items():
         if not torch.isfinite(value).all():
-            raise ModelError(f"{path}: {name} holds numbers that are not finite; download the checkpoint again")
+            raise ModelError(
+                f"{path}: {name} holds numbers that are not finite; download the checkpoint again"
+            )
     network.load_state_dict(state)
 
 
 def _read_state(path: Path) -> dict[str, Tensor]:
     state = read_checkpoint(path)
-    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+    if not isinstance(state, dict) or not all(
+        isinstance(value, Tensor) for value in state.values()
+    ):
         raise ModelError(f"{path}: not a state dict: it should map names of parameters to tensors")
     return dict(state)

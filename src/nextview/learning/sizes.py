@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from nextview.errors import DatasetError
 from nextview.geometry.mesh import UNITS
 
-ODD_SIZE = 300  # a thing so many times larger or smaller than the median of the others is asked about
+# a thing so many times larger or smaller than the median of the others is asked about
+ODD_SIZE = 300
 LARGEST_RADIUS = 20.0  # metres, of the median thing: no camera looks at larger ones from all around
 SMALLEST_RADIUS = 0.001  # and at smaller ones no depth camera
 USUAL_RADII = (0.01, 3.0)  # metres, of things of which one takes views
@@ -24,8 +25,8 @@ def check_sizes(paths: Sequence[Path], radii: NDArray[np.floating], unit: str | 
         unit: of the mesh files, as it was given; None if it was not.
 
     Raises:
-        DatasetError: a thing is hundreds of times larger or smaller than most, or most are larger than a house or
-            smaller than what a depth camera sees.
+        DatasetError: a thing is hundreds of times larger or smaller than most, or most are larger
+            than a house or smaller than what a depth camera sees.
     """
     known = np.isfinite(radii)
     if not known.any():
@@ -42,7 +43,9 @@ def check_sizes(paths: Sequence[Path], radii: NDArray[np.floating], unit: str | 
 
 
 def _all_odd(paths: Sequence[Path], radii: NDArray[np.floating], unit: str, median: float) -> str:
-    """The sentence about things that are all too large or too small: the unit that would make them usual."""
+    """The sentence about things that are all too large or too small: the unit that would make
+    them usual.
+    """
     middle = int(np.nanargmin(np.abs(radii - median)))
     size = f"has a radius of {_length(float(radii[middle]))} if --unit {unit} is right"
     who = (

@@ -1,4 +1,6 @@
-"""Look at one thing from everywhere, without and with a sensor's errors, and note what its views are like."""
+"""Look at one thing from everywhere, without and with a sensor's errors, and note what its views
+are like.
+"""
 
 import zlib
 from collections.abc import Iterator, Mapping
@@ -39,29 +41,47 @@ SETUP = 8  # views that share the errors of one setup: a wrong centre, a wrong s
 BATCH = 20
 NEAR = np.radians(30)  # a captured view teaches what the thing looks like from no farther than this
 GRID = ViewSphere(RINGS, AZIMUTHS)
-SENSED = GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape(-1, 4, 4)  # poses of views through the sensor
-LEFT_OUT = "left_out"  # of a thing's arrays: a phrase about the frames that were not used; it is not remembered
-VERTICES, FACES = "vertices", "faces"  # of a thing's arrays: its surface, if its size is known
+# poses of views through the sensor
+SENSED = GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape(-1, 4, 4)
+# of a thing's arrays: a phrase about the frames that were not used; it is not remembered
+LEFT_OUT = "left_out"
+# of a thing's arrays: its surface, if its size is known
+VERTICES = "vertices"
+FACES = "faces"
 SYMMETRIES = "symmetries"  # and the axis and order of each of its symmetries, (S, 4)
-COARSER = 0.002  # of the radius: a camera stands farther from a large thing, and measures it less exactly
+# of the radius: a camera stands farther from a large thing, and measures it less exactly
+COARSER = 0.002
 Parts = Iterator[NDArray[np.float32]]  # of embeddings, (.., F) each, in order
 
 
 @dataclass(frozen=True)
 class How:
-    """How things are looked at."""
+    """How things are looked at.
 
-    unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None  # of the mesh files; then size counts as evidence
-    up: Literal["y", "z"] | None = None  # the up axis of the mesh files; z by default, but y for GLB
-    upright: bool = False  # the things only ever stand as their files have them; by default they may also lie
-    sensor: str = "wrist"  # the camera that will look at them: NAME or NAME:STRENGTH, see nextview render --help
-    largest_part: bool = False  # leave out all that is not connected to the largest part of each mesh
-    any_size: bool = False  # take things of very different sizes as they are
-    one_class: bool = False  # take things that all lie in one folder for a class, as beside others with --add
-    # depth frames without poses, beside camera-intrinsics.txt: the camera stood still, and the thing turned once around
-    # by equal steps, counter-clockwise (ccw) or clockwise (cw) as seen from above
+    Attributes:
+        unit: of the mesh files; then size counts as evidence.
+        up: the up axis of the mesh files; z by default, but y for GLB.
+        upright: the things only ever stand as their files have them; by default they may also lie.
+        sensor: the camera that will look at them: NAME or NAME:STRENGTH, see nextview render
+            --help.
+        largest_part: leave out all that is not connected to the largest part of each mesh.
+        any_size: take things of very different sizes as they are.
+        one_class: take things that all lie in one folder for a class, as beside others with --add.
+        turntable: depth frames without poses, beside camera-intrinsics.txt: the camera stood still,
+            and the thing turned once around by equal steps, counter-clockwise (ccw) or clockwise
+            (cw) as seen from above.
+        seed: of all random draws.
+    """
+
+    unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None
+    up: Literal["y", "z"] | None = None
+    upright: bool = False
+    sensor: str = "wrist"
+    largest_part: bool = False
+    any_size: bool = False
+    one_class: bool = False
     turntable: Literal["ccw", "cw"] | None = None
-    seed: int = 0  # of all random draws
+    seed: int = 0
 
     def check(self) -> None:
         """Refuse, before anything is taught, what every thing would be refused for.
@@ -86,9 +106,9 @@ def teach(path: Path, name: str, how: How, threads: int = 1) -> Arrays:
         threads: that work side by side.
 
     Returns:
-        Arrays by the names of the fields of ``things.memory.Memory``. If its size is known, also its surface in the
-        frame of its file, metres: VERTICES, (V, 3) float32, FACES, (F, 3) int32, and SYMMETRIES. Where some of the
-        frames were not used, a phrase about them under LEFT_OUT.
+        Arrays by the names of the fields of ``things.memory.Memory``. If its size is known, also
+        its surface in the frame of its file, metres: VERTICES, (V, 3) float32, FACES, (F, 3) int32,
+        and SYMMETRIES. Where some of the frames were not used, a phrase about them under LEFT_OUT.
 
     Raises:
         MeshError, DatasetError, ObservationError: why it cannot be looked at, in one sentence.
@@ -96,14 +116,22 @@ def teach(path: Path, name: str, how: How, threads: int = 1) -> Arrays:
     rng = np.random.default_rng([how.seed, zlib.crc32(name.encode())])
     if path.is_dir():
         if not is_capture(path) and how.turntable is None:
-            raise DatasetError(f"{path}: its frames have no poses; --turntable ccw or cw says how the thing turned")
-        return _of_capture(read_capture(path) if is_capture(path) else read_turntable(path, str(how.turntable)))
+            raise DatasetError(
+                f"{path}: its frames have no poses; --turntable ccw or cw says how the thing turned"
+            )
+        return _of_capture(
+            read_capture(path) if is_capture(path) else read_turntable(path, str(how.turntable))
+        )
     mesh = load_mesh(path, how.up, how.unit, largest_part=how.largest_part)
     rotations = np.eye(3)[None] if how.upright else resting_poses(mesh)
     lying = [mesh, *(rotated(mesh, rotation) for rotation in rotations[1:])]
-    directions = np.arcsin(rng.uniform(0, np.sin(np.radians(RINGS[-1])), HELD_OUT)), rng.uniform(0, 2 * np.pi, HELD_OUT)
+    directions = (
+        np.arcsin(rng.uniform(0, np.sin(np.radians(RINGS[-1])), HELD_OUT)),
+        rng.uniform(0, 2 * np.pi, HELD_OUT),
+    )
     with ThreadPoolExecutor(threads) as pool:
-        # Of any of its resting poses: things lie in practice, and calibration and the rate of strangers follow these.
+        # Of any of its resting poses: things lie in practice, and calibration and the rate of
+        # strangers follow these.
         shown_pose = lying[int(rng.integers(len(lying)))]
         held_out = _sensed(pool, shown_pose, look_at_origin(*directions), how.sensor, rng)
         clean = [_clean(pool, each) for each in lying]
@@ -118,13 +146,17 @@ def teach(path: Path, name: str, how: How, threads: int = 1) -> Arrays:
         "held_out_views": np.stack(directions, 1).astype(np.float32),
         "radii": np.array([np.nan if mesh.metres is None else mesh.metres], np.float32),
         "doubts": np.frombuffer("\n".join(mesh_warnings(mesh)).encode(), np.uint8),
-        "pictures": _picture(SimulatedCamera(mesh, 64).observe(look_at_origin(np.radians(25), np.radians(35)))),
+        "pictures": _picture(
+            SimulatedCamera(mesh, 64).observe(look_at_origin(np.radians(25), np.radians(35)))
+        ),
         **_surface(mesh, to_mesh),
     }
 
 
 def _surface(mesh: Mesh, to_mesh: NDArray[np.float64]) -> Arrays:
-    """The surface of a mesh in the axes of its file, which ``to_mesh`` turns into its own; nothing without a unit."""
+    """The surface of a mesh in the axes of its file, which ``to_mesh`` turns into its own;
+    nothing without a unit.
+    """
     if mesh.metres is None:
         return {}
 
@@ -144,10 +176,13 @@ def of_surface(surface: Surface) -> Arrays:
 
 
 def _around(clean: Parts, sensed: Parts) -> NDArray[np.float32]:
-    """Embeddings of the views of the grid, (rings, azimuths, F): the mean without and with a sensor's errors."""
+    """Embeddings of the views of the grid, (rings, azimuths, F): the mean without and with a
+    sensor's errors.
+    """
     ideal = np.concatenate(list(clean)).reshape(len(RINGS), AZIMUTHS, -1)
     through = np.zeros_like(ideal)
-    # Between the rings and azimuths that are looked at through the sensor the embeddings are interpolated.
+    # Between the rings and azimuths that are looked at through the sensor the embeddings are
+    # interpolated.
     through[::2, ::2] = np.concatenate(list(sensed)).reshape(len(RINGS[::2]), AZIMUTHS // 2, -1)
     through[::2, 1::2] = unit(through[::2, ::2] + np.roll(through[::2, ::2], -1, 1))
     through[1::2] = unit(through[:-1:2] + through[2::2])
@@ -160,7 +195,9 @@ def _clean(pool: ThreadPoolExecutor, mesh: Mesh) -> Parts:
     return pool.map(partial(_seen, camera), np.split(GRID.poses, len(GRID) // BATCH))
 
 
-def _sensed(pool: ThreadPoolExecutor, mesh: Mesh, poses: NDArray[np.float64], sensor: str, rng: Generator) -> Parts:
+def _sensed(
+    pool: ThreadPoolExecutor, mesh: Mesh, poses: NDArray[np.float64], sensor: str, rng: Generator
+) -> Parts:
     """Embeddings of a mesh from poses, (B, 4, 4), through a sensor."""
     parts = np.split(poses, range(SETUP, len(poses), SETUP))
     cameras = (partial(SensedCamera, mesh, sensor, own) for own in rng.spawn(len(parts)))
@@ -172,7 +209,8 @@ def _seen(camera: Camera, poses: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def _of_capture(capture: Capture) -> Arrays:
-    """Of captured frames: each cell of the grid is what the nearest of them shows. Every fourth is held out.
+    """Of captured frames: each cell of the grid is what the nearest of them shows. Every fourth is
+    held out.
 
     Its surface, and its resting pose, are in the frame of the world in which it was captured.
     """
@@ -181,13 +219,16 @@ def _of_capture(capture: Capture) -> Arrays:
     seen = [view for view in camera.object.observations if view.seen]
     if not seen:
         raise ObservationError(f"{capture.folder}: none of its frames shows an object")
-    directions, each = np.stack([direction_of(view.pose) for view in seen]), embeddings(seen)
+    directions = np.stack([direction_of(view.pose) for view in seen])
+    each = embeddings(seen)
     kept = np.arange(len(seen)) % 4 < 3 if len(seen) > 4 else np.ones(len(seen), bool)
     arc = angle_between(GRID.directions[:, None], directions[kept][None])
     views = np.where(arc.min(1)[:, None] < NEAR, each[kept][arc.argmin(1)], 0)
     rest = np.flatnonzero(~kept) if not kept.all() else np.arange(len(seen))
     held_out = np.resize(rest, HELD_OUT)
-    angles = np.stack([np.arcsin(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])], 1)
+    angles = np.stack(
+        [np.arcsin(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])], 1
+    )
     found = camera.object.object_frame
     surface = fuse(camera.object.sightings, found.radius, capture.folder.name)
     return {
@@ -223,7 +264,9 @@ def _features() -> Features:
 
 
 def embeddings(observations: list[Observation]) -> NDArray[np.float32]:
-    """Embeddings of views from one camera, unit vectors, (B, F) float32; zero where nothing is seen."""
+    """Embeddings of views from one camera, unit vectors, (B, F) float32; zero where nothing is
+    seen.
+    """
     network = _features()
     inputs = from_observations(network.card.input, observations)
     parts = [network(inputs[start : start + BATCH]) for start in range(0, len(inputs), BATCH)]

@@ -1,4 +1,6 @@
-"""Which things a folder teaches: mesh files, class folders of them, and folders of captured depth frames."""
+"""Which things a folder teaches: mesh files, class folders of them, and folders of captured
+depth frames.
+"""
 
 import os
 from dataclasses import dataclass
@@ -47,9 +49,9 @@ class Found:
 def find_things(folder: Path, out: Path | None = None, one_class: bool = False) -> Found:
     """Find the things that a folder teaches.
 
-    A mesh in the folder itself, and a folder of captured frames, is a thing and a class of its own name. All else is as
-    in a dataset (``data.folders``): each mesh in a class folder is a thing of that class; where there are splits, those
-    of "train".
+    A mesh in the folder itself, and a folder of captured frames, is a thing and a class of its own
+    name. All else is as in a dataset (``data.folders``): each mesh in a class folder is a thing of
+    that class; where there are splits, those of "train".
 
     Args:
         folder: to be looked through.
@@ -60,8 +62,9 @@ def find_things(folder: Path, out: Path | None = None, one_class: bool = False) 
         The things, and all that was left out.
 
     Raises:
-        DatasetError: there is no such folder, nothing in it can be taught, two things have one name, or all are of one
-            class: a folder around the things, as an archive has one, looks the same.
+        DatasetError: there is no such folder, nothing in it can be taught, two things have one
+            name, or all are of one class: a folder around the things, as an archive has one, looks
+            the same.
     """
     if not folder.is_dir():
         raise DatasetError(f"{folder}: there is no such folder")
@@ -76,12 +79,16 @@ def find_things(folder: Path, out: Path | None = None, one_class: bool = False) 
 
     entries, other_splits = _to_be_taught(listing.entries)
     left_out = left_out_phrases(
-        listing.left_out + [(e.path.relative_to(folder), f"of the split {e.split}") for e in other_splits]
+        listing.left_out
+        + [(e.path.relative_to(folder), f"of the split {e.split}") for e in other_splits]
     )
     things = [Source(path.name, path.name, path) for path in captures]
     things += [Source(entry.name, entry.label, entry.path) for entry in entries]
     if not things:
-        text = f"{folder}: holds no mesh ({', '.join(FORMATS)}) and no folder of depth frames with poses"
+        text = (
+            f"{folder}: holds no mesh ({', '.join(FORMATS)}) and no folder of depth frames with"
+            " poses"
+        )
         raise DatasetError("; left out: ".join([text, *filter(None, ["; ".join(left_out)])]))
     things.sort(key=lambda thing: (thing.label, thing.name))
     _check_names(things)
@@ -90,19 +97,31 @@ def find_things(folder: Path, out: Path | None = None, one_class: bool = False) 
 
     layout = [listing.layout()] if entries else []
     if captures:
-        layout.append("1 folder of depth frames" if len(captures) == 1 else f"{len(captures)} folders of depth frames")
+        layout.append(
+            "1 folder of depth frames"
+            if len(captures) == 1
+            else f"{len(captures)} folders of depth frames"
+        )
     notes = (f"in {folder}: {', '.join(layout)}", *listing.notes)
     return Found(things, left_out, notes)
 
 
 def _captures(folder: Path) -> list[Path]:
     """The folders of captured frames in a folder, sorted by name."""
-    inside = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
-    return [path for path in inside if path.name.isprintable() and (is_capture(path) or is_turntable(path))]
+    inside = sorted(
+        path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")
+    )
+    return [
+        path
+        for path in inside
+        if path.name.isprintable() and (is_capture(path) or is_turntable(path))
+    ]
 
 
 def _to_be_taught(entries: list[Entry]) -> tuple[list[Entry], list[Entry]]:
-    """Those that are taught, and those of other splits: a test is of things that nobody was taught."""
+    """Those that are taught, and those of other splits: a test is of things that nobody was
+    taught.
+    """
     if not any(entry.split == "train" for entry in entries):
         return entries, []
     taught = [entry for entry in entries if entry.split in ("train", "")]
@@ -125,5 +144,6 @@ def _check_classes(folder: Path, things: list[Source]) -> None:
     all_things = f"all {len(things)} things are of the one class {one_line(label)}"
     inside = one_line(os.path.commonpath([thing.path.parent for thing in things]), 200)
     raise DatasetError(
-        f"{folder}: {all_things}; give {inside} if that holds the things, or --one-class if they are one"
+        f"{folder}: {all_things}; give {inside} if that holds the things, or --one-class if they"
+        " are one"
     )

@@ -1,4 +1,6 @@
-"""Learn to notice objects of no known class, from views of known objects and of other objects of the same classes."""
+"""Learn to notice objects of no known class, from views of known objects and of other objects of
+the same classes.
+"""
 
 import logging
 import zlib
@@ -34,9 +36,13 @@ CALIBRATION_VIEWS = 5
 MAX_ELEVATION = np.radians(75.0)
 """Views are drawn between the horizontal plane and this elevation."""
 DEFORMATIONS = (Deform(rotated=True), Deform(stretch=0.25, rotated=True))
-"""No real object stands along the axes of a data set, and few have the proportions of one of its meshes."""
+"""No real object stands along the axes of a data set, and few have the proportions of one of its
+meshes.
+"""
 CONDITIONS = 2 * len(DEFORMATIONS)
-"""Through the sensor and without one, each deformation: of views of a held-out object, in this order."""
+"""Through the sensor and without one, each deformation: of views of a held-out object, in this
+order.
+"""
 LEVELS = 201  # of the quantiles
 
 _log = logging.getLogger("nextview")
@@ -58,23 +64,35 @@ class FittedUnknown:
 
 
 def fit_unknown(
-    meshes: Path,  # folder of the meshes that the recogniser was trained on; those of the test split are left out
-    card: Path,  # of the recogniser
-    sensor: str = "wrist",  # through which half of the calibration views are taken, see simulation.sensor.sensor_named
-    seed: int = 0,  # of all that is drawn
-    workers: int | None = None,  # processes; one for each core by default
+    meshes: Path,
+    card: Path,
+    sensor: str = "wrist",
+    seed: int = 0,
+    workers: int | None = None,
     track: Track = silently,
 ) -> FittedUnknown:
-    """Teach a recogniser to notice objects of no class that it knows, at a false-alarm rate that can be chosen.
+    """Teach a recogniser to notice objects of no class that it knows, at a false-alarm rate that
+    can be chosen.
 
-    It remembers views of its training objects. How novel other views of known classes are is measured on the objects
-    that its card calls held out. All objects are turned about the vertical at random; half of them are stretched. The
-    novelty score goes into NAME.novelty.safetensors beside the card, and its SHA-256 into the card. A run that was
-    stopped begins anew.
+    It remembers views of its training objects. How novel other views of known classes are is
+    measured on the objects that its card calls held out. All objects are turned about the vertical
+    at random; half of them are stretched. The novelty score goes into NAME.novelty.safetensors
+    beside the card, and its SHA-256 into the card. A run that was stopped begins anew.
+
+    Args:
+        meshes: folder of the meshes that the recogniser was trained on; those of the test split are
+            left out.
+        card: of the recogniser.
+        sensor: through which half of the calibration views are taken, see
+            simulation.sensor.sensor_named.
+        seed: of all that is drawn.
+        workers: processes; one for each core by default.
     """
     sensor_named(sensor)  # refused here, not by every object
     with card_to_fit(card) as (model, write):
-        entries = [e for e in list_dataset(meshes) if e.split != "test" and e.label in model.classes]
+        entries = [
+            e for e in list_dataset(meshes) if e.split != "test" and e.label in model.classes
+        ]
         look = partial(_looked_at, frozenset(model.held_out), sensor, seed)
         seen: dict[Entry, Float32] = {}
         left_out: list[tuple[Path, str]] = []
@@ -93,25 +111,35 @@ def fit_unknown(
         known = [seen[e] for e in entries if e in seen and e.name not in model.held_out]
         held_out = [e for e in entries if e in seen and e.name in model.held_out]
         if not known or not held_out:
-            raise DatasetError(f"{meshes}: holds no object that {card} was trained on, or none that it calls held out")
+            raise DatasetError(
+                f"{meshes}: holds no object that {card} was trained on, or none that it calls"
+                " held out"
+            )
 
         labels = np.array([model.classes.index(e.label) for e in held_out])
         novelty = fit_novelty(np.concatenate(known), np.stack([seen[e] for e in held_out]), labels)
         about = (
-            f"{len(known)} objects of the training split, calibrated on {len(held_out)} others, turned at random and "
-            f"half of them stretched, half of the views through the sensor {sensor}"
+            f"{len(known)} objects of the training split, calibrated on {len(held_out)} others,"
+            " turned at random and half of them stretched, half of the views through the sensor"
+            f" {sensor}"
         )
-        # Killed between the two files, this leaves a card without a score, not one with the hash of another.
+        # Killed between the two files, this leaves a card without a score, not one with the hash of
+        # another.
         write("novelty", "nothing, the fit was cut off", [], novelty_sha256="")
-        write("novelty", about, [], novelty_sha256=novelty.save(novelty_path(model.path), overwrite=True))
+        write(
+            "novelty",
+            about,
+            [],
+            novelty_sha256=novelty.save(novelty_path(model.path), overwrite=True),
+        )
     return FittedUnknown(len(known), len(held_out), len(left_out))
 
 
 def _looked_at(held_out: frozenset[str], sensor: str, seed: int, entry: Entry) -> Float32 | str:
     """Embeddings of views of a mesh, or why there are none.
 
-    Of a held-out object, (CONDITIONS, views, F). Of any other, clean views of each deformation, (deformations, views,
-    F).
+    Of a held-out object, (CONDITIONS, views, F). Of any other, clean views of each deformation,
+    (deformations, views, F).
     """
     rng = np.random.default_rng([seed, zlib.crc32(entry.name.encode())])
     try:
@@ -137,7 +165,9 @@ def _looked_at(held_out: frozenset[str], sensor: str, seed: int, entry: Entry) -
 
 
 def _random_views(camera: Camera, wanted: int, rng: Generator) -> Float32:
-    """Embeddings of so many views from random directions, (views, F); fewer where the object is often not seen."""
+    """Embeddings of so many views from random directions, (views, F); fewer where the object is
+    often not seen.
+    """
     tries = 4 * wanted
     elevations = rng.uniform(0, MAX_ELEVATION, tries)
     azimuths = rng.uniform(0, 2 * np.pi, tries)
@@ -158,15 +188,20 @@ def fit_novelty(
 
     Args:
         known: embeddings of views to remember, (..., F).
-        held_out: embeddings of views of N other objects, (N, conditions, views, F); the first half of the conditions
-            through a sensor, the others without one's errors.
+        held_out: embeddings of views of N other objects, (N, conditions, views, F); the first half
+            of the conditions through a sensor, the others without one's errors.
         labels: classes of these N objects, (N,).
         n_views: up to so many views of an object the mean score is calibrated.
     """
     rows = as_stored(known.reshape(-1, known.shape[-1]))
     plain = np.array([[0, 1], [0, 1]], np.float32)
     raw = Novelty(np.zeros((1, 2), np.float32), np.array([len(held_out)]), rows, plain)
-    scores = np.stack([raw.scores(views.reshape(-1, rows.shape[1])).reshape(views.shape[:-1]) for views in held_out])
+    scores = np.stack(
+        [
+            raw.scores(views.reshape(-1, rows.shape[1])).reshape(views.shape[:-1])
+            for views in held_out
+        ]
+    )
 
     objects, conditions, views = scores.shape
     ways = scores.reshape(objects, 2, conditions // 2 * views)  # through a sensor, and without one
@@ -180,9 +215,12 @@ def fit_novelty(
 
 
 def quantiles(scores: NDArray[np.float64], labels: NDArray[np.int64], n_views: int) -> Float32:
-    """Quantiles of the mean score over 1 to ``n_views`` views, classes weighted evenly: (views, LEVELS), ascending."""
+    """Quantiles of the mean score over 1 to ``n_views`` views, classes weighted evenly: (views,
+    LEVELS), ascending.
+    """
     count = np.bincount(labels)
-    share_of, levels = 1 / count[labels], []
+    share_of = 1 / count[labels]
+    levels = []
     for n in range(1, min(n_views, scores.shape[1]) + 1):
         draws = scores.shape[1] // n
         means = scores[:, : draws * n].reshape(len(scores), draws, n).mean(2)

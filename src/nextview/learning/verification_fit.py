@@ -1,4 +1,6 @@
-"""What is fitted to the surfaces of taught things: how much geometry counts, and how well known things fit."""
+"""What is fitted to the surfaces of taught things: how much geometry counts, and how well known
+things fit.
+"""
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
@@ -30,10 +32,13 @@ MOST_THINGS = 150  # that are shown: a drawn part of more
 EPISODES = 2  # for each of many things
 ENOUGH_EPISODES = 16  # for each of few things as if all of them had so many together
 GROWTH = 2  # weights are fitted anew when there are so many times as many things
-DEFAULT_THINGS = 10.0  # things that the default weights count for, beside those that others are fitted to
-WEIGHTS_COST = 5.0  # by which weights of five numbers have to raise the log-likelihood (Akaike, 1974)
+# things that the default weights count for, beside those that others are fitted to
+DEFAULT_THINGS = 10.0
+# by which weights of five numbers have to raise the log-likelihood (Akaike, 1974)
+WEIGHTS_COST = 5.0
 MOST_RESIDUALS = 400  # for a number of views; of more their quantiles are kept
-FEW_RESIDUALS = 100  # of fewer, what further ones are likely to be is kept: a p-value of 0.01 needs so many
+# of fewer, what further ones are likely to be is kept: a p-value of 0.01 needs so many
+FEW_RESIDUALS = 100
 DECIMALS = 4
 
 
@@ -62,10 +67,11 @@ class VerifiedFit:
 
     Attributes:
         verification: for the card, of the things of known geometry alone.
-        accuracy: share of the cases that are named right after 1, 2 and 3 views, with weights that were fitted to other
-            things; () if nothing was shown.
+        accuracy: share of the cases that are named right after 1, 2 and 3 views, with weights that
+            were fitted to other things; () if nothing was shown.
         by_features: the same by features and size alone.
-        confused: pairs of a class and the one that it was named, with the share of its cases, after two views.
+        confused: pairs of a class and the one that it was named, with the share of its cases, after
+            two views.
         things: how many were shown.
     """
 
@@ -92,8 +98,8 @@ def to_be_shown(things: Sequence[int], known: int, rng: Generator) -> list[tuple
 def show(card: Path, sensor: str, seed: int, item: tuple[int, int]) -> list[Shown]:
     """Show a thing through a sensor, in any of its resting poses, and recognise it by its geometry.
 
-    A thing that has others of its class is recognised by these alone: whoever teaches a class will meet other things of
-    it.
+    A thing that has others of its class is recognised by these alone: whoever teaches a class will
+    meet other things of it.
 
     Args:
         card: of a memory; its weights are not used.
@@ -102,7 +108,8 @@ def show(card: Path, sensor: str, seed: int, item: tuple[int, int]) -> list[Show
         item: number of the thing among those of known geometry, and of the draw.
 
     Returns:
-        What was found after one and more views; empty where nothing is seen, or no other thing of the class is known.
+        What was found after one and more views; empty where nothing is seen, or no other thing of
+        the class is known.
     """
     thing, draw = item
     known, labels = _opened(card)
@@ -171,7 +178,14 @@ def _of_classes(judged: JudgedEpisode, truth: int, labels: Index) -> JudgedEpiso
     """The same in classes, by the class of each thing; ``truth`` is the class that is right."""
     by_features = np.zeros(max(int(labels.max()), truth) + 1)
     np.add.at(by_features, labels, judged.by_features)
-    return JudgedEpisode(truth, labels[judged.things], judged.mean, judged.camera_costs, judged.log_belief, by_features)
+    return JudgedEpisode(
+        truth,
+        labels[judged.things],
+        judged.mean,
+        judged.camera_costs,
+        judged.log_belief,
+        by_features,
+    )
 
 
 def fit_verification(shown: Sequence[Shown], labels: Index) -> VerifiedFit:
@@ -207,14 +221,19 @@ def fit_verification(shown: Sequence[Shown], labels: Index) -> VerifiedFit:
 
 
 def _weights(shown: Sequence[Shown]) -> EvidenceWeights:
-    """The weights that suit what was shown, drawn towards the defaults: few things do not tell much."""
+    """The weights that suit what was shown, drawn towards the defaults: few things do not tell
+    much.
+    """
     count = len({one.judged.truth for one in shown})
     if count < 2:  # whatever the weights are, a thing alone is named right
         return EvidenceWeights()
 
     episodes = [one.judged for one in shown]
     fitted = fit_weights(episodes)
-    if _log_likelihood(fitted, episodes) < _log_likelihood(EvidenceWeights(), episodes) + WEIGHTS_COST:
+    if (
+        _log_likelihood(fitted, episodes)
+        < _log_likelihood(EvidenceWeights(), episodes) + WEIGHTS_COST
+    ):
         return EvidenceWeights()
 
     share = count / (count + DEFAULT_THINGS)
@@ -243,7 +262,9 @@ def _residuals(shown: Sequence[Shown], labels: Index) -> KnownResiduals | None:
 
 
 def _right(shown: Sequence[Shown], labels: Index) -> tuple[Index, Float, Index]:
-    """Of what was named right by the best explanation: the thing, the residual and the number of views."""
+    """Of what was named right by the best explanation: the thing, the residual and the number of
+    views.
+    """
     right = [one for one in shown if labels[one.named] == one.judged.truth]
     things = np.array([one.named for one in right], np.int64)
     residuals = np.array([one.residual for one in right], np.float64)
@@ -253,9 +274,9 @@ def _right(shown: Sequence[Shown], labels: Index) -> tuple[Index, Float, Index]:
 def likely_excess(found: Float) -> Float:
     """By how much known things are likely to exceed their usual residuals, from what some did.
 
-    Few of them do not tell how rare larger ones are. Of fewer than FEW_RESIDUALS the quantiles are kept that a further
-    one of a normal distribution would have (Student's t, as of a prediction interval), or those that were found where
-    these are larger.
+    Few of them do not tell how rare larger ones are. Of fewer than FEW_RESIDUALS the quantiles are
+    kept that a further one of a normal distribution would have (Student's t, as of a prediction
+    interval), or those that were found where these are larger.
 
     Args:
         found: see ``KnownResiduals.excess``, ascending, (N,).
@@ -275,7 +296,9 @@ def likely_excess(found: Float) -> Float:
     return np.maximum(predicted, np.quantile(found, levels))
 
 
-def with_new_things(before: Verification, shown: Sequence[Shown], labels: Index, carried: Index) -> VerifiedFit:
+def with_new_things(
+    before: Verification, shown: Sequence[Shown], labels: Index, carried: Index
+) -> VerifiedFit:
     """Add what was found of new things to what was fitted before.
 
     Args:
@@ -302,8 +325,12 @@ def with_new_things(before: Verification, shown: Sequence[Shown], labels: Index,
     )
 
 
-def as_stored(weights: EvidenceWeights, residuals: KnownResiduals | None, things: int) -> Verification:
-    """What a card holds of weights and residuals, rounded; ``things`` is how many they are fitted to."""
+def as_stored(
+    weights: EvidenceWeights, residuals: KnownResiduals | None, things: int
+) -> Verification:
+    """What a card holds of weights and residuals, rounded; ``things`` is how many they are
+    fitted to.
+    """
     named = {field.name: float(f"{getattr(weights, field.name):.4g}") for field in fields(weights)}
     if residuals is None:
         return Verification(named, things)
@@ -312,7 +339,9 @@ def as_stored(weights: EvidenceWeights, residuals: KnownResiduals | None, things
         if len(row) > MOST_RESIDUALS:
             row = np.quantile(row, np.linspace(0, 1, MOST_RESIDUALS))
         excess.append(tuple(np.round(row, DECIMALS).tolist()))
-    return Verification(named, things, tuple(np.round(residuals.usual, DECIMALS).tolist()), tuple(excess))
+    return Verification(
+        named, things, tuple(np.round(residuals.usual, DECIMALS).tolist()), tuple(excess)
+    )
 
 
 def _accuracy(shown: Sequence[Shown], answers: Sequence[int]) -> tuple[float, ...]:
@@ -325,7 +354,9 @@ def _accuracy(shown: Sequence[Shown], answers: Sequence[int]) -> tuple[float, ..
 
 
 def _confused(shown: Sequence[Shown], answers: Sequence[int]) -> tuple[tuple[int, int, float], ...]:
-    """Pairs of classes by the share of the cases in which one is named as the other, the worst first."""
+    """Pairs of classes by the share of the cases in which one is named as the other, the worst
+    first.
+    """
     truths = [one.judged.truth for one in shown if one.views == 2]
     named = [answer for one, answer in zip(shown, answers, strict=True) if one.views == 2]
     pairs = dict[tuple[int, int], float]()
@@ -333,4 +364,6 @@ def _confused(shown: Sequence[Shown], answers: Sequence[int]) -> tuple[tuple[int
         if truth != answer:
             pair = min(truth, answer), max(truth, answer)
             pairs[pair] = pairs.get(pair, 0) + 0.5 / truths.count(truth)
-    return tuple((a, b, share) for (a, b), share in sorted(pairs.items(), key=lambda item: -item[1]))
+    return tuple(
+        (a, b, share) for (a, b), share in sorted(pairs.items(), key=lambda item: -item[1])
+    )

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from nextview.things.expected_views import Outlook  # SciPy, which few policies need
 
 Float = NDArray[np.float64]
-Scope = Literal["global", "local"]  # where a policy may go: to all views, or to those of the local window
+# where a policy may go: to all views, or to those of the local window
+Scope = Literal["global", "local"]
 
 
 @dataclass(frozen=True)
@@ -29,20 +30,26 @@ class EpisodeState:
         belief: fused over all views, (B, classes) float64.
         evidence: of the current view.
         step: views taken so far, 1 or more.
-        episodes: which episodes these are, (B,) int64: where an oracle looks up its truth. Live there is one, 0.
-        azimuth_bins: belief, over all views, in the azimuth bin that is seen from the current view, if the object is
-            of each class, (B, classes, azimuth bins) float64; None unless the policy needs it.
-        joint: belief, over all views, in each hypothesis of ``Calibration.hypotheses`` seen from each azimuth bin from
-            here, (B, hypotheses, azimuth bins) float64; None unless the policy needs it.
-        reachable: which views the camera can be brought to, (B, V) bool; None for all.
-        travel: cost to go from here to each view, grid cells, (B, V) float64; None for the travel of the viewpoints.
-        places: unit vectors towards where the camera really stood, the last one here, (B, step, 3) float64; None where
-            these are the views themselves. Then ``visited`` are the views nearest to them.
-        observations: all views taken so far, in order, B sequences; None unless the policy needs them.
-        visibility: expected share of the object that shows from each view, 0 to 1, (B, V) float64; None unless the
+        episodes: which episodes these are, (B,) int64: where an oracle looks up its truth. Live
+            there is one, 0.
+        azimuth_bins: belief, over all views, in the azimuth bin that is seen from the current view,
+            if the object is of each class, (B, classes, azimuth bins) float64; None unless the
             policy needs it.
-        outlook: what can be foreseen of views by the geometry of taught things, of B episodes, None in those where
-            that is nothing; None unless the policy needs it.
+        joint: belief, over all views, in each hypothesis of ``Calibration.hypotheses`` seen from
+            each azimuth bin from here, (B, hypotheses, azimuth bins) float64; None unless the
+            policy needs it.
+        reachable: which views the camera can be brought to, (B, V) bool; None for all.
+        travel: cost to go from here to each view, grid cells, (B, V) float64; None for the travel
+            of the viewpoints.
+        places: unit vectors towards where the camera really stood, the last one here, (B, step, 3)
+            float64; None where these are the views themselves. Then ``visited`` are the views
+            nearest to them.
+        observations: all views taken so far, in order, B sequences; None unless the policy needs
+            them.
+        visibility: expected share of the object that shows from each view, 0 to 1, (B, V) float64;
+            None unless the policy needs it.
+        outlook: what can be foreseen of views by the geometry of taught things, of B episodes, None
+            in those where that is nothing; None unless the policy needs it.
     """
 
     current: NDArray[np.int64]
@@ -77,16 +84,20 @@ class EpisodeState:
 
 
 class Policy(Protocol):
-    """Chooses where to look next, in many episodes at once, in each by itself: no row may depend on another."""
+    """Chooses where to look next, in many episodes at once, in each by itself: no row may depend
+    on another.
+    """
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of maps that it wants in the evidence, "azimuth_bins", "joint", "observations", "outlook",
-        "visibility".
+        """Names of maps that it wants in the evidence, "azimuth_bins", "joint", "observations",
+        "outlook", "visibility".
         """
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        """The next view of each episode, (B,) int64: one of ``state.free``, of which each episode has at least one."""
+        """The next view of each episode, (B,) int64: one of ``state.free``, of which each
+        episode has at least one.
+        """
 
 
 @runtime_checkable
@@ -94,19 +105,25 @@ class ValuesViews(Protocol):
     """A policy that can show what it decides by. Optional: nothing but pictures depends on it."""
 
     def view_values(self, state: EpisodeState) -> Float:
-        """What each candidate view is valued at, (B, V) float64; NaN for those that are not considered."""
+        """What each candidate view is valued at, (B, V) float64; NaN for those that are not
+        considered.
+        """
 
 
 @runtime_checkable
 class ScoresViews(Protocol):
-    """A policy on a grid that goes to the free view with the best score less weighted travel; see ``off_grid``."""
+    """A policy on a grid that goes to the free view with the best score less weighted travel;
+    see ``off_grid``.
+    """
 
     @property
     def travel_weight(self) -> float:
         """Of a grid cell of travel."""
 
     def scores(self, state: EpisodeState) -> Float:
-        """The score of each view before travel counts, (B, V) float64; NaN for those that are not considered."""
+        """The score of each view before travel counts, (B, V) float64; NaN for those that are
+        not considered.
+        """
 
 
 def travel_from(sphere: Viewpoints, state: EpisodeState) -> Float:
@@ -117,7 +134,9 @@ def travel_from(sphere: Viewpoints, state: EpisodeState) -> Float:
 def visibility_of(state: EpisodeState) -> Float:
     """What is expected to show from each view, (B, V)."""
     if state.visibility is None:
-        raise PolicyError("this policy needs the share of the object that is expected to show from each view")
+        raise PolicyError(
+            "this policy needs the share of the object that is expected to show from each view"
+        )
     return state.visibility
 
 
@@ -128,36 +147,52 @@ def check_weight(travel_weight: float) -> None:
 
 
 def in_window(sphere: ViewSphere, state: EpisodeState, values: NDArray[np.floating]) -> Float:
-    """Values of the local window's cells, (B, rings, 3), where they lie on the sphere, (B, V); NaN elsewhere."""
+    """Values of the local window's cells, (B, rings, 3), where they lie on the sphere, (B, V);
+    NaN elsewhere.
+    """
     found = np.full(state.visited.shape, np.nan)
-    np.put_along_axis(found, sphere.windows[state.current].reshape(len(found), -1), values.reshape(len(found), -1), 1)
+    np.put_along_axis(
+        found,
+        sphere.windows[state.current].reshape(len(found), -1),
+        values.reshape(len(found), -1),
+        1,
+    )
     return found
 
 
-def window_of(sphere: ViewSphere, state: EpisodeState, values: NDArray[np.floating]) -> NDArray[np.floating]:
+def window_of(
+    sphere: ViewSphere, state: EpisodeState, values: NDArray[np.floating]
+) -> NDArray[np.floating]:
     """Of values of all views, (B, V), those of the local window's cells, (B, rings, 3)."""
     return values[np.arange(len(values))[:, None, None], sphere.windows[state.current]]
 
 
 def considered(sphere: ViewSphere, state: EpisodeState, values: Float, scope: Scope) -> Float:
     """Values of the views, (B, V), where a policy of this scope may go; NaN elsewhere."""
-    return values if scope == "global" else in_window(sphere, state, window_of(sphere, state, values))
+    return (
+        values if scope == "global" else in_window(sphere, state, window_of(sphere, state, values))
+    )
 
 
 def best_view(
     sphere: Viewpoints, state: EpisodeState, values: NDArray[np.floating], scope: Scope = "global"
 ) -> NDArray[np.int64]:
-    """The free view with the highest value, (B, V): of all views, or of the local window; (B,) int64."""
+    """The free view with the highest value, (B, V): of all views, or of the local window; (B,)
+    int64.
+    """
     if scope == "global":
         return np.where(state.free, values, -np.inf).argmax(1)
     assert isinstance(sphere, ViewSphere)
     return best_in_window(sphere, state, window_of(sphere, state, values))
 
 
-def best_in_window(sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.floating]) -> NDArray[np.int64]:
+def best_in_window(
+    sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.floating]
+) -> NDArray[np.int64]:
     """The free view of the local window with the highest of finite scores, (B, rings, 3).
 
-    With none free there, the free view with the shortest travel; with none at all, the window's best.
+    With none free there, the free view with the shortest travel; with none at all, the window's
+    best.
     """
     b = len(state.current)
     rows = np.arange(b)
@@ -168,5 +203,7 @@ def best_in_window(sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.f
     stuck = ~free.any(1)
     if stuck.any():
         near = np.where(state.free[stuck], travel_from(sphere, state)[stuck], np.inf)
-        chosen[stuck] = np.where(np.isfinite(near).any(1), near.argmin(1), window[stuck, flat[stuck].argmax(1)])
+        chosen[stuck] = np.where(
+            np.isfinite(near).any(1), near.argmin(1), window[stuck, flat[stuck].argmax(1)]
+        )
     return chosen

@@ -1,4 +1,5 @@
-"""Policies that ask no network: by where the camera has been, by what shows, and views that were settled beforehand.
+"""Policies that ask no network: by where the camera has been, by what shows, and views that were
+settled beforehand.
 
 The thesis's baselines (section 5.3, figure 11) are ``Random``, ``Furthest`` and ``Unidirectional``.
 """
@@ -19,14 +20,18 @@ from nextview.policies.base import (
     check_weight,
     travel_from,
     visibility_of,
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """A policy that asks for nothing but the viewpoints."""
+    """A policy that asks for nothing but the viewpoints.
 
-    sphere: Any  # a ``ViewSphere``; for ``RandomAll`` any ``Viewpoints``
+    Attributes:
+        sphere: a ``ViewSphere``; for ``RandomAll`` any ``Viewpoints``.
+    """
+
+    sphere: Any
     needs: tuple[str, ...] = ()
 
 
@@ -34,21 +39,29 @@ class Random(Baseline):
     """Any unvisited view of the local window, with equal chance."""
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        return best_in_window(self.sphere, state, rng.random((len(state.current), self.sphere.rings, 3)))
+        return best_in_window(
+            self.sphere, state, rng.random((len(state.current), self.sphere.rings, 3))
+        )
 
 
 class RandomAll(Baseline):
-    """Any unvisited view of the whole sphere, with equal chance: the far views that a local window rules out."""
+    """Any unvisited view of the whole sphere, with equal chance: the far views that a local
+    window rules out.
+    """
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         return best_view(self.sphere, state, rng.random(state.visited.shape))
 
 
 class Furthest(Baseline):
-    """The unvisited view of the local window with the largest grid distance; equal ones with equal chance."""
+    """The unvisited view of the local window with the largest grid distance; equal ones with
+    equal chance.
+    """
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        distance = self.sphere.travel[state.current[:, None, None], self.sphere.windows[state.current]]
+        distance = self.sphere.travel[
+            state.current[:, None, None], self.sphere.windows[state.current]
+        ]
         return best_in_window(self.sphere, state, distance + 1e-6 * rng.random(distance.shape))
 
 
@@ -70,7 +83,9 @@ class Unidirectional(Baseline):
 
 @dataclass(frozen=True)
 class Spread:
-    """The unvisited view farthest on the sphere from all visited ones; equal ones with equal chance."""
+    """The unvisited view farthest on the sphere from all visited ones; equal ones with equal
+    chance.
+    """
 
     sphere: Viewpoints
     scope: Scope = "global"
@@ -78,7 +93,8 @@ class Spread:
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         nearest = np.full(state.visited.shape, np.inf)
-        for view in range(len(self.sphere)):  # one at a time, so that the memory does not grow with V squared
+        # one at a time, so that the memory does not grow with V squared
+        for view in range(len(self.sphere)):
             seen = state.visited[:, view]
             nearest[seen] = np.minimum(nearest[seen], self.sphere.arc[view])
         return best_view(self.sphere, state, nearest + 1e-6 * rng.random(nearest.shape), self.scope)
@@ -86,7 +102,9 @@ class Spread:
 
 @dataclass(frozen=True)
 class Visibility:
-    """The free view from which most of the object should show, less the weighted travel; equal ones by chance."""
+    """The free view from which most of the object should show, less the weighted travel; equal
+    ones by chance.
+    """
 
     sphere: Viewpoints
     travel_weight: float = 0.0
@@ -100,14 +118,20 @@ class Visibility:
         return visibility_of(state) - self.travel_weight * travel_from(self.sphere, state)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        return best_view(self.sphere, state, self.view_values(state) + 1e-6 * rng.random(state.visited.shape))
+        return best_view(
+            self.sphere, state, self.view_values(state) + 1e-6 * rng.random(state.visited.shape)
+        )
 
 
 @dataclass(frozen=True)
 class ViewList:
-    """Goes where a list says."""
+    """Goes where a list says.
 
-    views: NDArray[np.int64]  # of each episode in order, (E, k); the first of them are the first views
+    Attributes:
+        views: of each episode in order, (E, k); the first of them are the first views.
+    """
+
+    views: NDArray[np.int64]
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -117,12 +141,17 @@ class ViewList:
 
 
 def orbit(sphere: ViewSphere, starts: NDArray[np.int64], k: int) -> NDArray[np.int64]:
-    """The next k views round the ring of each start, (E,), then round the ring above; the lowest follows the top."""
-    n, step = sphere.azimuths, np.arange(k)
+    """The next k views round the ring of each start, (E,), then round the ring above; the lowest
+    follows the top.
+    """
+    n = sphere.azimuths
+    step = np.arange(k)
     ring = (sphere.ring[starts][:, None] + step // n) % sphere.rings
     return ring * n + (sphere.azimuth_index[starts][:, None] + step) % n
 
 
 def ranked(values: NDArray[np.floating], k: int) -> NDArray[np.int64]:
-    """The k views with the highest values, (E, V), highest first, equal ones in their order: (E, k) int64."""
+    """The k views with the highest values, (E, V), highest first, equal ones in their order: (E,
+    k) int64.
+    """
     return np.argsort(-values, axis=1, kind="stable")[:, :k]

@@ -1,4 +1,6 @@
-"""The policy that tells taught things apart: it looks where the things that are believed most look least alike."""
+"""The policy that tells taught things apart: it looks where the things that are believed most
+look least alike.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,46 +15,69 @@ from nextview.things.memory import AZIMUTHS, RINGS, open_memory
 
 Float = NDArray[np.float64]
 WEIGHT = 40.0  # of a cosine, as a log-likelihood: for one view whose noise is not known yet
-LEADING = 24  # pairs of a thing, in a resting pose, and an azimuth that are weighed: those believed most
+# pairs of a thing, in a resting pose, and an azimuth that are weighed: those believed most
+LEADING = 24
 
 
 @dataclass(frozen=True)
 class Rivals:
-    """The two classes believed most, and the remembered view of each that is nearest to each of V candidate views."""
+    """The two classes believed most, and the remembered view of each that is nearest to each of
+    V candidate views.
 
-    classes: NDArray[np.int64]  # that believed most first, (2,)
-    hypotheses: NDArray[np.int64]  # the likeliest of each, (2,)
-    rings: NDArray[np.int64]  # of the remembered views, indices, (V,)
-    azimuths: NDArray[np.int64]  # likewise, (2, V)
-    alike: Float  # cosine of the two views, (V,); NaN where one of them is not remembered
+    Attributes:
+        classes: that believed most first, (2,).
+        hypotheses: the likeliest of each, (2,).
+        rings: of the remembered views, indices, (V,).
+        azimuths: likewise, (2, V).
+        alike: cosine of the two views, (V,); NaN where one of them is not remembered.
+    """
+
+    classes: NDArray[np.int64]
+    hypotheses: NDArray[np.int64]
+    rings: NDArray[np.int64]
+    azimuths: NDArray[np.int64]
+    alike: Float
 
 
 @dataclass(frozen=True, eq=False)
 class Discriminate:
     """Goes where the view is expected to tell most of which thing it is, less the weighted travel.
 
-    For each candidate view the memory says what each leading hypothesis, a thing and the azimuth it is seen from, would
-    show there. If one of them is true, the others keep the likelihood of their likeness to it. A view is worth the
-    expected logarithm of the belief in the true class (expected information: Denzler and Brown, IEEE TPAMI 2002;
-    Borotschnig et al., Image and Vision Computing 2000).
+    For each candidate view the memory says what each leading hypothesis, a thing and the azimuth it
+    is seen from, would show there. If one of them is true, the others keep the likelihood of their
+    likeness to it. A view is worth the expected logarithm of the belief in the true class (expected
+    information: Denzler and Brown, IEEE TPAMI 2002; Borotschnig et al., Image and Vision Computing
+    2000).
+
+    Attributes:
+        viewpoints: the candidates, anywhere.
+        views: remembered views of each hypothesis, (H, rings, azimuths, F), unit vectors; zero
+            where nothing is known.
+        classes: class of each hypothesis, (H,).
+        travel_weight: of a grid cell of travel.
     """
 
-    viewpoints: Viewpoints  # the candidates, anywhere
-    # remembered views of each hypothesis, (H, rings, azimuths, F), unit vectors; zero where nothing is known
+    viewpoints: Viewpoints
     views: NDArray[np.floating]
-    classes: NDArray[np.int64]  # class of each hypothesis, (H,)
-    travel_weight: float = 0.0  # of a grid cell of travel
+    classes: NDArray[np.int64]
+    travel_weight: float = 0.0
     needs: tuple[str, ...] = ("joint",)
 
     def __post_init__(self) -> None:
         check_weight(self.travel_weight)
 
     @classmethod
-    def from_card(cls, path: Path, viewpoints: Viewpoints, classes: tuple[str, ...] | None = None) -> "Discriminate":
-        """For the things of a memory, by its card; OtherUseError if ``classes`` are not those of its things."""
+    def from_card(
+        cls, path: Path, viewpoints: Viewpoints, classes: tuple[str, ...] | None = None
+    ) -> "Discriminate":
+        """For the things of a memory, by its card; OtherUseError if ``classes`` are not those of
+        its things.
+        """
         card, memory = open_memory(path)
         if classes is not None and card.classes != tuple(classes):
-            raise OtherUseError(f"{path}: discriminates other things ({', '.join(card.classes[:10])})")
+            raise OtherUseError(
+                f"{path}: discriminates other things ({', '.join(card.classes[:10])})"
+            )
         return cls(viewpoints, memory.views, np.array(card.calibration.hypotheses))
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -61,15 +86,29 @@ class Discriminate:
 
     def view_values(self, state: EpisodeState) -> Float:
         if state.joint is None:
-            raise PolicyError("this policy needs the belief in things and azimuths together: models made by learn")
-        here = self.viewpoints.azimuth[state.current] if state.places is None else azimuth_of(state.places[:, -1])
-        worth = [self._worth(joint, azimuth) for joint, azimuth in zip(state.joint, here, strict=True)]
+            raise PolicyError(
+                "this policy needs the belief in things and azimuths together: models made by learn"
+            )
+        here = (
+            self.viewpoints.azimuth[state.current]
+            if state.places is None
+            else azimuth_of(state.places[:, -1])
+        )
+        worth = [
+            self._worth(joint, azimuth) for joint, azimuth in zip(state.joint, here, strict=True)
+        ]
         return np.stack(worth) - self.travel_weight * travel_from(self.viewpoints, state)
 
     def _worth(self, joint: Float, here: float) -> Float:
-        """Expected log-belief in the true class after each view, (V,), from the belief (H, azimuths) seen from here."""
+        """Expected log-belief in the true class after each view, (V,), from the belief (H,
+        azimuths) seen from here.
+        """
         flat = joint.ravel()
-        leading = np.argpartition(-flat, LEADING - 1)[:LEADING] if len(flat) > LEADING else np.arange(len(flat))
+        leading = (
+            np.argpartition(-flat, LEADING - 1)[:LEADING]
+            if len(flat) > LEADING
+            else np.arange(len(flat))
+        )
         hypothesis, azimuth = np.divmod(leading, AZIMUTHS)
         belief = flat[leading] / flat[leading].sum()
         ring, bins = self._remembered(azimuth, here)
@@ -77,19 +116,25 @@ class Discriminate:
         shown = shown.swapaxes(0, 1)
         alike = shown @ shown.swapaxes(1, 2)  # (V, leading, leading)
         known: NDArray[np.bool_] = np.asarray(shown.any(2))
-        alike = np.where(known[:, :, None] & known[:, None], alike, 1)  # what is not known tells nothing
+        # what is not known tells nothing
+        alike = np.where(known[:, :, None] & known[:, None], alike, 1)
         kept = np.exp(-WEIGHT * (1 - alike.astype(np.float64))) * belief
         same = self.classes[hypothesis][:, None] == self.classes[hypothesis]
         return np.log((kept * same).sum(2) / kept.sum(2)) @ belief
 
-    def _remembered(self, azimuth: NDArray[np.int64], here: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Ring (V,) and azimuth bin (n, V) of the remembered views nearest to each view, by the bins seen from here."""
+    def _remembered(
+        self, azimuth: NDArray[np.int64], here: float
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Ring (V,) and azimuth bin (n, V) of the remembered views nearest to each view, by the
+        bins seen from here.
+        """
         ahead = np.rint((self.viewpoints.azimuth - here) / (2 * np.pi) * AZIMUTHS).astype(np.int64)
         ring = np.abs(np.degrees(self.viewpoints.elevation)[:, None] - RINGS).argmin(1)
         return ring, (azimuth[:, None] + ahead) % AZIMUTHS
 
     def rivals(self, joint: Float, here: float) -> Rivals | None:
-        """The two classes believed most, as remembered from every view; None if all hypotheses are of one class.
+        """The two classes believed most, as remembered from every view; None if all hypotheses are
+        of one class.
 
         From the belief (H, azimuths) seen from an azimuth, radians.
         """
@@ -101,4 +146,10 @@ class Discriminate:
         hypothesis, azimuth = np.divmod(of_two.reshape(2, -1).argmax(1), AZIMUTHS)
         ring, bins = self._remembered(azimuth, here)
         shown = self.views[hypothesis[:, None], ring, bins].astype(np.float64)
-        return Rivals(two, hypothesis, ring, bins, np.where(shown.any(2).all(0), (shown[0] * shown[1]).sum(1), np.nan))
+        return Rivals(
+            two,
+            hypothesis,
+            ring,
+            bins,
+            np.where(shown.any(2).all(0), (shown[0] * shown[1]).sum(1), np.nan),
+        )

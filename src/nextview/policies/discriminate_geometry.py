@@ -48,7 +48,9 @@ class DiscriminateGeometry:
     def view_values(self, state: EpisodeState) -> Float:
         """Expected information of each free view, nats, less what its way counts, (B, V)."""
         if state.outlook is None:
-            raise PolicyError("this policy needs things of known geometry: a memory that was taught from scans")
+            raise PolicyError(
+                "this policy needs things of known geometry: a memory that was taught from scans"
+            )
         travel = travel_from(self.viewpoints, state)
         rows = zip(state.outlook, state.free, state.visited, travel, strict=True)
         return np.stack([self._values(*row) for row in rows])

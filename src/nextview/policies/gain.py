@@ -1,8 +1,10 @@
-"""The policy that has learned what a view from each viewpoint brings, and weighs it against the travel there.
+"""The policy that has learned what a view from each viewpoint brings, and weighs it against the
+travel there.
 
-It decides by numbers that do not depend on where the object's azimuth zero is. It knows the ring (from gravity), never
-the absolute azimuth: all views are written as cells (see ``policies.learned_tables``), seen from where the camera
-stands, or from where the recogniser believes the object's own zero to be. An object and its mirror image are alike.
+It decides by numbers that do not depend on where the object's azimuth zero is. It knows the ring
+(from gravity), never the absolute azimuth: all views are written as cells (see
+``policies.learned_tables``), seen from where the camera stands, or from where the recogniser
+believes the object's own zero to be. An object and its mirror image are alike.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +19,15 @@ from numpy.typing import NDArray
 
 from nextview.errors import ModelError, PolicyError
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.policies.base import EpisodeState, Scope, best_view, check_weight, considered, travel_from, visibility_of
+from nextview.policies.base import (
+    EpisodeState,
+    Scope,
+    best_view,
+    check_weight,
+    considered,
+    travel_from,
+    visibility_of,
+)
 from nextview.policies.learned_tables import cells_from, cells_to
 from nextview.recognition.inference import OnnxFile, check_end, open_onnx, run_onnx
 from nextview.recognition.map_names import SPHERE, in_order, maps_among
@@ -25,12 +35,14 @@ from nextview.recognition.map_names import SPHERE, in_order, maps_among
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 INPUTS = ("belief", "view", "place", "azimuth_bin")
-"""What a network may take: the belief over all views; that by the last view alone; the ring and the views visited; and
-the azimuth bin that is seen, of the class believed most and over all classes. Any other name is that of a map."""
-VISIBILITY = "visibility"  # one more, for scenes: the share of the object that is expected to show from each view
+"""What a network may take: the belief over all views; that by the last view alone; the ring and the
+views visited; and the azimuth bin that is seen, of the class believed most and over all classes.
+Any other name is that of a map."""
+# one more, for scenes: the share of the object that is expected to show from each view
+VISIBILITY = "visibility"
 Frame = Literal["camera", "object"]
-"""From where azimuths of cells are counted: the camera's, or that at which the object, if of the class believed most,
-most likely shows its azimuth bin 0."""
+"""From where azimuths of cells are counted: the camera's, or that at which the object, if of the
+class believed most, most likely shows its azimuth bin 0."""
 FLOOR = np.log(1e-4)  # logarithm of the smallest belief that is told apart from none
 FEATURES_INPUT = "told"  # the name that the features have in the ONNX file
 
@@ -44,9 +56,13 @@ def maps_of(inputs: Sequence[str]) -> tuple[str, ...]:
 
 
 def ordered(inputs: Sequence[str]) -> tuple[str, ...]:
-    """Some inputs, each once, in the order of ``features``, whatever theirs: the maps stand behind the place."""
+    """Some inputs, each once, in the order of ``features``, whatever theirs: the maps stand
+    behind the place.
+    """
     *before, azimuth_bin = INPUTS
-    return tuple(name for name in (*before, *maps_of(inputs), azimuth_bin, VISIBILITY) if name in inputs)
+    return tuple(
+        name for name in (*before, *maps_of(inputs), azimuth_bin, VISIBILITY) if name in inputs
+    )
 
 
 def mirrored(sphere: ViewSphere) -> Index:
@@ -65,9 +81,13 @@ def origin(sphere: ViewSphere, state: EpisodeState, frame: Frame) -> Index:
 
 
 def _bin_belief(sphere: ViewSphere, state: EpisodeState) -> Float:
-    """Belief in the azimuth bin that is seen from the current view, for each class, (B, C, azimuths)."""
+    """Belief in the azimuth bin that is seen from the current view, for each class, (B, C,
+    azimuths).
+    """
     if state.azimuth_bins is None or state.azimuth_bins.shape[2] != sphere.azimuths:
-        raise PolicyError(f"this policy needs a recogniser that discriminates {sphere.azimuths} azimuth bins")
+        raise PolicyError(
+            f"this policy needs a recogniser that discriminates {sphere.azimuths} azimuth bins"
+        )
     return state.azimuth_bins
 
 
@@ -76,16 +96,21 @@ def _most_believed(belief: Float, azimuth_bins: Float) -> Float:
     return azimuth_bins[np.arange(len(belief)), belief.argmax(1)]
 
 
-def features(sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], frame: Frame = "camera") -> Float:
+def features(
+    sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], frame: Frame = "camera"
+) -> Float:
     """What a network takes of B episodes, none of it depending on the absolute azimuth."""
-    n, start = sphere.azimuths, origin(sphere, state, frame)
+    n = sphere.azimuths
+    start = origin(sphere, state, frame)
     ahead = (sphere.azimuth_index[state.current] - sphere.azimuth_index[start]) % n
     rows = np.arange(len(state.current))
     parts: list[NDArray] = []
     if "belief" in inputs:
         parts += _facets(state.belief)
     if "view" in inputs:
-        alone = np.exp((state.evidence.logits - state.evidence.logits.max(1, keepdims=True)).astype(np.float64))
+        alone = np.exp(
+            (state.evidence.logits - state.evidence.logits.max(1, keepdims=True)).astype(np.float64)
+        )
         parts += _facets(alone / alone.sum(1, keepdims=True))
     if "place" in inputs:
         parts.append(np.eye(sphere.rings)[sphere.ring[state.current]])
@@ -99,11 +124,16 @@ def features(sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], fra
     if "azimuth_bin" in inputs:
         parts += [np.eye(n)[ahead]] if frame == "object" else []
         azimuth_bins = _bin_belief(sphere, state)
-        for believed in (_most_believed(state.belief, azimuth_bins), (state.belief[:, :, None] * azimuth_bins).sum(1)):
+        for believed in (
+            _most_believed(state.belief, azimuth_bins),
+            (state.belief[:, :, None] * azimuth_bins).sum(1),
+        ):
             parts.append(np.take_along_axis(believed, (np.arange(n) + ahead[:, None]) % n, 1))
     if VISIBILITY in inputs:
         parts.append(visibility_of(state)[rows[:, None], cells_from(sphere)[start]])
-    return np.concatenate([np.asarray(part, np.float64).reshape(len(rows), -1) for part in parts], 1)
+    return np.concatenate(
+        [np.asarray(part, np.float64).reshape(len(rows), -1) for part in parts], 1
+    )
 
 
 def _facets(belief: Float) -> list[Float]:
@@ -112,15 +142,22 @@ def _facets(belief: Float) -> list[Float]:
     return [belief, logs, -np.sort(-logs, 1)[:, :3]]
 
 
-def mirrored_features(sphere: ViewSphere, classes: int, inputs: Sequence[str], frame: Frame = "camera") -> Index:
-    """Which of the numbers of ``features`` stands in each place for the mirror image of an object, (D,) int64."""
-    n, facets = sphere.azimuths, 2 * classes + min(3, classes)
+def mirrored_features(
+    sphere: ViewSphere, classes: int, inputs: Sequence[str], frame: Frame = "camera"
+) -> Index:
+    """Which of the numbers of ``features`` stands in each place for the mirror image of an
+    object, (D,) int64.
+    """
+    n = sphere.azimuths
+    facets = 2 * classes + min(3, classes)
     window = np.arange(sphere.rings * 3).reshape(-1, 3)[:, ::-1].ravel()
     blocks = {
         "belief": np.arange(facets),
         "view": np.arange(facets),
         "place": np.concatenate([np.arange(sphere.rings), sphere.rings + mirrored(sphere)]),
-        "azimuth_bin": np.concatenate([k * n + -np.arange(n) % n for k in range(2 if frame == "camera" else 3)]),
+        "azimuth_bin": np.concatenate(
+            [k * n + -np.arange(n) % n for k in range(2 if frame == "camera" else 3)]
+        ),
         VISIBILITY: mirrored(sphere),
     } | {name: mirrored(sphere) if name.endswith(SPHERE) else window for name in maps_of(inputs)}
     chosen = [blocks[name] for name in ordered(inputs)]
@@ -133,33 +170,49 @@ def mirrored_features(sphere: ViewSphere, classes: int, inputs: Sequence[str], f
 
 @dataclass(frozen=True)
 class Gain:
-    """The unvisited view whose predicted value, less the travel weight of the way there, is highest.
+    """The unvisited view whose predicted value, less the travel weight of the way there, is
+    highest.
 
-    Small networks learn by replay of predictions what the belief in the true class becomes after each possible next
-    view (``nextview train gain``): fitted one-step lookahead, as in the value functions for sensor planning of Denzler
-    and Brown, "Information theoretic sensor data selection for active object recognition", PAMI 24 (2002), but
-    regressed from the decision state instead of simulated. They decide by ``features`` alone.
+    Small networks learn by replay of predictions what the belief in the true class becomes after
+    each possible next
+    view (``nextview train gain``): fitted one-step lookahead, as in the value functions for sensor
+    planning of Denzler and Brown, "Information theoretic sensor data selection for active object
+    recognition", PAMI 24 (2002), but regressed from the decision state instead of simulated. They
+    decide by ``features`` alone.
+
+    Attributes:
+        classes: how many, C.
+        score: from features, (B, D) float32, to the value of each cell, (B, V): the mean over some
+            networks and over the object and its mirror image; each row by itself, to the last bit.
+        inputs: of which the features are made.
+        travel_weight: of a grid cell, in the unit of the values: log-belief for the bundled one.
+        scope: where it may go.
+        frame: in which cells are counted.
     """
 
     sphere: ViewSphere
-    classes: int  # how many, C
-    # from features, (B, D) float32, to the value of each cell, (B, V): the mean over some networks and over the object
-    # and its mirror image; each row by itself, to the last bit
+    classes: int
     score: Callable[[NDArray[np.float32]], NDArray[np.floating]]
-    inputs: tuple[str, ...]  # of which the features are made
-    travel_weight: float = 0.0  # of a grid cell, in the unit of the values: log-belief for the bundled one
-    scope: Scope = "global"  # where it may go
-    frame: Frame = "camera"  # in which cells are counted
+    inputs: tuple[str, ...]
+    travel_weight: float = 0.0
+    scope: Scope = "global"
+    frame: Frame = "camera"
 
     def __post_init__(self) -> None:
         maps = maps_of(self.inputs)
         unknown = [name for name in maps if name not in maps_among(maps)]  # other needs of policies
         if unknown or not self.inputs:
-            known, other = ", ".join((*INPUTS, VISIBILITY)), ", ".join(unknown) or "nothing"
-            raise PolicyError(f"a gain policy takes some of {known} and of the maps that are predicted, not {other}")
+            known = ", ".join((*INPUTS, VISIBILITY))
+            other = ", ".join(unknown) or "nothing"
+            raise PolicyError(
+                f"a gain policy takes some of {known} and of the maps that are predicted, not"
+                f" {other}"
+            )
         check_weight(self.travel_weight)
         if self.frame not in get_args(Frame):
-            raise PolicyError(f"cells are counted from one of {', '.join(get_args(Frame))}, not {self.frame!r}")
+            raise PolicyError(
+                f"cells are counted from one of {', '.join(get_args(Frame))}, not {self.frame!r}"
+            )
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -168,13 +221,22 @@ class Gain:
         return (*maps_of(self.inputs), *(name for name, taken in others.items() if taken))
 
     def gains(self, state: EpisodeState) -> Float:
-        """The predicted value of each view, (B, V) float64; only differences between views mean anything."""
-        cells = self.score(features(self.sphere, state, self.inputs, self.frame).astype(np.float32)).astype(np.float64)
-        cells -= 1e-9 * np.arange(len(self.sphere))  # cells that are mirror images may tie; the first of them is taken
-        return np.take_along_axis(cells, cells_to(self.sphere)[origin(self.sphere, state, self.frame)], 1)
+        """The predicted value of each view, (B, V) float64; only differences between views mean
+        anything.
+        """
+        cells = self.score(
+            features(self.sphere, state, self.inputs, self.frame).astype(np.float32)
+        ).astype(np.float64)
+        # cells that are mirror images may tie; the first of them is taken
+        cells -= 1e-9 * np.arange(len(self.sphere))
+        return np.take_along_axis(
+            cells, cells_to(self.sphere)[origin(self.sphere, state, self.frame)], 1
+        )
 
     def view_values(self, state: EpisodeState) -> Float:
-        """Predicted gain of each view less the weighted travel there, (B, V); differences between views count."""
+        """Predicted gain of each view less the weighted travel there, (B, V); differences
+        between views count.
+        """
         return self.gains(state) - self.travel_weight * travel_from(self.sphere, state)
 
     def scores(self, state: EpisodeState) -> Float:
@@ -189,8 +251,9 @@ class Gain:
 class VisibleGain:
     """The free view with the highest product of what shows from it and its value if all shows.
 
-    The learned gain of a view tells only how much better it is than others. So a clear view is taken to bring, on the
-    average, all that the belief still lacks: its entropy. Where everything shows it goes where the gain policy goes.
+    The learned gain of a view tells only how much better it is than others. So a clear view is
+    taken to bring, on the average, all that the belief still lacks: its entropy. Where everything
+    shows it goes where the gain policy goes.
     """
 
     gain: Gain
@@ -210,7 +273,8 @@ class VisibleGain:
 
     def scores(self, state: EpisodeState) -> Float:
         """The products, (B, V); see ``ScoresViews``."""
-        gains, free = self.gain.gains(state), state.free
+        gains = self.gain.gains(state)
+        free = state.free
         mean = (gains * free).sum(1, keepdims=True) / np.maximum(free.sum(1, keepdims=True), 1)
         lacking = -(state.belief * np.log(np.maximum(state.belief, 1e-300))).sum(1, keepdims=True)
         return visibility_of(state) * (lacking + gains - mean)
@@ -239,11 +303,15 @@ def _cells(weights: Path, session: OnnxFile, features: NDArray[np.float32]) -> N
     return run_onnx(weights, session, ["cells"], features)[0]
 
 
-def read_gain(sphere: ViewSphere, table: GainTable, scope: Scope, weights: Path, sha256: str) -> Gain:
+def read_gain(
+    sphere: ViewSphere, table: GainTable, scope: Scope, weights: Path, sha256: str
+) -> Gain:
     """The policy that a card describes."""
     session = open_onnx(weights, sha256, threads=1)
     score = partial(_cells, weights, session)
-    policy = Gain(sphere, table.classes, score, table.inputs, table.travel_weight, scope, table.frame)
+    policy = Gain(
+        sphere, table.classes, score, table.inputs, table.travel_weight, scope, table.frame
+    )
     width = len(mirrored_features(sphere, policy.classes, policy.inputs, policy.frame))
     ends = [*session.get_inputs(), *session.get_outputs()]
     if [end.name for end in ends] != [FEATURES_INPUT, "cells"]:

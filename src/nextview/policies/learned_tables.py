@@ -1,7 +1,8 @@
-"""Policies that follow a table learned from predictions. They know the ring (from gravity), never the object's azimuth.
+"""Policies that follow a table learned from predictions. They know the ring (from gravity), never
+the object's azimuth.
 
-So a place is a *cell*: its ring, and how many azimuth steps it lies ahead of the camera, ``cell = ring * azimuths +
-steps``. What no table says is left to the view farthest from all visited.
+So a place is a *cell*: its ring, and how many azimuth steps it lies ahead of the camera, ``cell =
+ring * azimuths + steps``. What no table says is left to the view farthest from all visited.
 """
 
 from dataclasses import dataclass
@@ -30,17 +31,24 @@ def cells_to(sphere: ViewSphere) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class FixedSequence:
-    """The same moves for every object: a list of cells, each seen from the view before, for each ring to start from."""
+    """The same moves for every object: a list of cells, each seen from the view before, for each
+    ring to start from.
+
+    Attributes:
+        moves: cells, (rings, K).
+    """
 
     sphere: ViewSphere
-    moves: NDArray[np.int64]  # cells, (rings, K)
+    moves: NDArray[np.int64]
     scope: Scope = "global"
     needs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         on_it = (self.moves >= 0) & (self.moves < len(self.sphere))
         if self.moves.ndim != 2 or len(self.moves) != self.sphere.rings or not on_it.all():
-            raise PolicyError(f"a sequence needs moves over the sphere from each of its {self.sphere.rings} rings")
+            raise PolicyError(
+                f"a sequence needs moves over the sphere from each of its {self.sphere.rings} rings"
+            )
 
     @cached_property
     def paths(self) -> NDArray[np.int64]:
@@ -54,13 +62,20 @@ class FixedSequence:
         chosen = Spread(self.sphere, self.scope).next_views(state, rng)
         if state.step >= self.paths.shape[1]:
             return chosen
-        # Where the episode began is not told, but what was visited is: the start is the one whose path led here.
+        # Where the episode began is not told, but what was visited is: the start is the one whose
+        # path led here.
         so_far = self.paths[:, : state.step]
         deduplicated = (np.diff(np.sort(so_far, axis=1)) > 0).all(1)
-        led_here = deduplicated & state.visited[:, so_far].all(2) & (so_far[:, -1] == state.current[:, None])
+        led_here = (
+            deduplicated
+            & state.visited[:, so_far].all(2)
+            & (so_far[:, -1] == state.current[:, None])
+        )
         following = self.paths[led_here.argmax(1), state.step]
         free = state.free[np.arange(len(chosen)), following]
-        return np.where(led_here.any(1) & (state.visited.sum(1) == state.step) & free, following, chosen)
+        return np.where(
+            led_here.any(1) & (state.visited.sum(1) == state.step) & free, following, chosen
+        )
 
 
 @dataclass(frozen=True)
@@ -77,26 +92,41 @@ class FixedRing:
             raise PolicyError(f"there is no ring {self.ring} to be walked in steps of {self.steps}")
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        n, rows = self.sphere.azimuths, np.arange(len(state.current))
+        n = self.sphere.azimuths
+        rows = np.arange(len(state.current))
         order = np.concatenate([[0], np.arange(1, n) * self.steps, np.arange(1, n)])
         ahead = self.ring * n + (self.sphere.azimuth_index[state.current][:, None] + order) % n
         free = state.free[rows[:, None], ahead]
-        return np.where(free.any(1), ahead[rows, free.argmax(1)], Spread(self.sphere).next_views(state, rng))
+        return np.where(
+            free.any(1), ahead[rows, free.argmax(1)], Spread(self.sphere).next_views(state, rng)
+        )
 
 
 @dataclass(frozen=True)
 class ClassTable:
-    """The unvisited cell with the highest value for the class believed and the ring that the camera is on."""
+    """The unvisited cell with the highest value for the class believed and the ring that the
+    camera is on.
+
+    Attributes:
+        values: by believed class, current ring and cell, (classes, rings, V).
+    """
 
     sphere: ViewSphere
-    values: NDArray[np.float64]  # by believed class, current ring and cell, (classes, rings, V)
+    values: NDArray[np.float64]
     scope: Scope = "global"
     needs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         wanted = (self.sphere.rings, len(self.sphere))
-        if self.values.ndim != 3 or self.values.shape[1:] != wanted or not np.isfinite(self.values).all():
-            raise PolicyError(f"the table has to hold finite numbers of the shape (classes, {wanted[0]}, {wanted[1]})")
+        if (
+            self.values.ndim != 3
+            or self.values.shape[1:] != wanted
+            or not np.isfinite(self.values).all()
+        ):
+            raise PolicyError(
+                f"the table has to hold finite numbers of the shape (classes, {wanted[0]},"
+                f" {wanted[1]})"
+            )
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         return best_view(self.sphere, state, self._looked_up(state), self.scope)

@@ -11,32 +11,50 @@ from nextview.policies.base import EpisodeState, best_in_window, best_view, in_w
 
 
 def local_peaks(maps: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Cells of maps, (B, rows, columns), that no neighbour exceeds (3x3 maximum filter; nothing beyond the border)."""
-    # As SciPy's maximum_filter; recognising an object imports no SciPy, which keeps its start short.
+    """Cells of maps, (B, rows, columns), that no neighbour exceeds (3x3 maximum filter; nothing
+    beyond the border).
+    """
+    # As SciPy's maximum_filter; recognising an object imports no SciPy, which keeps its start
+    # short.
     padded = np.pad(maps, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
-    return np.asarray(maps) >= np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(1, 2)).max((-2, -1))
+    return np.asarray(maps) >= np.lib.stride_tricks.sliding_window_view(
+        padded, (3, 3), axis=(1, 2)
+    ).max((-2, -1))
 
 
 def peaks_first(maps: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Scores that put every local peak before every other cell, each group by value; same shape as the maps."""
+    """Scores that put every local peak before every other cell, each group by value; same shape
+    as the maps.
+    """
     maps = np.asarray(maps, np.float64)
     return maps + (np.ptp(maps, axis=(1, 2), keepdims=True) + 1.0) * local_peaks(maps)
 
 
 def sphere_peaks(values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The same of maps of the whole sphere, (B, rings, azimuths): the last azimuth is next to the first."""
+    """The same of maps of the whole sphere, (B, rings, azimuths): the last azimuth is next to
+    the first.
+    """
     values = np.asarray(values, np.float64)
     round_once = np.concatenate([values[..., -1:], values, values[..., :1]], 2)
-    return values + (np.ptp(values, axis=(1, 2), keepdims=True) + 1) * local_peaks(round_once)[..., 1:-1]
+    return (
+        values
+        + (np.ptp(values, axis=(1, 2), keepdims=True) + 1) * local_peaks(round_once)[..., 1:-1]
+    )
 
 
 @dataclass(frozen=True)
 class MapPeak:
-    """Go to the highest unvisited peak of a predicted map, or the deepest valley where the belief says so."""
+    """Go to the highest unvisited peak of a predicted map, or the deepest valley where the
+    belief says so.
+
+    Attributes:
+        map_name: in the evidence, (B, rings, 3).
+        valley_classes: those who are *believed* to be of one of these go to the lowest valley.
+    """
 
     sphere: ViewSphere
-    map_name: str  # in the evidence, (B, rings, 3)
-    valley_classes: tuple[int, ...] = ()  # those who are *believed* to be of one of these go to the lowest valley
+    map_name: str
+    valley_classes: tuple[int, ...] = ()
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -61,19 +79,28 @@ class MapPeak:
         if maps.shape[1:] != (self.sphere.rings, 3):
             there = f"the sphere has {self.sphere.rings} rings"
             raise PolicyError(f"the map {self.map_name!r} is {maps.shape[1:]}, but {there}")
-        return peaks_first(np.where(np.isin(state.belief.argmax(1), self.valley_classes)[:, None, None], -maps, maps))
+        return peaks_first(
+            np.where(
+                np.isin(state.belief.argmax(1), self.valley_classes)[:, None, None], -maps, maps
+            )
+        )
 
 
 @dataclass(frozen=True)
 class SpherePeak:
-    """Go to the highest unvisited peak of a predicted map of the whole sphere, then to the highest other view.
+    """Go to the highest unvisited peak of a predicted map of the whole sphere, then to the highest
+    other view.
 
-    As in Parisotto, Mukherjee and Kasaei, "MORE: simultaneous multi-view 3D object recognition and pose estimation"
-    (Intelligent Service Robotics 16, 2023). But here the map is predicted anew from each view, on the network's grid.
+    As in Parisotto, Mukherjee and Kasaei, "MORE: simultaneous multi-view 3D object recognition and
+    pose estimation" (Intelligent Service Robotics 16, 2023). But here the map is predicted anew
+    from each view, on the network's grid.
+
+    Attributes:
+        map_name: in the evidence, (B, rings, azimuths), columns once round from the view.
     """
 
     sphere: ViewSphere
-    map_name: str  # in the evidence, (B, rings, azimuths), columns once round from the view
+    map_name: str
     travel_weight = 0.0
 
     @property
@@ -94,6 +121,9 @@ class SpherePeak:
     def _on_sphere(self, state: EpisodeState, maps: NDArray[np.float64]) -> NDArray[np.float64]:
         n = self.sphere.azimuths
         if maps.shape[1:] != (self.sphere.rings, n):
-            raise PolicyError(f"the map {self.map_name!r} is {maps.shape[1:]}, but the sphere {self.sphere.rings, n}")
+            raise PolicyError(
+                f"the map {self.map_name!r} is {maps.shape[1:]}, but the sphere"
+                f" {self.sphere.rings, n}"
+            )
         columns = (np.arange(n) - self.sphere.azimuth_index[state.current][:, None]) % n
         return np.take_along_axis(maps, columns[:, None], 2).reshape(len(maps), -1)

@@ -1,7 +1,9 @@
-"""A policy that knows one grid of views, asked about views that lie anywhere from a camera that stands anywhere.
+"""A policy that knows one grid of views, asked about views that lie anywhere from a camera that
+stands anywhere.
 
-All that a policy on a grid is told counts azimuth from the camera. So the grid is turned until a column of it passes
-through the camera; the policy values the turned grid, and between its views the values are interpolated.
+All that a policy on a grid is told counts azimuth from the camera. So the grid is turned until a
+column of it passes through the camera; the policy values the turned grid, and between its views the
+values are interpolated.
 """
 
 from dataclasses import dataclass, replace
@@ -9,14 +11,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.geometry.viewsphere import Viewpoints, ViewSphere, angle_between, azimuth_of, elevation_of
+from nextview.geometry.viewsphere import (
+    Viewpoints,
+    ViewSphere,
+    angle_between,
+    azimuth_of,
+    elevation_of,
+)
 from nextview.policies.base import EpisodeState, Policy, ScoresViews, ValuesViews, travel_from
 
 Float = NDArray[np.float64]
 
 
 def anywhere(policy: Policy, sphere: Viewpoints) -> Policy:
-    """A policy for some viewpoints and for cameras that stand beside them: itself, if it knows its way already."""
+    """A policy for some viewpoints and for cameras that stand beside them: itself, if it knows
+    its way already.
+    """
     grid = getattr(policy, "sphere", None)
     if not isinstance(grid, ViewSphere):
         return policy
@@ -28,9 +38,10 @@ def anywhere(policy: Policy, sphere: Viewpoints) -> Policy:
 class OffGrid:
     """A policy on its grid, for any views. Camera and views on the grid itself make no difference.
 
-    The scores of one that scores views are interpolated between the four views of the turned grid around each view; a
-    view counts only where all of them do, and where none counts the nearest free one is taken. Any other policy chooses
-    among the cells that have a free view, and goes to the view nearest to the cell.
+    The scores of one that scores views are interpolated between the four views of the turned grid
+    around each view; a view counts only where all of them do, and where none counts the nearest
+    free one is taken. Any other policy chooses among the cells that have a free view, and goes to
+    the view nearest to the cell.
     """
 
     policy: Policy
@@ -52,10 +63,14 @@ class OffGrid:
         free = state.free
         considered = free & np.isfinite(scores)
         near = np.where(free, travel_from(self.sphere, state), np.inf)
-        return np.where(considered.any(1), np.where(considered, scores, -np.inf).argmax(1), near.argmin(1))
+        return np.where(
+            considered.any(1), np.where(considered, scores, -np.inf).argmax(1), near.argmin(1)
+        )
 
     def view_values(self, state: EpisodeState) -> Float:
-        """What the policy values each view at, interpolated, (B, V); all NaN where it values nothing."""
+        """What the policy values each view at, interpolated, (B, V); all NaN where it values
+        nothing.
+        """
         if not isinstance(self.policy, ValuesViews):
             return np.full(state.visited.shape, np.nan)
         if self._on_grid(state):
@@ -64,25 +79,35 @@ class OffGrid:
         if not isinstance(self.policy, ScoresViews):
             return self._between(self.policy.view_values(turned), ahead)
         # Travel to the views counts, not that to the grid.
-        values = self._between(self.policy.view_values(replace(turned, travel=np.zeros(turned.visited.shape))), ahead)
+        values = self._between(
+            self.policy.view_values(replace(turned, travel=np.zeros(turned.visited.shape))), ahead
+        )
         return values - self.policy.travel_weight * travel_from(self.sphere, state)
 
     def _on_grid(self, state: EpisodeState) -> bool:
         if not isinstance(self.sphere, ViewSphere) or not self.sphere.same_grid(self.grid):
             return False
-        return state.places is None or np.array_equal(state.places[:, -1], self.sphere.directions[state.current])
+        return state.places is None or np.array_equal(
+            state.places[:, -1], self.sphere.directions[state.current]
+        )
 
     def _turned(self, state: EpisodeState) -> tuple[EpisodeState, Float]:
-        """The state on the turned grid, and how many steps of azimuth each view lies ahead of the camera, (B, V)."""
-        n, rows = self.grid.azimuths, np.arange(len(state.current))[:, None]
+        """The state on the turned grid, and how many steps of azimuth each view lies ahead of
+        the camera, (B, V).
+        """
+        n = self.grid.azimuths
+        rows = np.arange(len(state.current))[:, None]
         here = self._here(state)
         ahead = (self.sphere.azimuth[None] - azimuth_of(here)[:, None]) / (2 * np.pi) * n % n
         ring = np.abs(np.radians(self.grid.elevations) - elevation_of(here)[:, None]).argmin(1)
-        ring_of = np.abs(np.radians(self.grid.elevations) - self.sphere.elevation[:, None]).argmin(1)
+        ring_of = np.abs(np.radians(self.grid.elevations) - self.sphere.elevation[:, None]).argmin(
+            1
+        )
         cell = ring_of * n + np.floor(ahead + 0.5).astype(np.int64) % n
         visited = np.zeros((len(rows), len(self.grid)), bool)
         reachable = visited.copy()
-        views, cells = np.nonzero(state.visited), np.nonzero(state.free)
+        views = np.nonzero(state.visited)
+        cells = np.nonzero(state.free)
         visited[views[0], cell[views]] = True
         reachable[cells[0], cell[cells]] = True
         visited &= ~reachable  # a cell with several views may have one that is free
@@ -94,7 +119,9 @@ class OffGrid:
         if visibility is not None:  # that of the view nearest to each cell
             near = self._grid_directions(state) @ self.sphere.directions.T
             visibility = np.take_along_axis(visibility, near.argmax(2), 1)
-        turned = replace(state, current=current, visited=visited, reachable=reachable, visibility=visibility)
+        turned = replace(
+            state, current=current, visited=visited, reachable=reachable, visibility=visibility
+        )
         return replace(turned, travel=None, places=None), ahead
 
     def _grid_directions(self, state: EpisodeState) -> Float:
@@ -107,24 +134,34 @@ class OffGrid:
     def _nearest_to(self, cells: NDArray[np.int64], state: EpisodeState) -> NDArray[np.int64]:
         """The free view nearest to a cell of the turned grid, (B,)."""
         towards = self._grid_directions(state)[np.arange(len(cells)), cells]
-        return np.where(state.free, angle_between(towards[:, None], self.sphere.directions[None]), np.inf).argmin(1)
+        return np.where(
+            state.free, angle_between(towards[:, None], self.sphere.directions[None]), np.inf
+        ).argmin(1)
 
     def _here(self, state: EpisodeState) -> Float:
         """Unit vectors towards the cameras, (B, 3)."""
-        return self.sphere.directions[state.current] if state.places is None else state.places[:, -1]
+        return (
+            self.sphere.directions[state.current] if state.places is None else state.places[:, -1]
+        )
 
     def _between(self, values: Float, ahead: Float) -> Float:
-        """Values of the turned grid's views, (B, grid), between which the views lie, (B, V); NaN beside a NaN."""
-        n, order = self.grid.azimuths, np.argsort(self.grid.elevations, kind="stable")
+        """Values of the turned grid's views, (B, grid), between which the views lie, (B, V); NaN
+        beside a NaN.
+        """
+        n = self.grid.azimuths
+        order = np.argsort(self.grid.elevations, kind="stable")
         heights = np.radians(self.grid.elevations)[order]
         row = np.interp(self.sphere.elevation, heights, np.arange(len(heights)))
         low = np.minimum(np.floor(row + 1e-9).astype(np.int64), len(heights) - 1)
         up = np.maximum(row - low, 0.0)
         left = np.floor(ahead + 1e-9).astype(np.int64)
         right = np.maximum(ahead - left, 0.0)
-        rows, found = np.arange(len(values))[:, None], np.zeros(ahead.shape)
+        rows = np.arange(len(values))[:, None]
+        found = np.zeros(ahead.shape)
         for ring, of_ring in ((low, 1 - up), (np.minimum(low + 1, len(heights) - 1), up)):
             for step, of_step in ((left, 1 - right), (left + 1, right)):
                 share = of_ring * of_step
-                found += np.where(share > 1e-6, share * values[rows, order[ring] * n + step % n], 0.0)
+                found += np.where(
+                    share > 1e-6, share * values[rows, order[ring] * n + step % n], 0.0
+                )
         return found

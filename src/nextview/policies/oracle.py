@@ -1,4 +1,6 @@
-"""Policies that see the truth: the ceiling of what can be gained, and the thesis's own choice, named for what it is."""
+"""Policies that see the truth: the ceiling of what can be gained, and the thesis's own choice,
+named for what it is.
+"""
 
 from dataclasses import dataclass
 
@@ -13,10 +15,15 @@ from nextview.recognition.belief import PLAIN_SUM, Calibration, of_true_class
 
 @dataclass(frozen=True)
 class OracleValley:
-    """The map's peak, or its valley where the *true* class asks for it, as the thesis did (section 4.2.3)."""
+    """The map's peak, or its valley where the *true* class asks for it, as the thesis did
+    (section 4.2.3).
+
+    Attributes:
+        labels: of each episode, (E,).
+    """
 
     sphere: ViewSphere
-    labels: NDArray[np.int64]  # of each episode, (E,)
+    labels: NDArray[np.int64]
     valley_classes: tuple[int, ...]
     map_name: str
 
@@ -27,19 +34,26 @@ class OracleValley:
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         maps = np.asarray(state.evidence.maps[self.map_name], np.float64)
         valley = np.isin(self.labels[state.episodes], self.valley_classes)
-        return best_in_window(self.sphere, state, peaks_first(np.where(valley[:, None, None], -maps, maps)))
+        return best_in_window(
+            self.sphere, state, peaks_first(np.where(valley[:, None, None], -maps, maps))
+        )
 
 
 @dataclass(frozen=True)
 class OracleMeasure:
-    """The unvisited view with the highest true value of a measure, or the highest peak of its map of the sphere.
+    """The unvisited view with the highest true value of a measure, or the highest peak of its map
+    of the sphere.
 
-    With viewpoint entropy this is the choice of Shui et al. (thesis, section 3.5), from a first view that is drawn;
-    with the fused descriptor that of Ding et al.; with peaks of the depth-entropy that of Parisotto et al.
+    With viewpoint entropy this is the choice of Shui et al. (thesis, section 3.5), from a first
+    view that is drawn; with the fused descriptor that of Ding et al.; with peaks of the
+    depth-entropy that of Parisotto et al.
+
+    Attributes:
+        values: of each view in each episode, (E, V).
     """
 
     sphere: ViewSphere
-    values: NDArray[np.floating]  # of each view in each episode, (E, V)
+    values: NDArray[np.floating]
     peaks: bool = False
     needs: tuple[str, ...] = ()
 
@@ -50,19 +64,28 @@ class OracleMeasure:
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         values = self.view_values(state)
         if self.peaks:
-            values = sphere_peaks(values.reshape(-1, self.sphere.rings, self.sphere.azimuths)).reshape(values.shape)
+            values = sphere_peaks(
+                values.reshape(-1, self.sphere.rings, self.sphere.azimuths)
+            ).reshape(values.shape)
         return best_view(self.sphere, state, values)
 
 
 @dataclass(frozen=True)
 class OracleGain:
-    """The view after which the true class is believed most: the ceiling of choosing one view ahead."""
+    """The view after which the true class is believed most: the ceiling of choosing one view
+    ahead.
+
+    Attributes:
+        log_evidence: of every view of every object, so that it adds up, (N, V, D).
+        labels: (N,).
+        objects: of each episode, (E,).
+    """
 
     sphere: ViewSphere
-    log_evidence: NDArray[np.floating]  # of every view of every object, so that it adds up, (N, V, D)
+    log_evidence: NDArray[np.floating]
     classes: int
-    labels: NDArray[np.int64]  # (N,)
-    objects: NDArray[np.int64]  # of each episode, (E,)
+    labels: NDArray[np.int64]
+    objects: NDArray[np.int64]
     scope: Scope = "local"
     calibration: Calibration = PLAIN_SUM
     needs: tuple[str, ...] = ()
@@ -76,12 +99,17 @@ class OracleGain:
         return best_in_window(self.sphere, state, gain.reshape(b, -1, 3))
 
     def _gains(self, state: EpisodeState, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Logarithm of the belief in the truth after a view of each view, or each of the window, in some episodes."""
-        objects, current = self.objects[state.episodes[rows]], state.current[rows]
+        """Logarithm of the belief in the truth after a view of each view, or each of the window,
+        in some episodes.
+        """
+        objects = self.objects[state.episodes[rows]]
+        current = state.current[rows]
         log_evidence = self.log_evidence[objects].astype(np.float64)
         so_far = np.matmul(state.visited[rows, None].astype(np.float64), log_evidence)[:, 0]
         if self.scope == "local":
             window = self.sphere.windows[current].reshape(len(rows), -1)
             log_evidence = log_evidence[np.arange(len(rows))[:, None], window]
-        logs = self.calibration.log_belief(so_far[:, None] + log_evidence, state.step + 1, self.classes)
+        logs = self.calibration.log_belief(
+            so_far[:, None] + log_evidence, state.step + 1, self.classes
+        )
         return of_true_class(logs, self.labels[objects])

@@ -1,4 +1,6 @@
-"""The card of a policy that was learned from predictions: one JSON file, table and all; weights are ONNX beside it."""
+"""The card of a policy that was learned from predictions: one JSON file, table and all; weights
+are ONNX beside it.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,7 +21,9 @@ Sha256 = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")]
 
 
 class LearnedFrom(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Predictions that a policy was learned from: the hash of their file; name and hash of each model, by kind."""
+    """Predictions that a policy was learned from: the hash of their file; name and hash of each
+    model, by kind.
+    """
 
     sha256: Sha256
     models: dict[str, tuple[str, str]]
@@ -38,9 +42,16 @@ TABLES = {  # what a card's table holds, by its kind
 
 
 class PolicyCard(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, tag_field="schema", tag=1
+    msgspec.Struct,
+    frozen=True,
+    forbid_unknown_fields=True,
+    omit_defaults=True,
+    tag_field="schema",
+    tag=1,
 ):
-    """One policy that was learned, for viewpoints on rings; its weights, if any, are the ONNX file beside it."""
+    """One policy that was learned, for viewpoints on rings; its weights, if any, are the ONNX
+    file beside it.
+    """
 
     kind: Literal["fixed-sequence", "fixed-ring", "class-table", "gain"]
     scope: Scope
@@ -50,7 +61,8 @@ class PolicyCard(
     table: dict[str, Any]  # see TABLES
     learned_from: str = ""  # in words
     predictions: tuple[LearnedFrom, ...] = ()
-    calibration: tuple[tuple[float, float], ...] = ()  # temperature and correlation of the beliefs in each part
+    # temperature and correlation of the beliefs in each part
+    calibration: tuple[tuple[float, float], ...] = ()
     settings: dict[str, Any] = {}  # how it was learned
     commands: tuple[str, ...] = ()  # all that made it from the models, in order
     sha256: Sha256 = ""  # of the ONNX file; "" if there is none
@@ -95,12 +107,19 @@ def read_policy_card(path: Path) -> PolicyCard:
 def read_policy(path: Path, sphere: Viewpoints, classes: Sequence[str] | None = None) -> Policy:
     """Make the policy that a card describes.
 
-    OtherUseError: it was learned for other viewpoints or classes. PolicyError: there is no such card, or it is damaged.
+    OtherUseError: it was learned for other viewpoints or classes. PolicyError: there is no such
+        card, or it is damaged.
     """
-    card, weights = read_policy_card(path), path.with_suffix(".onnx")
-    if not isinstance(sphere, ViewSphere) or (card.elevations, card.azimuths) != (sphere.elevations, sphere.azimuths):
+    card = read_policy_card(path)
+    weights = path.with_suffix(".onnx")
+    if not isinstance(sphere, ViewSphere) or (card.elevations, card.azimuths) != (
+        sphere.elevations,
+        sphere.azimuths,
+    ):
         rings = len(card.elevations)
-        raise OtherUseError(f"{path}: was learned for {rings} rings of {card.azimuths} views, not for this sphere")
+        raise OtherUseError(
+            f"{path}: was learned for {rings} rings of {card.azimuths} views, not for this sphere"
+        )
     if classes is not None and card.classes != tuple(classes):
         raise OtherUseError(f"{path}: was learned for other classes ({', '.join(card.classes)})")
     try:

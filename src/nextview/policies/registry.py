@@ -9,7 +9,14 @@ from nextview.checks import did_you_mean, one_line, plugin, plugin_errors, plugi
 from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import Viewpoints, ViewSphere
 from nextview.policies.base import Policy
-from nextview.policies.baselines import Furthest, Random, RandomAll, Spread, Unidirectional, Visibility
+from nextview.policies.baselines import (
+    Furthest,
+    Random,
+    RandomAll,
+    Spread,
+    Unidirectional,
+    Visibility,
+)
 from nextview.policies.discriminate import Discriminate
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.policies.gain import Gain, VisibleGain
@@ -19,7 +26,8 @@ from nextview.recognition.map_names import SPHERE, in_order
 from nextview.recognition.model_card import DISCRIMINATE, MAPS, is_memory
 from nextview.things.memory import open_memory
 
-POLICIES: dict[str, Callable[[Any], Policy]] = {  # those of no map; each map has its own, see ``map_policy``
+# those of no map; each map has its own, see ``map_policy``
+POLICIES: dict[str, Callable[[Any], Policy]] = {
     "random": Random,
     "random-all": RandomAll,
     "furthest": Furthest,
@@ -30,7 +38,8 @@ POLICIES: dict[str, Callable[[Any], Policy]] = {  # those of no map; each map ha
 }
 GROUP = "nextview.policies"  # entry points by which packages add policies of their own
 ANYWHERE = ("random-all", "spread", "visibility")  # those that need no grid
-VISIBLE = "visible-"  # before a gain policy's name: its values times the share that is expected to show
+# before a gain policy's name: its values times the share that is expected to show
+VISIBLE = "visible-"
 DEFAULT = "gain"  # the policy where none is named
 
 
@@ -43,17 +52,20 @@ def make_policy(
 ) -> Policy:
     """A policy by name; PolicyError if there is no such policy, or it cannot be made.
 
-    ``name`` is one of POLICIES; one by a map ("lem", "lem-peak", "lem-sphere-peak", see ``map_policy``); a learned one
-    that is bundled; the path of a learned one's card (.json); a gain policy with "visible-" before its name; one that
-    an installed package adds; or "MODULE:CLASS" for one of your own, which is called with the viewpoints alone.
-    NAME@WEIGHT sets the travel weight of one that weighs travel. ``sphere`` is a ``ViewSphere`` but for those of
-    ANYWHERE and your own; ``valley_classes`` are indices of those whose believers go to the map's valley; ``classes``
-    names those of the recogniser: a learned policy for others is refused; ``maps`` are predicted beside those of the
-    bundled networks.
+    ``name`` is one of POLICIES; one by a map ("lem", "lem-peak", "lem-sphere-peak", see
+    ``map_policy``); a learned one that is bundled; the path of a learned one's card (.json); a gain
+    policy with "visible-" before its name; one that an installed package adds; or "MODULE:CLASS"
+    for one of your own, which is called with the viewpoints alone. NAME@WEIGHT sets the travel
+    weight of one that weighs travel. ``sphere`` is a ``ViewSphere`` but for those of ANYWHERE and
+    your own; ``valley_classes`` are indices of those whose believers go to the map's valley;
+    ``classes`` names those of the recogniser: a learned policy for others is refused; ``maps`` are
+    predicted beside those of the bundled networks.
     """
     if "@" in name and ":" not in name:
         plain, _, travel_weight = name.partition("@")
-        return _at_travel_weight(make_policy(plain, sphere, valley_classes, classes, maps), name, travel_weight)
+        return _at_travel_weight(
+            make_policy(plain, sphere, valley_classes, classes, maps), name, travel_weight
+        )
     if _on_grid(name, maps) and not isinstance(sphere, ViewSphere):
         raise PolicyError(f"policy {name} needs viewpoints on rings")
     if name in POLICIES:
@@ -69,17 +81,26 @@ def make_policy(
         if not name.startswith(VISIBLE):
             return policy
         if not isinstance(policy, Gain):
-            raise PolicyError(f"{name}: this policy values no views that could be weighed by what shows")
+            raise PolicyError(
+                f"{name}: this policy values no views that could be weighed by what shows"
+            )
         return VisibleGain(policy, policy.travel_weight)
     path = plugins(GROUP).get(name, name)
     if ":" in path:
         return _import_policy(path, sphere)
     if name == DISCRIMINATE:
-        raise PolicyError("the policy discriminate is for taught things: models ycb, or those of nextview learn")
+        raise PolicyError(
+            "the policy discriminate is for taught things: models ycb, or those of nextview learn"
+        )
     if name.startswith(("true-", "oracle-", "best-", "worst-")) or name.endswith("-oracle-valley"):
-        raise PolicyError(f"{name} knows what no robot does: it takes part in nextview benchmark alone")
+        raise PolicyError(
+            f"{name} knows what no robot does: it takes part in nextview benchmark alone"
+        )
     known = [*policy_names(), *map_policy_names(maps), *bundled_policies(), f"{VISIBLE}{DEFAULT}"]
-    raise PolicyError(f"no policy is called {name!r}{did_you_mean(name, known) or '; there are ' + ', '.join(known)}")
+    raise PolicyError(
+        "no policy is called"
+        f" {name!r}{did_you_mean(name, known) or '; there are ' + ', '.join(known)}"
+    )
 
 
 def make_policy_anywhere(
@@ -112,16 +133,25 @@ def _card(name: str) -> Path | None:
 
 def _on_grid(name: str, maps: Collection[str]) -> bool:
     """Whether it is a policy that knows rings and neighbours."""
-    return (name in POLICIES and name not in ANYWHERE) or map_policy(name, None, (), maps) is not None
+    return (name in POLICIES and name not in ANYWHERE) or map_policy(
+        name, None, (), maps
+    ) is not None
 
 
-def map_policy(name: str, sphere: Any, valley_classes: Sequence[int], maps: Collection[str]) -> Policy | None:
+def map_policy(
+    name: str, sphere: Any, valley_classes: Sequence[int], maps: Collection[str]
+) -> Policy | None:
     """The policy that climbs a predicted map; None if the name is not that of one."""
     of = name.removesuffix("-peak")
-    window, always = of.removesuffix(SPHERE), of != name
+    window = of.removesuffix(SPHERE)
+    always = of != name
     if window not in (*MAPS, *maps) or (of != window and not always):
         return None
-    return MapPeak(sphere, of, () if always else tuple(valley_classes)) if of == window else SpherePeak(sphere, of)
+    return (
+        MapPeak(sphere, of, () if always else tuple(valley_classes))
+        if of == window
+        else SpherePeak(sphere, of)
+    )
 
 
 def map_policy_names(maps: Collection[str]) -> list[str]:
@@ -131,7 +161,9 @@ def map_policy_names(maps: Collection[str]) -> list[str]:
 
 
 def with_cards(name: str, cards: Mapping[str, Path]) -> str:
-    """The name, or what it means where it is that of one of these cards: also after "visible-" and before "@WEIGHT"."""
+    """The name, or what it means where it is that of one of these cards: also after "visible-"
+    and before "@WEIGHT".
+    """
     policy, weighted, travel_weight = name.partition("@")
     if policy in cards:
         return f"{cards[policy]}{weighted}{travel_weight}"
@@ -140,14 +172,18 @@ def with_cards(name: str, cards: Mapping[str, Path]) -> str:
 
 
 def _of_memory(card: Path, sphere: Viewpoints, classes: tuple[str, ...] | None) -> Policy:
-    """The policy that tells the things of a memory apart: by their surfaces, or else by what is remembered of them."""
+    """The policy that tells the things of a memory apart: by their surfaces, or else by what is
+    remembered of them.
+    """
     by_pictures = Discriminate.from_card(card, sphere, classes)
     _, memory = open_memory(card)
     return DiscriminateGeometry(sphere) if memory.surfaces.counts.any() else by_pictures
 
 
 def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:
-    if not isinstance(policy, Discriminate | DiscriminateGeometry | Gain | Visibility | VisibleGain):
+    if not isinstance(
+        policy, Discriminate | DiscriminateGeometry | Gain | Visibility | VisibleGain
+    ):
         raise PolicyError(f"{name}: this policy does not weigh travel")
     try:
         return replace(policy, travel_weight=float(travel_weight))
@@ -161,6 +197,10 @@ def _import_policy(path: str, sphere: Viewpoints) -> Policy:
     for part in ("next_views", "needs"):
         if not hasattr(policy, part):
             raise PolicyError(f"policy {path} has no {part}; see nextview.policies.base.Policy")
-    if not isinstance(policy.needs, tuple | list) or not all(isinstance(need, str) for need in policy.needs):
-        raise PolicyError(f"policy {path}: its needs are a tuple of names, not {one_line(repr(policy.needs))}")
+    if not isinstance(policy.needs, tuple | list) or not all(
+        isinstance(need, str) for need in policy.needs
+    ):
+        raise PolicyError(
+            f"policy {path}: its needs are a tuple of names, not {one_line(repr(policy.needs))}"
+        )
     return policy

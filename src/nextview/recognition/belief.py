@@ -16,7 +16,9 @@ Floating = NDArray[np.floating]
 
 
 def fuse(logits: Floating, temperature: float = 1.0) -> Float:
-    """Belief, (..., classes), by logits (..., views, classes): softmax of their sum (thesis, section 4.4)."""
+    """Belief, (..., classes), by logits (..., views, classes): softmax of their sum (thesis,
+    section 4.4).
+    """
     logits = np.asarray(logits, np.float64)
     if not np.isfinite(logits).all():
         raise ModelError("the recogniser gave a logit that is not a finite number")
@@ -29,11 +31,13 @@ def _softmax(logs: Floating) -> Float:
 
 
 def reorient(azimuth_bins: Floating, azimuth: Floating) -> Floating:
-    """Log-evidence of the bins seen from an azimuth as log-evidence of the azimuths to which bin 0 points; or back.
+    """Log-evidence of the bins seen from an azimuth as log-evidence of the azimuths to which bin 0
+    points; or back.
 
-    From azimuth a, bin s is seen if bin 0 points to a - s: the same sum turns either into the other. Between two steps
-    the likelihoods are interpolated, not their logarithms, so that they sum to the same over all azimuths. From (...,
-    classes, azimuth bins), in even steps of azimuth, and azimuths of the views, radians, (...).
+    From azimuth a, bin s is seen if bin 0 points to a - s: the same sum turns either into the
+    other. Between two steps the likelihoods are interpolated, not their logarithms, so that they
+    sum to the same over all azimuths. From (..., classes, azimuth bins), in even steps of azimuth,
+    and azimuths of the views, radians, (...).
     """
     n = azimuth_bins.shape[-1]
     steps = np.asarray(azimuth, np.float64)[..., None, None] / (2 * np.pi) * n
@@ -56,10 +60,11 @@ def reorient(azimuth_bins: Floating, azimuth: Floating) -> Floating:
 def log_evidence_of(logits: Floating, azimuth_bins: Floating | None, azimuth: Floating) -> Floating:
     """Log-evidence of views in a form that can be summed over views: see ``Calibration.belief``.
 
-    From logits (..., classes), log-likelihoods of the azimuth bins seen, (..., hypotheses, azimuth bins), or None,
-    and azimuths, radians, (...): the logits, then for each azimuth the log-evidence that azimuth bin 0 points there,
-    given each hypothesis, (..., classes + azimuth bins * hypotheses). The hypotheses are the classes, or see
-    ``Calibration.hypotheses``. The logits alone without azimuth bins.
+    From logits (..., classes), log-likelihoods of the azimuth bins seen, (..., hypotheses, azimuth
+    bins), or None, and azimuths, radians, (...): the logits, then for each azimuth the log-evidence
+    that azimuth bin 0 points there, given each hypothesis, (..., classes + azimuth bins *
+    hypotheses). The hypotheses are the classes, or see ``Calibration.hypotheses``. The logits alone
+    without azimuth bins.
     """
     if azimuth_bins is None:
         return logits
@@ -68,7 +73,9 @@ def log_evidence_of(logits: Floating, azimuth_bins: Floating | None, azimuth: Fl
 
 
 def of_true_class(logs: Float, labels: NDArray[np.int64]) -> Float:
-    """Log-belief in the true class, (N, ...), from logits (N, ..., C) up to a constant and labels (N,)."""
+    """Log-belief in the true class, (N, ...), from logits (N, ..., C) up to a constant and
+    labels (N,).
+    """
     top = logs.max(-1)
     of_truth = logs[np.arange(len(labels)), ..., labels]
     return of_truth - top - np.log(np.exp(logs - top[..., None]).sum(-1))
@@ -83,39 +90,55 @@ class RiskBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         ascending = all(a < b for a, b in zip(self.thresholds, self.thresholds[1:], strict=False))
-        fits = self.thresholds and self.bounds and all(len(row) == len(self.thresholds) for row in self.bounds)
+        fits = (
+            self.thresholds
+            and self.bounds
+            and all(len(row) == len(self.thresholds) for row in self.bounds)
+        )
         rates = all(0 <= rate <= 1 for row in self.bounds for rate in row) and 0 < self.delta < 1
         if not (ascending and fits and rates):
-            raise ModelError("error rates that cannot be promised: they do not fit their thresholds")
+            raise ModelError(
+                "error rates that cannot be promised: they do not fit their thresholds"
+            )
 
     def threshold(self, risk: float, max_views: int) -> float:
-        """The lowest threshold that promises an error rate of at most ``risk``; RiskError if none does."""
+        """The lowest threshold that promises an error rate of at most ``risk``; RiskError if
+        none does.
+        """
         if not 0 < risk < 1:
             raise RiskError(f"the risk is an error rate between 0 and 1, not {risk}")
         if max_views > len(self.bounds):
-            raise RiskError(f"error rates were calibrated for at most {len(self.bounds)} views, not {max_views}")
+            raise RiskError(
+                f"error rates were calibrated for at most {len(self.bounds)} views, not {max_views}"
+            )
         row = self.bounds[max_views - 1]
         for threshold, bound in zip(self.thresholds, row, strict=True):
             if bound <= risk:
                 return threshold
-        raise RiskError(f"this recogniser cannot promise an error rate of {risk}, only {min(row):.3f} and more")
+        raise RiskError(
+            f"this recogniser cannot promise an error rate of {risk}, only {min(row):.3f} and more"
+        )
 
 
 LARGEST_NUMBER = (
-    1e4  # of a calibration, and the reciprocal of its least temperature; what is fitted is within 0.01 to 100
+    # of a calibration, and the reciprocal of its least temperature; what is fitted is within 0.01
+    # to 100
+    1e4
 )
 
 
 class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """How far to trust a sum of logits. Views of one object err together, so k of them are not k pieces of evidence.
+    """How far to trust a sum of logits. Views of one object err together, so k of them are not k
+    pieces of evidence.
 
-    The sum over k views is divided by ``temperature * (1 + correlation * (k - 1))``: what the variance of a sum of k
-    equally correlated terms grows by, beyond k. Correlation 0 trusts the sum, 1 the mean.
+    The sum over k views is divided by ``temperature * (1 + correlation * (k - 1))``: what the
+    variance of a sum of k equally correlated terms grows by, beyond k. Correlation 0 trusts the
+    sum, 1 the mean.
 
-    Azimuth bins count too, if the recogniser knows them: an object stands still, so views from different azimuths have
-    to agree on where its azimuth bin 0 points. The belief in a class is multiplied by the likelihood of that agreement,
-    summed over all azimuths. ModelError: a temperature that is not positive, a negative number, or hypotheses that are
-    not of every class.
+    Azimuth bins count too, if the recogniser knows them: an object stands still, so views from
+    different azimuths have to agree on where its azimuth bin 0 points. The belief in a class is
+    multiplied by the likelihood of that agreement, summed over all azimuths. ModelError: a
+    temperature that is not positive, a negative number, or hypotheses that are not of every class.
     """
 
     temperature: float = 1.0  # of a single view
@@ -123,8 +146,8 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
     risk: RiskBounds | None = None  # for stopping with a promise; None if not known
     # of the azimuth bins of two views, 0 .. 1; None where these shall not count for the class
     bin_correlation: float | None = None
-    # what the azimuth bins are given, by the class of each, ascending: things, each in every resting pose that it was
-    # taught in. () where they are given the classes.
+    # what the azimuth bins are given, by the class of each, ascending: things, each in every
+    # resting pose that it was taught in. () where they are given the classes.
     hypotheses: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -138,7 +161,9 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
 
     @property
     def threshold_decay(self) -> float:
-        """How fast the threshold for stopping comes down with the views, see ``Stopping``: not at all for things."""
+        """How fast the threshold for stopping comes down with the views, see ``Stopping``: not
+        at all for things.
+        """
         return 0.0 if self.hypotheses else self.correlation
 
     def temperature_after(self, n_views: NDArray | int) -> Any:
@@ -146,7 +171,9 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         return self.temperature * (1 + self.correlation * (n_views - 1))
 
     def log_belief(self, total: Floating, n_views: NDArray | int, classes: int) -> Float:
-        """Log-belief in each class up to a constant, (..., classes), by a sum of ``log_evidence_of`` so many views."""
+        """Log-belief in each class up to a constant, (..., classes), by a sum of
+        ``log_evidence_of`` so many views.
+        """
         if not np.isfinite(total).all():
             raise ModelError("the recogniser said something that is not a finite number")
         total = np.asarray(total, np.float64)
@@ -158,58 +185,92 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         pointing -= top[..., None, :]
         agreement = top + np.log(np.exp(pointing, out=pointing).sum(-2))
         if self.hypotheses:  # a class is the sum of its things
-            first, top = np.unique(self.hypotheses, return_index=True)[1], agreement.max(-1, keepdims=True)
+            first = np.unique(self.hypotheses, return_index=True)[1]
+            top = agreement.max(-1, keepdims=True)
             # What underflows is far below the best, but still ordered.
             shares = np.add.reduceat(np.exp(agreement - top), first, -1)
-            agreement = np.maximum(np.log(shares + 1e-300), np.maximum.reduceat(agreement, first, -1) - top) + top
+            agreement = (
+                np.maximum(np.log(shares + 1e-300), np.maximum.reduceat(agreement, first, -1) - top)
+                + top
+            )
         return logs + agreement
 
     def _pointing(self, total: Floating, n_views: NDArray | int, classes: int) -> Float:
-        """Log-evidence of the azimuths to which azimuth bin 0 points, (..., azimuth bins, hypotheses)."""
+        """Log-evidence of the azimuths to which azimuth bin 0 points, (..., azimuth bins,
+        hypotheses).
+        """
         correlation = self.correlation if self.bin_correlation is None else self.bin_correlation
         sums = np.asarray(total, np.float64)[..., classes:]
         pointing = sums.reshape(*sums.shape[:-1], -1, len(self.hypotheses) or classes)
         return pointing / (1 + correlation * (np.asarray(n_views)[..., None, None] - 1))
 
-    def joint(self, total: Floating, n_views: NDArray | int, classes: int, azimuth: Floating) -> Float:
-        """Belief in each hypothesis seen from each azimuth bin, jointly, (..., hypotheses, azimuth bins), sums to 1."""
+    def joint(
+        self, total: Floating, n_views: NDArray | int, classes: int, azimuth: Floating
+    ) -> Float:
+        """Belief in each hypothesis seen from each azimuth bin, jointly, (..., hypotheses,
+        azimuth bins), sums to 1.
+        """
         total = np.asarray(total, np.float64)
         logs = reorient(self._pointing(total, n_views, classes).swapaxes(-1, -2), azimuth)
         of_class = total[..., :classes] / self.temperature_after(np.asarray(n_views)[..., None])
-        logs = logs + (of_class[..., list(self.hypotheses)] if self.hypotheses else of_class)[..., None]
+        logs = (
+            logs
+            + (of_class[..., list(self.hypotheses)] if self.hypotheses else of_class)[..., None]
+        )
         return _softmax(logs.reshape(*logs.shape[:-2], -1)).reshape(logs.shape)
 
     def belief(self, total: Floating, n_views: NDArray | int, classes: int) -> Float:
-        """Belief in each class, (..., classes) float64, sums to 1; arguments as for ``log_belief``."""
+        """Belief in each class, (..., classes) float64, sums to 1; arguments as for
+        ``log_belief``.
+        """
         return _softmax(self.log_belief(total, n_views, classes))
 
-    def azimuth_bins(self, total: Floating, n_views: NDArray | int, classes: int, azimuth: Floating) -> Float | None:
-        """Belief in the bin seen from an azimuth, given each hypothesis, (..., hypotheses, bins); None without bins."""
+    def azimuth_bins(
+        self, total: Floating, n_views: NDArray | int, classes: int, azimuth: Floating
+    ) -> Float | None:
+        """Belief in the bin seen from an azimuth, given each hypothesis, (..., hypotheses,
+        bins); None without bins.
+        """
         if total.shape[-1] == classes:
             return None
         return _softmax(reorient(self._pointing(total, n_views, classes).swapaxes(-1, -2), azimuth))
 
     def threshold(self, risk: float, max_views: int) -> float:
-        """The lowest threshold of the belief that promises an error rate; RiskError if none does."""
+        """The lowest threshold of the belief that promises an error rate; RiskError if none
+        does.
+        """
         if self.risk is None:
-            raise RiskError("this recogniser promises no error rate; calibrate it with nextview fit calibration")
+            raise RiskError(
+                "this recogniser promises no error rate; calibrate it with nextview fit calibration"
+            )
         return self.risk.threshold(risk, max_views)
 
 
-RARE, MUCH = 0.05, 2.0  # share of a class that is smaller than usual, and larger; times beyond that which none has
+# share of a class that is smaller than usual, and larger; times beyond that which none has
+RARE = 0.05
+MUCH = 2.0
 PLAIN_SUM = Calibration()  # trusts the sum of the logits as it stands, as the thesis did
 
 
 class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
-    """How likely each size is for an object of each class; it is added to the logits of views whose scale is known."""
+    """How likely each size is for an object of each class; it is added to the logits of views
+    whose scale is known.
+    """
 
     radii_m: tuple[float, ...]  # object radii, metres, ascending, (R,)
     log_density: tuple[tuple[float, ...], ...]  # that of their logarithm, (C, R)
     weight: float  # beside the logits
 
     def __post_init__(self) -> None:
-        radii, fits = np.array(self.radii_m), {len(row) for row in self.log_density} == {len(self.radii_m)}
-        if not fits or not len(radii) or radii[0] <= 0 or not (np.diff(radii) > 0).all() or not self.weight >= 0:
+        radii = np.array(self.radii_m)
+        fits = {len(row) for row in self.log_density} == {len(self.radii_m)}
+        if (
+            not fits
+            or not len(radii)
+            or radii[0] <= 0
+            or not (np.diff(radii) > 0).all()
+            or not self.weight >= 0
+        ):
             raise ModelError("sizes that do not fit together")
 
     @classmethod
@@ -226,16 +287,23 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
         """Logarithms of the radii between which nearly all objects of each class are, (C,) each."""
         grid, table = self._table
         share = np.cumsum(np.exp(table) * np.gradient(grid), axis=1)
-        low, high = (np.array([np.interp(at * row[-1], row, grid) for row in share]) for at in (RARE, 1 - RARE))
+        low, high = (
+            np.array([np.interp(at * row[-1], row, grid) for row in share])
+            for at in (RARE, 1 - RARE)
+        )
         return low, high
 
     def impossible(self, radius: float, much: float = MUCH) -> NDArray[np.bool_]:
-        """Whether an object of this radius, metres, is much smaller or larger than nearly all of each class, (C,)."""
+        """Whether an object of this radius, metres, is much smaller or larger than nearly all of
+        each class, (C,).
+        """
         low, high = self._usual
         return (np.log(radius) < low - np.log(much)) | (np.log(radius) > high + np.log(much))
 
     def logits(self, radii: Floating) -> NDArray[np.float32]:
-        """What is added to the logits, (B, C) float32, for object radii in metres, (B,); zero where these are NaN."""
+        """What is added to the logits, (B, C) float32, for object radii in metres, (B,); zero
+        where these are NaN.
+        """
         at = np.log(np.where(np.isfinite(radii), radii, 1.0))
         grid, table = self._table
         densities = np.stack([np.interp(at, grid, row) for row in table], 1)
@@ -246,10 +314,11 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
 class Stopping:
     """Stop when the belief's peak reaches a threshold, or after ``max_views`` views.
 
-    The threshold is ``threshold`` at the first view. With a ``threshold_decay`` its log-odds are then divided by
-    ``1 + threshold_decay * (views - 1)``: what is unclear after several views is seldom cleared up by another one. A
-    calibrated belief whose threshold decay is its correlation stops where the plain sum of logits does. UsageError: a
-    threshold outside 0 .. 1, fewer than one view, or a negative threshold decay.
+    The threshold is ``threshold`` at the first view. With a ``threshold_decay`` its log-odds are
+    then divided by ``1 + threshold_decay * (views - 1)``: what is unclear after several views is
+    seldom cleared up by another one. A calibrated belief whose threshold decay is its correlation
+    stops where the plain sum of logits does. UsageError: a threshold outside 0 .. 1, fewer than one
+    view, or a negative threshold decay.
     """
 
     threshold: float = 0.97
@@ -258,33 +327,44 @@ class Stopping:
 
     def __post_init__(self) -> None:
         if not 0 <= number(self.threshold, "the threshold") <= 1:
-            raise UsageError(f"the threshold is a probability between 0 and 1, not {self.threshold}")
+            raise UsageError(
+                f"the threshold is a probability between 0 and 1, not {self.threshold}"
+            )
         if whole(self.max_views, "the number of views", -(2**31)) < 1:
             raise UsageError(f"at least one view has to be taken, not {self.max_views}")
         number(self.threshold_decay, "the threshold decay", 0)
 
     @classmethod
     def of(
-        cls, calibration: Calibration, threshold: float = 0.97, risk: float | None = None, max_views: int = 5
+        cls,
+        calibration: Calibration,
+        threshold: float = 0.97,
+        risk: float | None = None,
+        max_views: int = 5,
     ) -> "Stopping":
-        """The rule that goes with a recogniser's calibration: the threshold decays with its correlation.
+        """The rule that goes with a recogniser's calibration: the threshold decays with its
+        correlation.
 
-        With a ``risk`` instead, the lowest threshold at which at most this share of those who stop early is wrong; it
-        does not decay. RiskError if that cannot be promised.
+        With a ``risk`` instead, the lowest threshold at which at most this share of those who stop
+        early is wrong; it does not decay. RiskError if that cannot be promised.
         """
         if risk is not None:
             return cls(calibration.threshold(risk, max_views), max_views)
         return cls(threshold, max_views, calibration.threshold_decay)
 
     def reached(self, belief: Floating, n_views: NDArray | int) -> NDArray[np.bool_]:
-        """Whether beliefs, (..., classes), after so many views, (...), are sure enough to stop, (...)."""
+        """Whether beliefs, (..., classes), after so many views, (...), are sure enough to stop,
+        (...).
+        """
         return belief.max(-1) >= self.threshold_at(n_views)
 
     def threshold_at(self, n_views: NDArray | int) -> Float:
         """The belief at which to stop after so many views, same shape."""
         if self.threshold_decay == 0 or self.threshold in (0, 1):
             return np.full(np.shape(n_views), float(self.threshold))
-        odds = np.log(self.threshold / (1 - self.threshold)) / (1 + self.threshold_decay * (np.asarray(n_views) - 1))
+        odds = np.log(self.threshold / (1 - self.threshold)) / (
+            1 + self.threshold_decay * (np.asarray(n_views) - 1)
+        )
         return 1 / (1 + np.exp(-odds))
 
     def __str__(self) -> str:
@@ -292,13 +372,17 @@ class Stopping:
         if self.threshold_decay == 0 or self.max_views == 1:
             return f"threshold {self.threshold:.3g}"
         first, second = self.threshold_at(np.arange(1, 3))
-        last = f", {float(self.threshold_at(self.max_views)):.2g} at view {self.max_views}" * (self.max_views > 2)
+        last = f", {float(self.threshold_at(self.max_views)):.2g} at view {self.max_views}" * (
+            self.max_views > 2
+        )
         return f"threshold {first:.3g} at the first view, {second:.2g} at the second{last}"
 
 
 @dataclass(frozen=True)
 class FixedLength(Stopping):
-    """Stop after ``max_views`` views and never before, however sure the belief is; the threshold counts for nothing."""
+    """Stop after ``max_views`` views and never before, however sure the belief is; the threshold
+    counts for nothing.
+    """
 
     def threshold_at(self, n_views: NDArray | int) -> Float:
         """Infinity, which no belief reaches, same shape."""

@@ -17,14 +17,15 @@ class Evidence:
 
     Attributes:
         logits: (B, classes) float.
-        maps: the maps that the policy needs, by name: local maps ("lem"), (B, rings, 3) float, and maps of the whole
-            sphere ("lem-sphere"), (B, rings, azimuths), columns once round from the view.
-        azimuth_bins: log-likelihood of each azimuth bin being the one that is seen, given each class, (B, classes,
-            azimuth bins) float. None if the recogniser cannot tell.
-        seen: whether anything was seen, (B,) bool; None if something was in all. A view without is no evidence: in
-            episodes all the above counts as zero there.
-        novelty: score of each view, B of them, made when asked for, see ``nextview.recognition.novelty``; None if the
-            recogniser judges no single views.
+        maps: the maps that the policy needs, by name: local maps ("lem"), (B, rings, 3) float, and
+            maps of the whole sphere ("lem-sphere"), (B, rings, azimuths), columns once round from
+            the view.
+        azimuth_bins: log-likelihood of each azimuth bin being the one that is seen, given each
+            class, (B, classes, azimuth bins) float. None if the recogniser cannot tell.
+        seen: whether anything was seen, (B,) bool; None if something was in all. A view without is
+            no evidence: in episodes all the above counts as zero there.
+        novelty: score of each view, B of them, made when asked for, see
+            ``nextview.recognition.novelty``; None if the recogniser judges no single views.
         observations: the views themselves, B of them; None where only what the models say is known.
     """
 
@@ -42,7 +43,8 @@ class Evidence:
             return None if values is None else values[rows]
 
         maps = {name: values[rows] for name, values in self.maps.items()}
-        novelty, observations = items_at(self.novelty, rows), items_at(self.observations, rows)
+        novelty = items_at(self.novelty, rows)
+        observations = items_at(self.observations, rows)
         bins, seen = map(some, (self.azimuth_bins, self.seen))
         return Evidence(self.logits[rows], maps, bins, seen, novelty, observations)
 

@@ -1,4 +1,6 @@
-"""Run the networks with ONNX Runtime: the recogniser, map networks, and any file that a card describes."""
+"""Run the networks with ONNX Runtime: the recogniser, map networks, and any file that a card
+describes.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,16 +27,24 @@ INPUT = "input"
 BINS_OUTPUT = "sides"
 FEATURES_OUTPUT = "features"
 EMBEDDING_OUTPUT = "embedding"
-"""Ends of ONNX files; "features" are what the last layers of a recogniser make the logits of, (B, F)."""
+"""Ends of ONNX files; "features" are what the last layers of a recogniser make the logits of,
+(B, F).
+"""
 LONGEST = 300  # letters of what the runtime says
-RUNTIME_ERRORS: tuple[type[Exception], ...] = (*DAMAGED, *RUNTIME_FAILURES)  # of a network that is no usable one
+# of a network that is no usable one
+RUNTIME_ERRORS: tuple[type[Exception], ...] = (*DAMAGED, *RUNTIME_FAILURES)
 Shape = tuple[int | None, ...]  # without the batch; None for a size that is free
 
 
 class OnnxFile(ort.InferenceSession):
-    """A network that ``open_onnx`` opened; pickled as its file, which is opened again. It never changes."""
+    """A network that ``open_onnx`` opened; pickled as its file, which is opened again.
 
-    def __init__(self, content: bytes, options: ort.SessionOptions, opened: tuple[Path, str, int]) -> None:
+    It never changes.
+    """
+
+    def __init__(
+        self, content: bytes, options: ort.SessionOptions, opened: tuple[Path, str, int]
+    ) -> None:
         super().__init__(content, options, providers=["CPUExecutionProvider"])
         self._opened = opened
 
@@ -51,41 +61,64 @@ def open_onnx(path: Path, sha256: str, threads: int = 0) -> OnnxFile:
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3
-    # Threads that wait for more work of one network would take the cores from the next: a third of the time of a view.
+    # Threads that wait for more work of one network would take the cores from the next: a third of
+    # the time of a view.
     options.add_session_config_entry("session.force_spinning_stop", "1")
-    # The hash is of this file alone: weights that it refers to in others, of the working folder say, are not found.
-    options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(path))
+    # The hash is of this file alone: weights that it refers to in others, of the working folder
+    # say, are not found.
+    options.add_session_config_entry(
+        "session.model_external_initializers_file_folder_path", str(path)
+    )
     try:
         return OnnxFile(content, options, (Path(path).absolute(), sha256, threads))
     except RUNTIME_ERRORS as error:
-        raise ModelError(f"{path}: not a usable ONNX model ({one_line(str(error), LONGEST)})") from None
+        raise ModelError(
+            f"{path}: not a usable ONNX model ({one_line(str(error), LONGEST)})"
+        ) from None
 
 
-def run_onnx(path: Path, session: ort.InferenceSession, names: Sequence[str], inputs: NDArray) -> list[NDArray]:
-    """The named outputs of a network with one input, (B, ...); ModelError if they are not B rows of finite numbers."""
+def run_onnx(
+    path: Path, session: ort.InferenceSession, names: Sequence[str], inputs: NDArray
+) -> list[NDArray]:
+    """The named outputs of a network with one input, (B, ...); ModelError if they are not B rows
+    of finite numbers.
+    """
     try:
         answers = session.run(list(names), {session.get_inputs()[0].name: inputs})
     except RUNTIME_ERRORS as error:
-        raise ModelError(f"{path}: fails when it is run ({one_line(str(error), LONGEST)})") from None
+        raise ModelError(
+            f"{path}: fails when it is run ({one_line(str(error), LONGEST)})"
+        ) from None
     declared = {end.name: end.shape for end in session.get_outputs()}
     for name, values in zip(names, answers, strict=True):
         wanted = (len(inputs), *declared[name][1:])
         fits = zip(wanted, values.shape, strict=False)
-        if values.ndim != len(wanted) or any(isinstance(w, int) and w != there for w, there in fits):
-            raise ModelError(f"{path}: gives {name} of the shape {values.shape} for {len(inputs)} inputs")
+        if values.ndim != len(wanted) or any(
+            isinstance(w, int) and w != there for w, there in fits
+        ):
+            raise ModelError(
+                f"{path}: gives {name} of the shape {values.shape} for {len(inputs)} inputs"
+            )
         if not np.isfinite(values).all():
             raise ModelError(f"{path}: gives {name} that are not finite numbers")
     return answers
 
 
 def check_end(path: Path, end: ort.NodeArg, kind: str, shape: Shape) -> None:
-    """Refuse an input or output that is not of this type ("tensor(float)") and shape, after a free batch dimension."""
+    """Refuse an input or output that is not of this type ("tensor(float)") and shape, after a
+    free batch dimension.
+    """
     there = end.shape[1:]
-    fits = len(end.shape) == len(shape) + 1 and all(w in (None, f) for w, f in zip(shape, there, strict=True))
+    fits = len(end.shape) == len(shape) + 1 and all(
+        w in (None, f) for w, f in zip(shape, there, strict=True)
+    )
     if not fits or end.type != kind or isinstance(end.shape[0], int):
         wanted = ", ".join("any" if size is None else str(size) for size in shape)
         sizes = ", ".join(map(str, end.shape))
-        raise ModelError(f"{path}: has {end.name} ({sizes}) {end.type}, not (batch, {wanted}) {kind} as its card says")
+        raise ModelError(
+            f"{path}: has {end.name} ({sizes}) {end.type}, not (batch, {wanted}) {kind} as its card"
+            " says"
+        )
 
 
 def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
@@ -93,11 +126,14 @@ def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
     session = open_onnx(card.path, card.sha256, threads)
     kind = "tensor(float)" if card.input.kind == "cloud" else "tensor(uint8)"
     ends = {end.name: end for end in session.get_outputs()}
-    shapes: dict[str, Shape] = {"map": (None, 3)} | ({"sphere": (None, None)} if card.output == "sphere" else {})
+    shapes: dict[str, Shape] = {"map": (None, 3)} | (
+        {"sphere": (None, None)} if card.output == "sphere" else {}
+    )
     if card.is_recogniser:
         bins = {BINS_OUTPUT: (len(card.classes), card.azimuth_bins)} if card.azimuth_bins else {}
         shapes = {"logits": (len(card.classes),), **bins}
-    taken, called = session.get_inputs(), f" called {INPUT}" if card.is_recogniser else ""
+    taken = session.get_inputs()
+    called = f" called {INPUT}" if card.is_recogniser else ""
     if len(taken) != 1 or (called and taken[0].name != INPUT):
         wants = ", ".join(end.name for end in taken) or "nothing"
         raise ModelError(f"{card.path}: takes {wants}, not one input{called}")
@@ -112,20 +148,25 @@ def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
 class NetworkRecogniser:
     """Classifies the object in each view, by its shape and, where the camera knows it, by its size.
 
-    ``model`` is the name of a bundled model, or the path of a card, ``threads`` those of ONNX Runtime, 0 for one on
-    each core. It discriminates so many ``azimuth_bins``, 0 for none; ``novelty`` is None if that was not fitted.
+    ``model`` is the name of a bundled model, or the path of a card, ``threads`` those of ONNX
+    Runtime, 0 for one on each core. It discriminates so many ``azimuth_bins``, 0 for none;
+    ``novelty`` is None if that was not fitted.
     """
 
     def __init__(self, model: str | Path = RECOGNISER, threads: int = 0) -> None:
         self.card = find_card(model)
         if not self.card.is_recogniser:
             raise ModelError(f"model {self.card.name} is a {self.card.kind}, not a recogniser")
-        self.classes, self.azimuth_bins = self.card.classes, self.card.azimuth_bins
+        self.classes = self.card.classes
+        self.azimuth_bins = self.card.azimuth_bins
         self.calibration = self.card.calibration
         self._session = open_weights(self.card, threads)
         self._known: Features | None = None
-        self._threads, sha256 = threads, self.card.novelty_sha256
-        self.novelty: Quantiles | None = read_novelty(novelty_path(self.card.path), sha256) if sha256 else None
+        self._threads = threads
+        sha256 = self.card.novelty_sha256
+        self.novelty: Quantiles | None = (
+            read_novelty(novelty_path(self.card.path), sha256) if sha256 else None
+        )
 
     @property
     def name(self) -> str:
@@ -133,25 +174,39 @@ class NetworkRecogniser:
         return self.card.name
 
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
-        """Evidence of B views from one camera; views in which nothing is seen are marked, see ``Evidence.seen``."""
+        """Evidence of B views from one camera; views in which nothing is seen are marked, see
+        ``Evidence.seen``.
+        """
         inputs = from_observations(self.card.input, observations)
         elevations = np.array([elevation_of(direction_of(o.pose)) for o in observations])
-        evidence = replace(self.from_inputs(inputs, elevations), seen=np.array([o.seen for o in observations]))
+        evidence = replace(
+            self.from_inputs(inputs, elevations), seen=np.array([o.seen for o in observations])
+        )
         if isinstance(self.novelty, Novelty):
-            evidence = replace(evidence, novelty=[ViewScore(o, self.novelty_scores) for o in observations])
+            evidence = replace(
+                evidence, novelty=[ViewScore(o, self.novelty_scores) for o in observations]
+            )
         if self.card.size is None:
             return evidence
         radii = np.array([np.nan if o.radius is None else o.radius for o in observations])
         return replace(evidence, logits=evidence.logits + self.card.size.logits(radii))
 
-    def from_inputs(self, inputs: NDArray[Any], elevations: NDArray[np.floating] | None = None) -> Evidence:
-        """Evidence by shape alone, from what the network takes; a memory needs elevations too, radians, (B,)."""
+    def from_inputs(
+        self, inputs: NDArray[Any], elevations: NDArray[np.floating] | None = None
+    ) -> Evidence:
+        """Evidence by shape alone, from what the network takes; a memory needs elevations too,
+        radians, (B,).
+        """
         names = ["logits"] + [BINS_OUTPUT] * bool(self.azimuth_bins)
-        outputs = dict(zip(names, run_onnx(self.card.path, self._session, names, inputs), strict=True))
+        outputs = dict(
+            zip(names, run_onnx(self.card.path, self._session, names, inputs), strict=True)
+        )
         return Evidence(outputs["logits"], azimuth_bins=outputs.get(BINS_OUTPUT))
 
     def novelty_scores(self, observations: Sequence[Observation]) -> NDArray[np.float64]:
-        """How novel B views are, (B,), by the features that know no classes; ModelError if that was not fitted."""
+        """How novel B views are, (B,), by the features that know no classes; ModelError if that
+        was not fitted.
+        """
         if not isinstance(self.novelty, Novelty):
             raise ModelError(f"{self.card.path}: has no novelty score of views")
         if self._known is None:
@@ -160,13 +215,19 @@ class NetworkRecogniser:
             if known != self._known.size:
                 file = novelty_path(self.card.path)
                 hint = "run nextview fit unknown again"
-                raise ModelError(f"{file}: was fitted to {known} features, not {self._known.size}; {hint}")
-        inputs = np.concatenate([from_observations(self._known.card.input, [o]) for o in observations])
+                raise ModelError(
+                    f"{file}: was fitted to {known} features, not {self._known.size}; {hint}"
+                )
+        inputs = np.concatenate(
+            [from_observations(self._known.card.input, [o]) for o in observations]
+        )
         return self.novelty.scores(self._known(inputs), np.array([o.exact for o in observations]))
 
 
 class Features:
-    """The bundled network that knows no classes: views to embeddings, unit vectors that alike views share."""
+    """The bundled network that knows no classes: views to embeddings, unit vectors that alike
+    views share.
+    """
 
     def __init__(self, threads: int = 0) -> None:
         self.card = find_card(FEATURES)
@@ -184,10 +245,11 @@ class Features:
 
 
 class MapNetwork:
-    """Predicts the local map around each view from the geometry seen, or from its partial cloud, as its card says.
+    """Predicts the local map around each view from the geometry seen, or from its partial cloud, as
+    its card says.
 
-    ``rings`` is how many rings of views the map has, None if its file leaves that open. Arguments as of
-    ``NetworkRecogniser``.
+    ``rings`` is how many rings of views the map has, None if its file leaves that open. Arguments
+    as of ``NetworkRecogniser``.
     """
 
     def __init__(self, model: str | Path, threads: int = 0) -> None:
@@ -205,7 +267,9 @@ class MapNetwork:
     def from_inputs(self, inputs: NDArray[Any]) -> dict[str, NDArray[np.float32]]:
         """The same from what the network takes, see ``network_input``."""
         ends = ["map", "sphere"][: len(self.card.maps)]
-        return dict(zip(self.card.maps, run_onnx(self.card.path, self._session, ends, inputs), strict=True))
+        return dict(
+            zip(self.card.maps, run_onnx(self.card.path, self._session, ends, inputs), strict=True)
+        )
 
 
 @dataclass(frozen=True)
@@ -226,14 +290,20 @@ class Models:
         return names_of(self.maps)
 
     def valley_classes(self, map_name: str) -> tuple[int, ...]:
-        """Classes (indices) for which a map's valley is the better view, as its card says; none without that map."""
+        """Classes (indices) for which a map's valley is the better view, as its card says; none
+        without that map.
+        """
         network = self.maps.get(map_name)
         valleys = () if network is None else network.card.valleys(self.classes)
         return tuple(self.classes.index(c) for c in valleys if c in self.classes)
 
     def evidence(self, observations: Sequence[Observation]) -> Evidence:
         """Evidence and maps of views from one camera."""
-        maps = {name: values for network in self.maps.values() for name, values in network(observations).items()}
+        maps = {
+            name: values
+            for network in self.maps.values()
+            for name, values in network(observations).items()
+        }
         return replace(self.recogniser(observations), maps=maps, observations=observations)
 
 
@@ -242,13 +312,19 @@ def names_of(networks: Mapping[str, MapNetwork]) -> tuple[str, ...]:
     return tuple(name for network in networks.values() for name in network.card.maps)
 
 
-def open_maps(cards: Mapping[str, str | Path], needs: Sequence[str], threads: int = 0) -> dict[str, MapNetwork]:
-    """The networks, of some cards, that predict the maps among a policy's needs, by the name of the local map."""
+def open_maps(
+    cards: Mapping[str, str | Path], needs: Sequence[str], threads: int = 0
+) -> dict[str, MapNetwork]:
+    """The networks, of some cards, that predict the maps among a policy's needs, by the name of
+    the local map.
+    """
     wanted = maps_among(needs)
     names = dict.fromkeys(name.removesuffix(SPHERE) for name in wanted)
     networks = {name: MapNetwork(cards[name], threads) for name in names if name in cards}
     missing = [name for name in wanted if name not in names_of(networks)]
     if missing:
         known = (name for card in cards.values() for name in find_card(card).maps)
-        raise ModelError(f"no network predicts the map {missing[0]!r}; there are {', '.join(known)}")
+        raise ModelError(
+            f"no network predicts the map {missing[0]!r}; there are {', '.join(known)}"
+        )
     return networks

@@ -3,11 +3,16 @@
 from collections.abc import Iterable, Sequence
 from typing import Literal
 
-Good = Literal["peak", "valley"]  # where a measure's map has the better views: at its highest values or its lowest
-CONFIDENCE = "confidence"  # a measure of views: that of the recogniser where it is right; of predictions
-LEM, LCM = "lem", "lcm"
-MAP_NAMES = {"depth_entropy": LEM, CONFIDENCE: LCM}  # the thesis's; all others are called as their measure
-SPHERE = "-sphere"  # how the name of a map of the whole sphere ends; without this it is the map of the local window
+# where a measure's map has the better views: at its highest values or its lowest
+Good = Literal["peak", "valley"]
+# a measure of views: that of the recogniser where it is right; of predictions
+CONFIDENCE = "confidence"
+LEM = "lem"
+LCM = "lcm"
+# the thesis's; all others are called as their measure
+MAP_NAMES = {"depth_entropy": LEM, CONFIDENCE: LCM}
+# how the name of a map of the whole sphere ends; without this it is the map of the local window
+SPHERE = "-sphere"
 # what else a policy may need
 NO_MAPS = ("azimuth_bins", "joint", "observations", "outlook", "visibility")
 
@@ -28,7 +33,9 @@ def maps_among(needs: Sequence[str]) -> list[str]:
 
 
 def in_order(maps: Iterable[str]) -> list[str]:
-    """Names of maps, each once: local windows before whole spheres, of each the thesis's first, then by alphabet."""
+    """Names of maps, each once: local windows before whole spheres, of each the thesis's first,
+    then by alphabet.
+    """
     own = list(MAP_NAMES.values())
 
     def place(name: str) -> tuple[bool, int, str]:

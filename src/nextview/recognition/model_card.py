@@ -1,4 +1,6 @@
-"""The card of a model: what it is, how it was made, how good it is, and which file holds its weights."""
+"""The card of a model: what it is, how it was made, how good it is, and which file holds its
+weights.
+"""
 
 import glob
 from collections.abc import Sequence
@@ -17,11 +19,14 @@ from nextview.recognition.network_input import InputSpec
 
 BUNDLED = Path(__file__).parent / "bundled"
 RECOGNISER = "recogniser-modelnet10"
-FEATURES = "features"  # the bundled network that knows no classes: what taught things are remembered by
+# the bundled network that knows no classes: what taught things are remembered by
+FEATURES = "features"
 MEMORY_SUFFIX = ".safetensors"
 DISCRIMINATE = "discriminate"  # the policy of a memory of things; its card is that of the memory
-COLLECTIONS = {"modelnet10": RECOGNISER, "ycb": "ycb"}  # bundled recognisers, by the name of their models
-MAPS = {LEM: "lem-modelnet10", LCM: "lcm-modelnet10"}  # the map networks that are bundled, by the name of the map
+# bundled recognisers, by the name of their models
+COLLECTIONS = {"modelnet10": RECOGNISER, "ycb": "ycb"}
+# the map networks that are bundled, by the name of the map
+MAPS = {LEM: "lem-modelnet10", LCM: "lcm-modelnet10"}
 NOWHERE = Path()
 SCHEMA = 2  # of the cards of models; those of policies have 1
 LARGEST_WEIGHT = 1e6  # of a cosine; what is fitted is below a hundred
@@ -32,7 +37,9 @@ SHORT_HASH = 16  # hexadecimal digits of the SHA-256 of a memory that its file's
 
 
 class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a network learned from, in words, the settings of each training, and every command that made it."""
+    """What a network learned from, in words, the settings of each training, and every command
+    that made it.
+    """
 
     data: str = ""
     recipes: tuple[dict[str, Any], ...] = ()
@@ -40,7 +47,8 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Symmetry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One symmetry of a thing: turned about an axis through the centroid of its surface, it is the same.
+    """One symmetry of a thing: turned about an axis through the centroid of its surface, it is the
+    same.
 
     Attributes:
         axis: Unit vector in the frame of the scan file.
@@ -64,13 +72,16 @@ class Verification(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         weights: Of each kind of evidence, see ``things.weighing.EvidenceWeights``, by their names.
         things: How many things there were when these were fitted.
         usual: Usual residual of each thing, see ``things.unknown.KnownResiduals``.
-        excess: Logarithms of how many times known things exceed it, ascending, after 1, 2, ... views.
+        excess: Logarithms of how many times known things exceed it, ascending, after 1, 2, ...
+            views.
     """
 
     weights: dict[str, Annotated[float, msgspec.Meta(ge=0, le=LARGEST_WEIGHT)]]
     things: Annotated[int, msgspec.Meta(ge=0)]
     usual: tuple[Annotated[float, msgspec.Meta(ge=0, le=LARGEST_WEIGHT)], ...] = ()
-    excess: tuple[tuple[Annotated[float, msgspec.Meta(ge=-LARGEST_WEIGHT, le=LARGEST_WEIGHT)], ...], ...] = ()
+    excess: tuple[
+        tuple[Annotated[float, msgspec.Meta(ge=-LARGEST_WEIGHT, le=LARGEST_WEIGHT)], ...], ...
+    ] = ()
 
     def __post_init__(self) -> None:
         for row in self.excess:
@@ -104,8 +115,9 @@ class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         features_sha256: The SHA-256 of the network whose features are remembered.
         weight: Of a cosine, as a log-likelihood.
         attribution: Whose work the things are, in words.
-        novelty: Quantiles, see ``novelty.Quantiles``, after 1, 2, ... views, of the negative log-likelihood of known
-            things, given the class that explains them best; () if that was not fitted.
+        novelty: Quantiles, see ``novelty.Quantiles``, after 1, 2, ... views, of the negative
+            log-likelihood of known things, given the class that explains them best; () if that was
+            not fitted.
         usual: See ``novelty.Quantiles``; () if that was not fitted.
         verification: What was fitted to surfaces; None if nothing was.
     """
@@ -125,29 +137,42 @@ class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
         levels = {len(row) for row in self.novelty}
         if self.novelty and (len(levels) > 1 or min(levels) < 2):
-            raise ModelError("the quantiles of the novelty are not of the same length, two at least")
+            raise ModelError(
+                "the quantiles of the novelty are not of the same length, two at least"
+            )
 
         for row in self.novelty:
             if list(row) != sorted(row):
                 raise ModelError("the quantiles of the novelty do not ascend")
 
-        if self.verification is not None and len(self.verification.usual) not in (0, len(self.things)):
+        if self.verification is not None and len(self.verification.usual) not in (
+            0,
+            len(self.things),
+        ):
             raise ModelError(f"its usual residuals are not of its {len(self.things)} things")
 
     @property
     def poses(self) -> tuple[int, ...]:
-        """The index of the thing that each resting pose is of, in order: what ``Memory.thing`` holds."""
+        """The index of the thing that each resting pose is of, in order: what ``Memory.thing``
+        holds.
+        """
         return tuple(index for index, thing in enumerate(self.things) for _ in range(thing.poses))
 
 
 class ModelCard(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, tag_field="schema", tag=SCHEMA
+    msgspec.Struct,
+    frozen=True,
+    forbid_unknown_fields=True,
+    omit_defaults=True,
+    tag_field="schema",
+    tag=SCHEMA,
 ):
-    """One model; as a file, a JSON object of these fields beside the file of the same name with its weights.
+    """One model; as a file, a JSON object of these fields beside the file of the same name with its
+    weights.
 
-    That is an ONNX file; of a memory of taught things, which is a recogniser too, a safetensors file. ModelError: a
-    recogniser without classes, sizes of other classes than these, a network of no input, or a memory of other classes
-    or resting poses than those of its things.
+    That is an ONNX file; of a memory of taught things, which is a recogniser too, a safetensors
+    file. ModelError: a recogniser without classes, sizes of other classes than these, a network of
+    no input, or a memory of other classes or resting poses than those of its things.
     """
 
     name: str  # what users call it
@@ -159,20 +184,24 @@ class ModelCard(
     classes: tuple[str, ...] = ()  # of a recogniser, unique, in the order of its logits
     azimuth_bins: int = 0  # of an object that a recogniser discriminates; 0 for none
     calibration: Calibration = PLAIN_SUM  # of a recogniser
-    size: SizeEvidence | None = None  # what a recogniser knows of the sizes of objects; None if nothing
+    # what a recogniser knows of the sizes of objects; None if nothing
+    size: SizeEvidence | None = None
     # of the novelty score beside the card; "" if there is none
     novelty_sha256: Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")] = ""
     measure: str = ""  # of which a map network predicts the map
     good: Good = "peak"  # where such a map has the better views
     # of a map network: the local window, or the whole sphere, of which the window is a part
     output: Literal["window", "sphere"] = "window"
-    valley_classes: tuple[str, ...] = ()  # for which the valley of its map was found to be the better view
+    # for which the valley of its map was found to be the better view
+    valley_classes: tuple[str, ...] = ()
     valley_gain: dict[str, float] = {}  # by how much, for each class
     training: Training = Training()  # how it was made
     scores: dict[str, Any] = {}  # on each set of objects
-    largest_difference_to_torch: float | None = None  # of the file's answers; None if it was not measured
+    # of the file's answers; None if it was not measured
+    largest_difference_to_torch: float | None = None
     note: str = ""  # what else is to be said
-    held_out: tuple[str, ...] = ()  # objects of the training split that it was not trained on; () if it does not say
+    # objects of the training split that it was not trained on; () if it does not say
+    held_out: tuple[str, ...] = ()
     # what calibration, size, novelty and valleys were fitted to, in words, by their names
     fitted_to: dict[str, str] = {}
     memory: Taught | None = None  # of a recogniser that was taught things; None for a network
@@ -185,7 +214,9 @@ class ModelCard(
         if len(set(self.classes)) < len(self.classes):
             raise ModelError("two classes have the same name")
         if self.size is not None and len(self.size.log_density) != len(self.classes):
-            raise ModelError(f"sizes of {len(self.size.log_density)} classes, not {len(self.classes)}")
+            raise ModelError(
+                f"sizes of {len(self.size.log_density)} classes, not {len(self.classes)}"
+            )
         if self.memory is not None:
             self._check_memory(self.memory)
 
@@ -194,7 +225,8 @@ class ModelCard(
         if not self.is_recogniser:
             raise ModelError(f"a memory of things is a recogniser, not a {self.kind}")
 
-        # The calibration checks that the hypotheses ascend by steps of one: the last tells the number of classes.
+        # The calibration checks that the hypotheses ascend by steps of one: the last tells the
+        # number of classes.
         hypotheses = self.calibration.hypotheses
         if not hypotheses or hypotheses[-1] + 1 != len(self.classes):
             raise ModelError(f"its hypotheses are not of its {len(self.classes)} classes")
@@ -203,7 +235,10 @@ class ModelCard(
 
         poses = memory.poses
         if len(poses) != len(hypotheses):
-            raise ModelError(f"its things have {len(poses)} resting poses, and its hypotheses are {len(hypotheses)}")
+            raise ModelError(
+                f"its things have {len(poses)} resting poses, and its hypotheses are"
+                f" {len(hypotheses)}"
+            )
         if len(set(zip(poses, hypotheses, strict=True))) > len(memory.things):
             raise ModelError("a thing is of two classes")
 
@@ -225,12 +260,20 @@ class ModelCard(
 
     @property
     def maps(self) -> tuple[str, ...]:
-        """Names of the maps that a map network predicts: of the local window and, if it knows it, of the sphere."""
+        """Names of the maps that a map network predicts: of the local window and, if it knows
+        it, of the sphere.
+        """
         return (self.kind, self.kind + SPHERE)[: 2 if self.output == "sphere" else 1]
 
     def valleys(self, classes: Sequence[str]) -> tuple[str, ...]:
-        """The classes for which the valley of its map is the better view: as was fitted, or else all or none."""
-        return tuple(classes) if self.good == "valley" and not self.valley_gain else self.valley_classes
+        """The classes for which the valley of its map is the better view: as was fitted, or else
+        all or none.
+        """
+        return (
+            tuple(classes)
+            if self.good == "valley" and not self.valley_gain
+            else self.valley_classes
+        )
 
     def made_by(self, *commands: str) -> "ModelCard":
         """The same with further commands; one that it names already is not named again."""
@@ -253,10 +296,11 @@ def read_card(path: Path) -> ModelCard:
 
 
 def memory_path(card: Path, sha256: str) -> Path:
-    """Where the file of a memory of things is written, by the path of its card and the SHA-256 of the file.
+    """Where the file of a memory of things is written, by the path of its card and the SHA-256 of
+    the file.
 
-    It is NAME-HASH.safetensors beside NAME.json, HASH the first digits of the SHA-256: a new memory lies beside the old
-    one until the card names it.
+    It is NAME-HASH.safetensors beside NAME.json, HASH the first digits of the SHA-256: a new memory
+    lies beside the old one until the card names it.
     """
     return card.with_name(f"{card.stem}-{sha256[:SHORT_HASH]}{MEMORY_SUFFIX}")
 
@@ -283,7 +327,9 @@ class _Peek(msgspec.Struct):
 
 
 def _peek(path: Path) -> _Peek:
-    """What a JSON file says that it is; an empty answer if it is damaged, as reading it as a card will say why."""
+    """What a JSON file says that it is; an empty answer if it is damaged, as reading it as a
+    card will say why.
+    """
     regular_file(path, "a card", ModelError, LARGEST_RECORD)
     try:
         return msgspec.json.decode(path.read_bytes(), type=_Peek)
@@ -292,7 +338,9 @@ def _peek(path: Path) -> _Peek:
 
 
 def is_memory(card: Path) -> bool:
-    """Whether a card is that of a memory of things: by what it says, or, where it is damaged, by the file beside it."""
+    """Whether a card is that of a memory of things: by what it says, or, where it is damaged, by
+    the file beside it.
+    """
     if not card.is_file():
         return False
     peek = _peek(card)
@@ -326,7 +374,9 @@ def find_card(model: str | Path) -> ModelCard:
 
 @dataclass(frozen=True)
 class Collection:
-    """Cards of models that belong together: maps by their names, policies, without the bundled ones, by theirs."""
+    """Cards of models that belong together: maps by their names, policies, without the bundled
+    ones, by theirs.
+    """
 
     recogniser: Path
     maps: dict[str, Path]
@@ -336,7 +386,8 @@ class Collection:
 def find_models(models: str | Path) -> Collection:
     """The bundled models by name, one of COLLECTIONS, or those in a folder.
 
-    A folder holds the card of one recogniser. Maps that it lacks are the bundled ones: they know no classes.
+    A folder holds the card of one recogniser. Maps that it lacks are the bundled ones: they know no
+    classes.
     """
     bundled = {name: BUNDLED / f"{card}.json" for name, card in MAPS.items()}
     folder = Path(models)
@@ -344,8 +395,11 @@ def find_models(models: str | Path) -> Collection:
         return _with_memory(Collection(BUNDLED / f"{COLLECTIONS[str(models)]}.json", bundled, {}))
     if not folder.is_dir():
         known = ", ".join(COLLECTIONS)
-        raise ModelError(f"{folder}: is neither a folder with models nor the name of bundled ones ({known})")
-    networks, policies = dict[str, list[Path]](), dict[str, Path]()
+        raise ModelError(
+            f"{folder}: is neither a folder with models nor the name of bundled ones ({known})"
+        )
+    networks = dict[str, list[Path]]()
+    policies = dict[str, Path]()
     for path in sorted(folder.glob("*.json")):
         has_network = path.with_suffix(".onnx").exists() and _peek(path).elevations is None
         if has_network or is_memory(path):
@@ -354,7 +408,10 @@ def find_models(models: str | Path) -> Collection:
             policies[path.stem] = path
     for kind, paths in networks.items():
         if len(paths) > 1:
-            raise ModelError(f"{folder}: holds several models of the kind {kind}: {paths[0].name}, {paths[1].name}")
+            raise ModelError(
+                f"{folder}: holds several models of the kind {kind}: {paths[0].name},"
+                f" {paths[1].name}"
+            )
     if "recogniser" not in networks:
         raise ModelError(f"{folder}: holds no card of a recogniser; nextview learn makes one")
     own = {kind: paths[0] for kind, paths in networks.items()}
@@ -365,4 +422,6 @@ def _with_memory(found: Collection) -> Collection:
     """With the policy that needs no more than a memory of things, where the recogniser is one."""
     if not is_memory(found.recogniser):
         return found
-    return Collection(found.recogniser, found.maps, {DISCRIMINATE: found.recogniser} | found.policies)
+    return Collection(
+        found.recogniser, found.maps, {DISCRIMINATE: found.recogniser} | found.policies
+    )

@@ -1,4 +1,6 @@
-"""What the networks take of a view: geometry, a grey image or a cloud, of live views and of those of a store."""
+"""What the networks take of a view: geometry, a grey image or a cloud, of live views and of
+those of a store.
+"""
 
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -14,7 +16,8 @@ from nextview.geometry.observation import Observation
 Float = NDArray[np.float64]
 InputKind = Literal["geometry", "image", "cloud"]
 CHANNELS = ("facing", "up", "height", "nearness")
-CHANNELS_OF = {"geometry": len(CHANNELS), "image": 1}  # channels of the kinds of input that are images
+# channels of the kinds of input that are images
+CHANNELS_OF = {"geometry": len(CHANNELS), "image": 1}
 
 
 class InputSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -25,7 +28,9 @@ class InputSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         if self.size < 0 or (self.kind == "cloud") != (self.size == 0):
-            raise ModelError(f"a network takes geometry or an image of some size, or a cloud, not {self}")
+            raise ModelError(
+                f"a network takes geometry or an image of some size, or a cloud, not {self}"
+            )
 
     @property
     def shape(self) -> tuple[int | None, ...]:
@@ -34,45 +39,66 @@ class InputSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def from_observations(spec: InputSpec, observations: Sequence[Observation]) -> NDArray[Any]:
-    """What a network takes of B views; ObservationError if they are not from one camera, or do not suit it."""
-    if not isinstance(observations, Sequence) or not all(isinstance(view, Observation) for view in observations):
+    """What a network takes of B views; ObservationError if they are not from one camera, or do
+    not suit it.
+    """
+    if not isinstance(observations, Sequence) or not all(
+        isinstance(view, Observation) for view in observations
+    ):
         raise ObservationError("views are a list of Observations")
     if not observations:
         raise ObservationError("there is no view to look at")
     first = observations[0]
     for other in observations[1:]:
-        if other.depth.shape != first.depth.shape or not np.array_equal(other.intrinsics, first.intrinsics):
-            raise ObservationError("views that are handed in together are from one camera: of one size and one pinhole")
+        if other.depth.shape != first.depth.shape or not np.array_equal(
+            other.intrinsics, first.intrinsics
+        ):
+            raise ObservationError(
+                "views that are handed in together are from one camera: of one size and one pinhole"
+            )
     array = {"geometry": "depth", "image": "picture", "cloud": "points"}[spec.kind]
     views = np.stack([getattr(o, array) for o in observations])
     return _network_input(spec, views, np.stack([o.pose for o in observations]), first.intrinsics)
 
 
-def from_store(spec: InputSpec, store: Any, i: int, chosen: NDArray[np.int64] | slice = slice(None)) -> NDArray[Any]:
+def from_store(
+    spec: InputSpec, store: Any, i: int, chosen: NDArray[np.int64] | slice = slice(None)
+) -> NDArray[Any]:
     """The same of the views of object i of a ``ViewStore``, all V or the chosen ones."""
     reads: dict[str, Any] = {"geometry": store.depth, "image": store.image, "cloud": store.points}
-    return _network_input(spec, reads[spec.kind](i)[chosen], store.sphere.poses[chosen], store.intrinsics)
+    return _network_input(
+        spec, reads[spec.kind](i)[chosen], store.sphere.poses[chosen], store.intrinsics
+    )
 
 
-def _network_input(spec: InputSpec, views: NDArray[Any], poses: Float, intrinsics: Float) -> NDArray[Any]:
+def _network_input(
+    spec: InputSpec, views: NDArray[Any], poses: Float, intrinsics: Float
+) -> NDArray[Any]:
     if spec.kind == "cloud":
         return cloud_input(views, poses)
     if spec.kind == "image":
         return image_input(views, spec.size)
     # One view at a time stays in the processor's cache.
-    one = [geometry_input(views[v : v + 1], poses[v : v + 1], intrinsics, spec.size) for v in range(len(views))]
+    one = [
+        geometry_input(views[v : v + 1], poses[v : v + 1], intrinsics, spec.size)
+        for v in range(len(views))
+    ]
     return np.concatenate(one)
 
 
 def cloud_input(points: NDArray[np.float32], poses: Float) -> NDArray[np.float32]:
-    """Clouds, (B, P, 3), upright, with the camera at azimuth zero, scaled to [0, 1] by their own extent, float32.
+    """Clouds, (B, P, 3), upright, with the camera at azimuth zero, scaled to [0, 1] by their own
+    extent, float32.
 
-    In this frame the cells of the predicted map, all rings and azimuth -1, 0, +1, are in the same place for every view.
-    All zero for a cloud without extent.
+    In this frame the cells of the predicted map, all rings and azimuth -1, 0, +1, are in the same
+    place for every view. All zero for a cloud without extent.
     """
     azimuth = np.arctan2(poses[:, 1, 3], poses[:, 0, 3])
-    c, s = np.cos(azimuth).astype(np.float32)[:, None], np.sin(azimuth).astype(np.float32)[:, None]
-    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    c = np.cos(azimuth).astype(np.float32)[:, None]
+    s = np.sin(azimuth).astype(np.float32)[:, None]
+    x = points[..., 0]
+    y = points[..., 1]
+    z = points[..., 2]
     turned = np.stack([c * x + s * y, c * y - s * x, z], -1)
     low = turned.min((1, 2), keepdims=True)
     span = turned.max((1, 2), keepdims=True) - low
@@ -80,38 +106,52 @@ def cloud_input(points: NDArray[np.float32], poses: Float) -> NDArray[np.float32
 
 
 def image_input(images: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
-    """Grey images, (B, H, W), as one channel, (B, 1, size, size) uint8: the mean over squares of pixels."""
+    """Grey images, (B, H, W), as one channel, (B, 1, size, size) uint8: the mean over squares of
+    pixels.
+    """
     b, h, w = images.shape
     if h != w or h % size:
-        raise ObservationError(f"an image of {h}x{w} cannot be reduced to {size}x{size}: use a multiple of {size}")
+        raise ObservationError(
+            f"an image of {h}x{w} cannot be reduced to {size}x{size}: use a multiple of {size}"
+        )
     squares = images.reshape(b, size, h // size, size, h // size)
     return np.rint(squares.mean((2, 4), dtype=np.float32)).astype(np.uint8)[:, None]
 
 
-def geometry_input(depth: NDArray[np.float32], poses: Float, intrinsics: Float, size: int) -> NDArray[np.uint8]:
-    """Depth images as four channels in the frame of gravity and of the viewing ray, free of texture and lighting.
+def geometry_input(
+    depth: NDArray[np.float32], poses: Float, intrinsics: Float, size: int
+) -> NDArray[np.uint8]:
+    """Depth images as four channels in the frame of gravity and of the viewing ray, free of texture
+    and lighting.
 
-    facing: cosine between the surface normal and the ray to the camera, 0 .. 1 (what a headlight would show).
-    up: vertical part of the normal, -1 .. 1. height: above the object's centre, -1 .. 1 radii. nearness: towards the
-    camera from the object's centre, -1 .. 1 radii. Each becomes 1 .. 255; 0 is background. Normals come from
-    differences between neighbouring pixels of the full image, on whichever side the depth changes less; the image is
-    then thinned to every k-th pixel. From depth (B, H, W), object radii, 0 = no object, poses (B, 4, 4) and intrinsics
-    (3, 3): (B, 4, size, size) uint8.
+    facing: cosine between the surface normal and the ray to the camera, 0 .. 1 (what a headlight
+        would show).
+    up: vertical part of the normal, -1 .. 1. height: above the object's centre, -1 .. 1 radii.
+    nearness: towards the camera from the object's centre, -1 .. 1 radii. Each becomes 1 .. 255; 0
+    is background. Normals come from differences between neighbouring pixels of the full image, on
+    whichever side the depth changes less; the image is then thinned to every k-th pixel. From depth
+    (B, H, W), object radii, 0 = no object, poses (B, 4, 4) and intrinsics (3, 3): (B, 4, size,
+    size) uint8.
     """
     _b, h, w = depth.shape
     if h != w or h % size:
-        raise ObservationError(f"a depth image of {h}x{w} cannot be thinned to {size}x{size}: use a multiple of {size}")
+        raise ObservationError(
+            f"a depth image of {h}x{w} cannot be thinned to {size}x{size}: use a multiple of {size}"
+        )
     k = h // size
-    rotation, origin = poses[:, :3, :3].astype(np.float32), poses[:, :3, 3].astype(np.float32)
+    rotation = poses[:, :3, :3].astype(np.float32)
+    origin = poses[:, :3, 3].astype(np.float32)
     padded = np.pad(object_depth(depth).astype(np.float32, copy=False), ((0, 0), (1, 1), (1, 1)))
     z = padded[:, 1:-1:k, 1:-1:k]
     along_column = slope(padded[:, 1:-1:k, :-2:k], z, padded[:, 1:-1:k, 2::k])
     along_row = slope(padded[:, :-2:k, 1:-1:k], z, padded[:, 2::k, 1:-1:k])
-    focal, focal_y = intrinsics[0, 0].astype(np.float32), intrinsics[1, 1].astype(np.float32)
+    focal = intrinsics[0, 0].astype(np.float32)
+    focal_y = intrinsics[1, 1].astype(np.float32)
     along_row *= focal_y / focal  # a step down the image as long as one across it
     x = ((np.arange(0, w, k) + 0.5 - intrinsics[0, 2]) / focal).astype(np.float32)[None, None, :]
     y = ((np.arange(0, h, k) + 0.5 - intrinsics[1, 2]) / focal_y).astype(np.float32)[None, :, None]
-    # The surface is P = (x z, y z, z); the cross product of its derivatives, scaled, points to the camera:
+    # The surface is P = (x z, y z, z); the cross product of its derivatives, scaled, points to the
+    # camera:
     through = z / focal + x * along_column + y * along_row
     length = np.sqrt(along_column**2 + along_row**2 + through**2) + 1e-12
 

@@ -1,4 +1,6 @@
-"""How novel an object is to a recogniser, and whether it is of any class it knows (out-of-distribution detection)."""
+"""How novel an object is to a recogniser, and whether it is of any class it knows
+(out-of-distribution detection).
+"""
 
 from __future__ import annotations
 
@@ -23,22 +25,26 @@ Float = NDArray[np.floating]
 ARRAYS = ("quantiles", "objects", "neighbours", "standard")  # in the file of a novelty score
 NEIGHBOUR = 10  # the distance to this one of the nearest known views counts
 ROUNDED = 0.01  # by how much the length of a unit vector in half precision may be off
-HIDDEN = 2.0  # novelty by the share of an outline that is hidden: the least that keeps half hidden objects known
-NEARER, WINDOW = 0.4, 7  # what hides an outline is nearer by so much, object radii, in a window of so many pixels
+# novelty by the share of an outline that is hidden: the least that keeps half hidden objects known
+HIDDEN = 2.0
+# what hides an outline is nearer by so much, object radii, in a window of so many pixels
+NEARER = 0.4
+WINDOW = 7
 
 
 @dataclass(frozen=True)
 class Quantiles:
-    """The distribution of a novelty score over objects of known classes: the mean over the views of an object.
+    """The distribution of a novelty score over objects of known classes: the mean over the views of
+    an object.
 
     Attributes:
-        quantiles: scores of known objects after 1, 2, ... views, ascending, at even steps of probability from 0 to 1,
-            (views, Q) float32.
+        quantiles: scores of known objects after 1, 2, ... views, ascending, at even steps of
+            probability from 0 to 1, (views, Q) float32.
         objects: how many known objects they are of, (1,) int64.
-        joint: whether a view's score is that of all views up to it, see ``of_belief``; else the score of several is
-            their mean.
-        usual: how much more novel than others those of each class are after 1, 2, ... views, (views, classes): it is
-            taken off a joint score; None where that is not known.
+        joint: whether a view's score is that of all views up to it, see ``of_belief``; else the
+            score of several is their mean.
+        usual: how much more novel than others those of each class are after 1, 2, ... views,
+            (views, classes): it is taken off a joint score; None where that is not known.
     """
 
     quantiles: Float
@@ -60,17 +66,22 @@ class Quantiles:
         if self.usual is not None:
             check_array("its usual", self.usual, np.floating, (None, None))
 
-    def p_value(self, score: Float | float, n_views: NDArray[np.int64] | int) -> NDArray[np.float64]:
-        """The share of known objects that are at least as novel after so many views, by the mean score over them.
+    def p_value(
+        self, score: Float | float, n_views: NDArray[np.int64] | int
+    ) -> NDArray[np.float64]:
+        """The share of known objects that are at least as novel after so many views, by the mean
+        score over them.
 
-        A conformal p-value (Vovk et al., 2005): an object of a known class falls below p in a share p of the cases.
-        It cannot fall below one in all known objects and one. Few things have few known views, so a joint score beyond
-        all of these has the p-value of a normal distribution, if that is smaller. Beyond the number of views for which
-        there are quantiles, the last count. Shapes are broadcast; float64.
+        A conformal p-value (Vovk et al., 2005): an object of a known class falls below p in a share
+        p of the cases. It cannot fall below one in all known objects and one. Few things have few
+        known views, so a joint score beyond all of these has the p-value of a normal distribution,
+        if that is smaller. Beyond the number of views for which there are quantiles, the last
+        count. Shapes are broadcast; float64.
         """
         score, n_views = np.broadcast_arrays(np.asarray(score, np.float64), n_views)
         levels = np.linspace(0, 1, self.quantiles.shape[1])
-        found, n = np.empty(score.shape), int(self.objects[0])
+        found = np.empty(score.shape)
+        n = int(self.objects[0])
         for index in np.ndindex(score.shape):
             row = self.quantiles[min(int(n_views[index]), len(self.quantiles)) - 1]
             found[index] = (1 + n * (1 - np.interp(score[index], row, levels))) / (n + 1)
@@ -80,28 +91,35 @@ class Quantiles:
         return found
 
     def of_belief(self, log_belief: Float, n_views: int) -> float:
-        """The joint score of an object by the log-belief in each class, up to a constant, after so many views, (C,)."""
+        """The joint score of an object by the log-belief in each class, up to a constant, after
+        so many views, (C,).
+        """
         best = int(log_belief.argmax())
         usual = 0.0 if self.usual is None else self.usual[min(n_views, len(self.usual)) - 1, best]
         return float(-log_belief[best] - usual)
 
     def of_views(self, scores: Sequence[float]) -> float:
         """The p-value of one object by the scores of its views so far; 1 if there is none."""
-        return float(self.p_value(scores[-1] if self.joint else float(np.mean(scores)), len(scores))) if scores else 1.0
+        return (
+            float(self.p_value(scores[-1] if self.joint else float(np.mean(scores)), len(scores)))
+            if scores
+            else 1.0
+        )
 
 
 @dataclass(frozen=True)
 class Novelty(Quantiles):
-    """A novelty score of views by the features that know no classes, and its distribution over objects of known ones.
+    """A novelty score of views by the features that know no classes, and its distribution over
+    objects of known ones.
 
-    The score of a view is its distance to the tenth nearest of the known views (Sun et al., "Out-of-Distribution
-    Detection with Deep Nearest Neighbors", ICML 2022), standardised over views of objects that are not among these. The
-    score of an object is the mean over its views.
+    The score of a view is its distance to the tenth nearest of the known views (Sun et al.,
+    "Out-of-Distribution Detection with Deep Nearest Neighbors", ICML 2022), standardised over views
+    of objects that are not among these. The score of an object is the mean over its views.
 
     Attributes:
         neighbours: embeddings of known views, unit vectors, (R, F) float32.
-        standard: mean and deviation of the distance over other views of known classes, through a sensor, and without
-            one's errors, (2, 2) float32.
+        standard: mean and deviation of the distance over other views of known classes, through a
+            sensor, and without one's errors, (2, 2) float32.
     """
 
     neighbours: Float
@@ -121,21 +139,31 @@ class Novelty(Quantiles):
         if (self.standard[:, 1] <= 0).any():
             raise ModelError("its standard deviations are not above zero")
 
-    def scores(self, embeddings: Float, exact: NDArray[np.bool_] | bool = False) -> NDArray[np.float64]:
-        """The novelty score of each view, (B,) float64, from embeddings (B, F): the higher, the more novel.
+    def scores(
+        self, embeddings: Float, exact: NDArray[np.bool_] | bool = False
+    ) -> NDArray[np.float64]:
+        """The novelty score of each view, (B,) float64, from embeddings (B, F): the higher, the
+        more novel.
 
-        ``exact`` views, (B,), are without a sensor's errors. ModelError where the features are of another size.
+        ``exact`` views, (B,), are without a sensor's errors. ModelError where the features are of
+        another size.
         """
         if embeddings.shape[1] != self.neighbours.shape[1]:
-            raise ModelError("the novelty score was fitted to other features; run nextview fit unknown again")
+            raise ModelError(
+                "the novelty score was fitted to other features; run nextview fit unknown again"
+            )
         nearness = np.asarray(embeddings, np.float32) @ self.neighbours.T
         distance = -np.partition(nearness, -NEIGHBOUR, axis=1)[:, -NEIGHBOUR].astype(np.float64)
         middle, deviation = self.standard[np.broadcast_to(exact, distance.shape).astype(int)].T
         return (distance - middle) / deviation
 
     def save(self, path: Path, overwrite: bool = False) -> str:
-        """Write a .safetensors file, the known views in eight bits a number; returns its SHA-256."""
-        arrays = {name: getattr(self, name) for name in ARRAYS} | {"neighbours": _in_eight_bits(self.neighbours)}
+        """Write a .safetensors file, the known views in eight bits a number; returns its
+        SHA-256.
+        """
+        arrays = {name: getattr(self, name) for name in ARRAYS} | {
+            "neighbours": _in_eight_bits(self.neighbours)
+        }
         content = save({name: np.ascontiguousarray(values) for name, values in arrays.items()})
         with new_file(path, overwrite) as part:
             part.write_bytes(content)
@@ -144,31 +172,45 @@ class Novelty(Quantiles):
 
 @dataclass(eq=False)
 class ViewScore:
-    """The novelty score of one view. Its network runs when the score is first asked for: few frames decide by it."""
+    """The novelty score of one view.
+
+    Its network runs when the score is first asked for: few frames decide by it.
+
+    Attributes:
+        judge: scores of views, (B,); None where it is known.
+    """
 
     observation: Observation
-    judge: Callable[[Sequence[Observation]], Float] | None  # scores of views, (B,); None where it is known
+    judge: Callable[[Sequence[Observation]], Float] | None
     value: float = np.nan
 
 
 def values_of(scores: Sequence[ViewScore], whole: bool = False) -> list[float]:
-    """Values of some scores, made together; ``whole``: as if nothing hid the object, by what is usual then."""
+    """Values of some scores, made together; ``whole``: as if nothing hid the object, by what is
+    usual then.
+    """
     asked = [score for score in scores if score.judge is not None]
     if asked and (judge := asked[0].judge) is not None:
         for score, value in zip(asked, judge([s.observation for s in asked]), strict=True):
-            score.value, score.judge = float(value), None
+            score.value = float(value)
+            score.judge = None
     return [s.value - whole * HIDDEN * hidden_share(s.observation.scene) for s in scores]
 
 
 def hidden_share(scene: SceneView | None) -> float:
-    """Share of an object's outline beside which something nearer begins, or the picture ends, 0 to 1."""
+    """Share of an object's outline beside which something nearer begins, or the picture ends, 0
+    to 1.
+    """
     if scene is None:
         return 0.0
-    from scipy.ndimage import binary_erosion, minimum_filter  # only for frames: importing it takes time
+    # only for frames: importing it takes time
+    from scipy.ndimage import binary_erosion, minimum_filter
 
     outline = scene.target & ~binary_erosion(scene.target)
     others = np.where(scene.target | (scene.depth == 0), np.inf, scene.depth)
-    hidden = outline & (minimum_filter(others, WINDOW, mode="constant", cval=0) < scene.depth - NEARER)
+    hidden = outline & (
+        minimum_filter(others, WINDOW, mode="constant", cval=0) < scene.depth - NEARER
+    )
     return float(hidden.sum() / max(outline.sum(), 1))
 
 
@@ -178,7 +220,10 @@ def unit(rows: Float) -> Float:
 
 
 def _in_eight_bits(rows: Float) -> NDArray[np.int8]:
-    """Unit vectors as int8, same shape: the largest number of each row becomes 127. ``unit`` brings them back."""
+    """Unit vectors as int8, same shape: the largest number of each row becomes 127.
+
+    ``unit`` brings them back.
+    """
     largest = np.abs(rows).max(axis=-1, keepdims=True)
     return np.rint(rows / largest * np.iinfo(np.int8).max).astype(np.int8)
 
@@ -197,7 +242,8 @@ def read_novelty(path: Path, sha256: str) -> Novelty:
     """Read what ``Novelty.save`` wrote.
 
     Raises:
-        ModelError: the file is missing, is not that of this hash, or one of its values makes no sense.
+        ModelError: the file is missing, is not that of this hash, or one of its values makes no
+            sense.
     """
     content = checked_bytes(path, sha256, "a novelty score")
     arrays: dict[str, Any] = arrays_in(content, ARRAYS, f"{path}: not a novelty score")

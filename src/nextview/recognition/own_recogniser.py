@@ -104,7 +104,9 @@ class OwnJointRecogniser(OwnRecogniser):
                 logits[row] = np.log(np.maximum(belief, LEAST_BELIEF))
         return Evidence(logits, seen=np.array([seen.seen for seen in observations]))
 
-    def together(self, observations: Sequence[Observation], total: NDArray[np.floating], counted: int) -> JointBelief:
+    def together(
+        self, observations: Sequence[Observation], total: NDArray[np.floating], counted: int
+    ) -> JointBelief:
         """What all views say together.
 
         Args:
@@ -152,7 +154,9 @@ def own_recogniser(given: Any) -> Recogniser:
     if isinstance(given, NetworkRecogniser | OwnRecogniser):
         return given
     if isinstance(given, type):
-        raise ModelError(f"a recogniser is an object, not the class {given.__name__}: call it first")
+        raise ModelError(
+            f"a recogniser is an object, not the class {given.__name__}: call it first"
+        )
     if callable(getattr(given, "belief", None)):
         return OwnJointRecogniser(given, name)
     if not callable(given):
@@ -164,7 +168,9 @@ def own_recogniser(given: Any) -> Recogniser:
 def _named(path: str) -> Any:
     """What MODULE:NAME names; of a class, an object of it."""
     if ":" not in path:
-        raise UsageError(f"a recogniser of your own is named MODULE:NAME, not {one_line(repr(path))}")
+        raise UsageError(
+            f"a recogniser of your own is named MODULE:NAME, not {one_line(repr(path))}"
+        )
     with plugin_errors(lambda said: UsageError(f"the recogniser {path} cannot be made ({said})")):
         found = plugin(path)
         return found() if isinstance(found, type) else found

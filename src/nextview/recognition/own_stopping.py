@@ -14,10 +14,15 @@ from nextview.recognition.belief import Floating, Stopping
 
 @dataclass(frozen=True)
 class Believed:
-    """What is believed in some episodes, (...): all that a stopping rule may look at."""
+    """What is believed in some episodes, (...): all that a stopping rule may look at.
 
-    belief: Floating  # in each class, (..., classes)
-    n_views: NDArray | int  # so far, in which anything was seen, (...)
+    Attributes:
+        belief: in each class, (..., classes).
+        n_views: so far, in which anything was seen, (...).
+    """
+
+    belief: Floating
+    n_views: NDArray | int
 
     @property
     def highest(self) -> NDArray[np.float64]:
@@ -35,7 +40,9 @@ class Believed:
     @property
     def entropy(self) -> NDArray[np.float64]:
         """Of the belief, bits, (...)."""
-        return -np.asarray((self.belief * np.log2(np.maximum(self.belief, 1e-300))).sum(-1), np.float64)
+        return -np.asarray(
+            (self.belief * np.log2(np.maximum(self.belief, 1e-300))).sum(-1), np.float64
+        )
 
 
 Rule = Callable[[Believed, float], NDArray[np.bool_]]  # whether to stop, (...), by a threshold
@@ -72,8 +79,12 @@ def own_stopping(rule: Rule | str, threshold: float, max_views: int) -> Stopping
     name = rule if isinstance(rule, str) else getattr(rule, "__name__", "a rule of your own")
     if isinstance(rule, str):
         if ":" not in rule:
-            raise UsageError(f"a stopping rule of your own is named MODULE:NAME, not {one_line(repr(rule))}")
-        with plugin_errors(lambda said: UsageError(f"the stopping rule {rule} cannot be made ({said})")):
+            raise UsageError(
+                f"a stopping rule of your own is named MODULE:NAME, not {one_line(repr(rule))}"
+            )
+        with plugin_errors(
+            lambda said: UsageError(f"the stopping rule {rule} cannot be made ({said})")
+        ):
             found = plugin(rule)
     if isinstance(found, type) and issubclass(found, Stopping):
         return found(threshold, max_views)

@@ -40,9 +40,9 @@ class PoseCandidate:
         vertices: of its surface, in the scan file's frame, (V, 3) float32, metres; None if it has
             none.
         faces: triangles of the surface, indices of its vertices, (F, 3) int32.
-        symmetry: axes through its centroid, in the scan file's frame, about which the thing looks the
-            same after a turn, each with ``axis`` and ``order``, 0 for any turn; None if they are
-            not known.
+        symmetry: axes through its centroid, in the scan file's frame, about which the thing looks
+            the same after a turn, each with ``axis`` and ``order``, 0 for any turn; None if they
+            are not known.
     """
 
     thing: str

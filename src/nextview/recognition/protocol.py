@@ -84,7 +84,9 @@ class JudgesTogether(Protocol):
     Policies still see what it says of single views.
     """
 
-    def together(self, observations: Sequence[Observation], total: NDArray[np.floating], counted: int) -> JointBelief:
+    def together(
+        self, observations: Sequence[Observation], total: NDArray[np.floating], counted: int
+    ) -> JointBelief:
         """What is believed of an object.
 
         Args:

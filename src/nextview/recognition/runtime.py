@@ -1,8 +1,8 @@
 """ONNX Runtime, imported without its telemetry: import ``ort`` from here, never the package itself.
 
-Since version 1.29 the import alone writes a device number and a queue of events into the home folder, and a process
-that lives long enough sends them to the maker. The variable must be set before the import. Who wants the telemetry sets
-``ORT_DISABLE_TELEMETRY=0``: what is set is kept.
+Since version 1.29 the import alone writes a device number and a queue of events into the home
+folder, and a process that lives long enough sends them to the maker. The variable must be set
+before the import. Who wants the telemetry sets ``ORT_DISABLE_TELEMETRY=0``: what is set is kept.
 """
 
 import os

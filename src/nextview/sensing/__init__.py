@@ -1,4 +1,6 @@
-"""From a sensor frame to an observation: units and frames, support plane, segmentation, object frame, denoising."""
+"""From a sensor frame to an observation: units and frames, support plane, segmentation, object
+frame, denoising.
+"""
 
 from typing import TYPE_CHECKING, Any
 
@@ -9,11 +11,21 @@ from nextview.sensing.plausibility import ViewWarning, check_observation, check_
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject
 
-__all__ = ["Box", "Frame", "ObjectFrame", "ObservedObject", "ViewWarning", "check_observation", "check_views"]
+__all__ = [
+    "Box",
+    "Frame",
+    "ObjectFrame",
+    "ObservedObject",
+    "ViewWarning",
+    "check_observation",
+    "check_views",
+]
 
 
 def __getattr__(name: str) -> Any:
-    """``ObservedObject`` takes SciPy, which ``nextview recognise`` starts without: imported when it is used."""
+    """``ObservedObject`` takes SciPy, which ``nextview recognise`` starts without: imported when
+    it is used.
+    """
     if name == "ObservedObject":
         from nextview.sensing.observed_object import ObservedObject
 

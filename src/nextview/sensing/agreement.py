@@ -1,11 +1,11 @@
 """Whether posed depth frames agree about one rigid scene.
 
-Points on the surfaces of each frame are looked up in the pictures of all others. A point is confirmed where another
-frame measures the same depth, and contradicted where another frame looks through it. Points that are hidden, outside
-of the picture or not measured say nothing.
+Points on the surfaces of each frame are looked up in the pictures of all others. A point is
+confirmed where another frame measures the same depth, and contradicted where another frame looks
+through it. Points that are hidden, outside of the picture or not measured say nothing.
 
-Points that stand out of the largest plane of a frame can be judged on their own: a table looks the same after any turn
-about its normal, so its points agree where the object's do not.
+Points that stand out of the largest plane of a frame can be judged on their own: a table looks the
+same after any turn about its normal, so its points agree where the object's do not.
 """
 
 from collections.abc import Sequence
@@ -26,8 +26,10 @@ Mask = NDArray[np.bool_]
 POINT_GRID = 160  # columns of the grid from which surface points are drawn
 SURFACE_POINTS = 200  # points of each frame that are looked up in the others
 NOISE_TOLERANCE = 3.0  # standard deviations of the noise
-SMOOTH_STEP = 0.05  # part of the depth by which it may vary around a point that is looked up: no edges
-ABOVE_PLANE = 0.012  # height over the largest plane, as a part of the depth, from which a point is not on it
+# part of the depth by which it may vary around a point that is looked up: no edges
+SMOOTH_STEP = 0.05
+# height over the largest plane, as a part of the depth, from which a point is not on it
+ABOVE_PLANE = 0.012
 FAR_BEHIND = 1.5  # times the depth in the middle of the picture: what lies farther is background
 SMALLEST_MIDDLE = 20  # grid points in the middle of the picture that tell its depth
 LEAST_DEPTH = 1e-6  # metres before a camera from which a point can be in its picture
@@ -38,8 +40,8 @@ class Sharpness:
     """How closely two frames have to agree.
 
     Attributes:
-        columns: of the picture in which points are looked up. A point agrees with any depth in the block that it
-            falls on and in the blocks around that.
+        columns: of the picture in which points are looked up. A point agrees with any depth in the
+            block that it falls on and in the blocks around that.
         depth_tolerance: part of the depth by which two frames may differ, beside the noise of both.
     """
 
@@ -48,9 +50,14 @@ class Sharpness:
 
 
 ROUGH = Sharpness(160, 0.02)
-"""Forgives the errors of a usual calibration, 4 mm and half a degree: what is contradicted is wrong altogether."""
+"""Forgives the errors of a usual calibration, 4 mm and half a degree: what is contradicted is
+wrong altogether.
+"""
 SHARP = Sharpness(320, 0.006)
-"""Tells poses apart that differ by a few degrees. Right poses leave contradictions, too, where they are not exact."""
+"""Tells poses apart that differ by a few degrees.
+
+Right poses leave contradictions, too, where they are not exact.
+"""
 
 
 @dataclass(frozen=True)
@@ -59,8 +66,10 @@ class Picture:
 
     Attributes:
         intrinsics: pinhole matrix, pixels are blocks, (3, 3).
-        nearest: least depth in each block and around it, (h, w), metres; infinite where nothing was measured.
-        farthest: greatest depth in each block and around it, (h, w), metres; 0 where nothing was measured.
+        nearest: least depth in each block and around it, (h, w), metres; infinite where nothing was
+            measured.
+        farthest: greatest depth in each block and around it, (h, w), metres; 0 where nothing was
+            measured.
         complete: whether something was measured in each block and in all around it, (h, w).
         object_near: blocks on the object's mask or beside it, (h, w); None without a mask.
     """
@@ -80,7 +89,8 @@ class SurfaceView:
         pictures: the depth image for each sharpness.
         points: on the surfaces, (N, 3), camera frame, metres.
         noise: error of the depth of each point that noise explains, (N,), metres.
-        standing: which points stand out of the largest plane, (N,); all of them if there is a mask or no plane.
+        standing: which points stand out of the largest plane, (N,); all of them if there is a mask
+            or no plane.
     """
 
     pictures: dict[Sharpness, Picture]
@@ -94,7 +104,9 @@ class SurfaceView:
 
     def some(self, which: Mask) -> "SurfaceView":
         """The frame with some of its points, (N,) bool."""
-        return replace(self, points=self.points[which], noise=self.noise[which], standing=self.standing[which])
+        return replace(
+            self, points=self.points[which], noise=self.noise[which], standing=self.standing[which]
+        )
 
     def with_focal_length(self, times: float) -> "SurfaceView":
         """The frame as it would be if its focal lengths were so many times as long."""
@@ -108,7 +120,8 @@ class SurfaceView:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How often points of one frame, by row, are confirmed and contradicted by another one, by column.
+    """How often points of one frame, by row, are confirmed and contradicted by another one, by
+    column.
 
     Attributes:
         confirmed: number of points, (N, N).
@@ -137,7 +150,9 @@ class Agreement:
         return Agreement(self.confirmed[which][:, which], self.contradicted[which][:, which])
 
     def of_each(self) -> tuple[Float, Float]:
-        """The confirmed share and the number of judged points of each frame, both ways, (N,) each."""
+        """The confirmed share and the number of judged points of each frame, both ways, (N,)
+        each.
+        """
         confirmed = self.confirmed.sum(0) + self.confirmed.sum(1)
         judged = confirmed + self.contradicted.sum(0) + self.contradicted.sum(1)
         share = np.where(judged > 0, confirmed / np.maximum(judged, 1), 1.0)
@@ -147,8 +162,8 @@ class Agreement:
 def surface_view(frame: Frame, rng: np.random.Generator) -> SurfaceView:
     """Prepare a frame for comparison.
 
-    Points are taken from the object's mask. Without one they are taken from the middle of the picture: one half
-    from the largest plane, the other half from what stands out of it.
+    Points are taken from the object's mask. Without one they are taken from the middle of the
+    picture: one half from the largest plane, the other half from what stands out of it.
 
     Args:
         frame: its pose is not used.
@@ -183,13 +198,17 @@ def compare(
         poses: of their cameras, camera-to-world, (N, 4, 4), metres.
         scale: by which all depths are multiplied.
         sharpness: how closely the frames have to agree.
-        looked_up_with: poses of the cameras in whose pictures the points are looked up, (N, 4, 4); by default the same.
+        looked_up_with: poses of the cameras in whose pictures the points are looked up, (N, 4, 4);
+            by default the same.
     """
     count = len(views)
     owner = np.repeat(np.arange(count), [len(view.points) for view in views])
     tolerance = np.concatenate([view.tolerance(sharpness) for view in views])
     world = np.concatenate(
-        [scale * v.points @ pose[:3, :3].T + pose[:3, 3] for v, pose in zip(views, poses, strict=True)]
+        [
+            scale * v.points @ pose[:3, :3].T + pose[:3, 3]
+            for v, pose in zip(views, poses, strict=True)
+        ]
     )
 
     confirmed = np.zeros((count, count))
@@ -205,7 +224,9 @@ def compare(
 
 
 def _looked_up(picture: Picture, points: Float, tolerance: Float) -> tuple[Index, Mask, Mask]:
-    """Which points, (P, 3), lie in a picture; which of these it confirms, and which it contradicts."""
+    """Which points, (P, 3), lie in a picture; which of these it confirms, and which it
+    contradicts.
+    """
     height, width = picture.nearest.shape
     k = picture.intrinsics
     ahead = points[:, 2] > LEAST_DEPTH
@@ -228,7 +249,8 @@ def _looked_up(picture: Picture, points: Float, tolerance: Float) -> tuple[Index
     if picture.object_near is not None:
         on_object = picture.object_near[row, column]
         hidden = nearest < z - limit
-        # Where nothing nearer hides it, a point of the object has to be in the mask, measured or not.
+        # Where nothing nearer hides it, a point of the object has to be in the mask, measured or
+        # not.
         looks_through = np.where(on_object, looks_through, ~hidden)
         agrees &= on_object
     return which, agrees, looks_through
@@ -256,7 +278,9 @@ def _picture(frame: Frame, columns: int) -> Picture:
 
 
 def _surface_points(frame: Frame) -> Float:
-    """A grid of points on the object's mask; without one, on smooth surfaces in the middle of the picture, (N, 3)."""
+    """A grid of points on the object's mask; without one, on smooth surfaces in the middle of
+    the picture, (N, 3).
+    """
     side = max(1, frame.shape[1] // POINT_GRID)
     first = side // 2
     grid = frame.depth[first::side, first::side]
@@ -278,9 +302,11 @@ def _is_smooth(grid: NDArray[np.float32]) -> Mask:
 
 
 def _blockwise(image: NDArray, side: int, choose: np.ufunc) -> NDArray:
-    """Minimum or maximum of each square of ``side`` pixels; rows and columns that fill none are left out.
+    """Minimum or maximum of each square of ``side`` pixels; rows and columns that fill none are
+    left out.
 
-    ``choose`` is ``np.minimum`` or ``np.maximum``. Rows come first: that is faster than a reduction over two axes.
+    ``choose`` is ``np.minimum`` or ``np.maximum``. Rows come first: that is faster than a reduction
+    over two axes.
     """
     height, width = (size // side * side for size in image.shape)
     of_rows = image[0:height:side, :width]
@@ -293,7 +319,9 @@ def _blockwise(image: NDArray, side: int, choose: np.ufunc) -> NDArray:
 
 
 def _in_the_middle(grid: NDArray[np.float32]) -> Mask:
-    """What the camera looks at: the middle of a picture, (h, w), without what lies far behind it."""
+    """What the camera looks at: the middle of a picture, (h, w), without what lies far behind
+    it.
+    """
     height, width = grid.shape
     middle = grid[height // 3 : height - height // 3, width // 3 : width - width // 3]
     measured = middle[middle > 0]
@@ -304,8 +332,12 @@ def _in_the_middle(grid: NDArray[np.float32]) -> Mask:
     return inner & (grid < FAR_BEHIND * np.median(measured))
 
 
-def _half_off_the_plane(points: Float, frame: Frame, noise: Noise, rng: np.random.Generator) -> tuple[Float, Mask]:
-    """Some points, and which stand out of the largest plane of a frame: one half, if there are so many."""
+def _half_off_the_plane(
+    points: Float, frame: Frame, noise: Noise, rng: np.random.Generator
+) -> tuple[Float, Mask]:
+    """Some points, and which stand out of the largest plane of a frame: one half, if there are
+    so many.
+    """
     # The plane is searched in the camera's frame: the pose may be wrong.
     unposed = Frame(frame.depth, frame.intrinsics, pixel_centre=0.5)
     plane = find_plane(sample(unposed, unposed.depth > 0, noise), rng)

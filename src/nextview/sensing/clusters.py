@@ -1,7 +1,7 @@
 """Which pieces of what stands on a plane are one object, seen from above and in several frames.
 
-From above the parts of one object lie over each other even where it hides itself, such as the far legs of a table
-under its top; things that stand side by side lie apart.
+From above the parts of one object lie over each other even where it hides itself, such as the far
+legs of a table under its top; things that stand side by side lie apart.
 """
 
 from __future__ import annotations
@@ -26,34 +26,45 @@ Mask = NDArray[np.bool_]
 Joins = Literal["by their border", "never", "always"]  # whether things that touch are one thing
 
 CELL = 0.01  # side of a cell of the footprint, in distances of the camera from the object
-OVERLAP = 0.25  # share of the cells of a piece that lie over another one of the same frame, from which they are one
-TOUCH = 0.45  # strength of the link of two pieces that touch: what lies over each other in two frames is joined first
-BRIDGE = 0.25  # share of the smaller of two clusters that a piece which joins them has at least: no leg joins two
+# share of the cells of a piece that lie over another one of the same frame, from which they are one
+OVERLAP = 0.25
+# strength of the link of two pieces that touch: what lies over each other in two frames is joined
+# first
+TOUCH = 0.45
+# share of the smaller of two clusters that a piece which joins them has at least: no leg joins two
+BRIDGE = 0.25
 FEWEST = 0.15  # share of the pixels of a level cell that a piece shows over it, at least
-LIES_OVER = 0.5  # share of the cells of a piece that lie over, or beside, one of another frame, from which they are one
+# share of the cells of a piece that lie over, or beside, one of another frame, from which they are
+# one
+LIES_OVER = 0.5
 BESIDE = 2  # cells up to which two pieces stand side by side
-WITHIN = 0.8  # share of the cells of a piece that lie within the outline of another one, from which they are one
+# share of the cells of a piece that lie within the outline of another one, from which they are one
+WITHIN = 0.8
 ON_OUTLINE = 0.5  # cells up to which one outside of an outline lies on it
 OUTLINED = 25  # cells of a piece with an outline, at least
 MOST_COMPARED = 50  # cells of a piece that are compared with those of another one
 DIRECTIONS = 24
 SURROUNDED = 0.85  # share of the directions from what lies within a piece in which it has cells
 TWO = 0.25  # share of the cells of an object that a part of it has which may be another thing
-OVER_PLANE = 0.1  # share of a thing's pixels over what is seen of the plane, at least: it may hide most of it
+# share of a thing's pixels over what is seen of the plane, at least: it may hide most of it
+OVER_PLANE = 0.1
 BOTTOM_ROWS = 2  # rows of that picture that are its lower edge
 AIM_WIDTH = 160  # columns of the picture in which is seen how far from the optical axis things lie
-AIM_SPREAD = 0.08  # picture widths from the optical axis at which a thing counts for 1 / e of its pixels
-REACH, FAR = 250, 1000
-"""Cells to each side of where the object is looked for: farther things are left out. And cells from those of the first
-frame beyond which nothing can be a part of the same object."""
+# picture widths from the optical axis at which a thing counts for 1 / e of its pixels
+AIM_SPREAD = 0.08
+REACH = 250
+FAR = 1000
+"""Cells to each side of where the object is looked for: farther things are left out. And cells from
+those of the first frame beyond which nothing can be a part of the same object."""
 
 
 @dataclass(frozen=True)
 class Footprint:
-    """The cells, seen from above, over which the pieces of a frame lie: K pairs of a cell and a piece, each once.
+    """The cells, seen from above, over which the pieces of a frame lie: K pairs of a cell and a
+    piece, each once.
 
-    ``cells`` are the indices of the cells, (K, 2), ``piece`` the labels of the pieces, (K,). ``area`` is that of the
-    surface of each pair, square metres, ``pixels`` how many show it.
+    ``cells`` are the indices of the cells, (K, 2), ``piece`` the labels of the pieces, (K,).
+    ``area`` is that of the surface of each pair, square metres, ``pixels`` how many show it.
     """
 
     cells: NDArray[np.int64]
@@ -64,7 +75,9 @@ class Footprint:
 
     @cached_property
     def outlines(self) -> dict[int, Float]:
-        """The convex outline of each larger piece: lines a x + b y + c <= 0 inside, in cells, (K, 3)."""
+        """The convex outline of each larger piece: lines a x + b y + c <= 0 inside, in cells,
+        (K, 3).
+        """
         found = {}
         many = np.bincount(self.piece, minlength=1)
         for piece in np.flatnonzero(many >= OUTLINED):
@@ -87,8 +100,8 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Fl
         pieces: of what stands on the plane.
         axes: upright, rows x, y and z in the world, (3, 3).
         cell: side of a cell, metres.
-        middle: where the object is, or is looked for, along x and y, (2,), cells: what is more than REACH cells
-            from there is left out.
+        middle: where the object is, or is looked for, along x and y, (2,), cells: what is more than
+            REACH cells from there is left out.
     """
     rows, columns = np.divmod(np.flatnonzero(pieces.label), pieces.label.shape[1])
     label = pieces.label[rows, columns]
@@ -102,11 +115,15 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Fl
     there = np.floor(middle).astype(np.int64)
     i, j = ij
     within = (np.abs(i - there[0]) <= REACH) & (np.abs(j - there[1]) <= REACH)
-    z, label, i, j = z[within], label[within], i[within], j[within]
+    z = z[within]
+    label = label[within]
+    i = i[within]
+    j = j[within]
     low = np.array([i.min(initial=there[0]), j.min(initial=there[1])])
     side = int(j.max(initial=there[1])) - low[1] + 1
     place = (i - low[0]) * side + j - low[1]
-    shown, many = np.bincount(place) > 0, len(pieces.stands)
+    shown = np.bincount(place) > 0
+    many = len(pieces.stands)
     used = np.flatnonzero(shown)
     key = many * (np.cumsum(shown) - 1)[place] + label
     count = np.bincount(key, minlength=many * len(used))
@@ -115,23 +132,28 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Fl
     pairs = np.flatnonzero(count > FEWEST * level)
     area = np.bincount(key, z * z, len(count))[pairs] / focal
     at, piece = np.divmod(pairs, many)
-    cells, pixels = np.stack(np.divmod(used[at], side), 1) + low, count[pairs]
+    cells = np.stack(np.divmod(used[at], side), 1) + low
+    pixels = count[pairs]
     return Footprint(cells, piece, pieces, area, pixels)
 
 
-def clusters(footprints: Sequence[Footprint], joins: Joins = "by their border") -> tuple[list[NDArray[np.int64]], Mask]:
+def clusters(
+    footprints: Sequence[Footprint], joins: Joins = "by their border"
+) -> tuple[list[NDArray[np.int64]], Mask]:
     """Which pieces of some frames are of one object.
 
-    Pieces of one frame are joined where they overlap seen from above; and where they touch, unless both stand on the
-    plane and their border comes down to it: a handle and the back of a chair are joined. Things that stand side by side
-    stay apart, also where only their tops show. Pieces of two frames are joined where half of the smaller one lies over
-    the other, unless a frame shows both side by side. ``joins``: those that touch are "never" one, or "always".
+    Pieces of one frame are joined where they overlap seen from above; and where they touch, unless
+    both stand on the plane and their border comes down to it: a handle and the back of a chair are
+    joined. Things that stand side by side stay apart, also where only their tops show. Pieces of
+    two frames are joined where half of the smaller one lies over the other, unless a frame shows
+    both side by side. ``joins``: those that touch are "never" one, or "always".
 
     Returns:
-        The label of each pair in each footprint, (K,) int64 each: 1, 2, ... for the clusters; 0 for what lies far from
-        all that the first footprint shows. And for each label, (labels + 1,) bool, whether it may be two things, or a
-        part of one: one frame joins to the cluster what stands beside it in another one, or no frame shows whether
-        what is beside it stands for itself.
+        The label of each pair in each footprint, (K,) int64 each: 1, 2, ... for the clusters; 0 for
+        what lies far from all that the first footprint shows. And for each label, (labels + 1,)
+        bool, whether it may be two things, or a part of one: one frame joins to the cluster what
+        stands beside it in another one, or no frame shows whether what is beside it stands for
+        itself.
     """
     sizes = [len(f.cells) for f in footprints]
     if not sum(sizes):
@@ -142,12 +164,16 @@ def clusters(footprints: Sequence[Footprint], joins: Joins = "by their border") 
     near = np.abs(cells - cells[0]).max(1) <= FAR
     here, around = _cells_over(cells[near], node[near], int(first[-1]))
     size = np.maximum(here.sum(1), 1)
-    shared, beside = here @ here.T / np.minimum.outer(size, size), around @ here.T > 0
+    shared = here @ here.T / np.minimum.outer(size, size)
+    beside = around @ here.T > 0
     within = _within_outlines(footprints, shared)
     strength, apart, either = _links(footprints, shared, beside, within, joins)
     cluster, doubtful = _joined(strength, apart, size)
     for a, b in np.argwhere(np.triu(either)):  # in doubt until a frame shows which
-        if cluster[a] != cluster[b] and not apart[np.ix_(cluster == cluster[a], cluster == cluster[b])].any():
+        if (
+            cluster[a] != cluster[b]
+            and not apart[np.ix_(cluster == cluster[a], cluster == cluster[b])].any()
+        ):
             doubtful.append((int(a), int(b)))
     two = np.zeros(cluster.max() + 2, bool)
     whole = np.bincount(cluster, size)
@@ -157,8 +183,12 @@ def clusters(footprints: Sequence[Footprint], joins: Joins = "by their border") 
     return np.split(np.where(near, cluster[node] + 1, 0), np.cumsum(sizes)[:-1]), two
 
 
-def _cells_over(cells: NDArray[np.int64], node: NDArray[np.int64], nodes: int) -> tuple[Float, Float]:
-    """Which of the cells over which anything lies are over each node, and up to BESIDE from it, (nodes, cells) each."""
+def _cells_over(
+    cells: NDArray[np.int64], node: NDArray[np.int64], nodes: int
+) -> tuple[Float, Float]:
+    """Which of the cells over which anything lies are over each node, and up to BESIDE from it,
+    (nodes, cells) each.
+    """
     at = cells - cells.min(0) + BESIDE
     width = int(at[:, 1].max()) + 1 + BESIDE
     place = at[:, 0] * width + at[:, 1]
@@ -172,15 +202,19 @@ def _cells_over(cells: NDArray[np.int64], node: NDArray[np.int64], nodes: int) -
 
 
 def _within_outlines(footprints: Sequence[Footprint], shared: Float) -> Mask:
-    """Which pieces lie within the outline, seen from above, of which other one that is the same thing, (N, N) bool.
+    """Which pieces lie within the outline, seen from above, of which other one that is the same
+    thing, (N, N) bool.
 
-    Of one frame that is one which surrounds them: the sides of a bathtub its bottom, the top of a table its foot, and
-    the rim of a lid its knob, with nothing but the plane between them; what stands in a corner is not surrounded. Of
-    another frame it may also be one beside which they lie: other sides of a box. Those that share cells anyway, by a
-    share of the cells of the smaller one, (N, N), are not looked at.
+    Of one frame that is one which surrounds them: the sides of a bathtub its bottom, the top of a
+    table its foot, and the rim of a lid its knob, with nothing but the plane between them; what
+    stands in a corner is not surrounded. Of another frame it may also be one beside which they lie:
+    other sides of a box. Those that share cells anyway, by a share of the cells of the smaller one,
+    (N, N), are not looked at.
     """
     first = np.cumsum([0, *(len(foot.pieces.stands) for foot in footprints)])
-    node = np.concatenate([foot.piece + start for foot, start in zip(footprints, first, strict=False)])
+    node = np.concatenate(
+        [foot.piece + start for foot, start in zip(footprints, first, strict=False)]
+    )
     cells = np.concatenate([foot.cells for foot in footprints]).astype(np.float64)
     many = np.maximum(np.bincount(node, minlength=first[-1]), 1)
 
@@ -196,14 +230,18 @@ def _within_outlines(footprints: Sequence[Footprint], shared: Float) -> Mask:
             for inner in np.flatnonzero((share >= WITHIN) & (shared[its_node] < LIES_OVER)):
                 own = cells[node == inner]
                 other_frame = not first[k] <= inner < first[k + 1]
-                within[inner, its_node] = _surrounds(outer, own) or (other_frame and _lie_beside(own, outer))
+                within[inner, its_node] = _surrounds(outer, own) or (
+                    other_frame and _lie_beside(own, outer)
+                )
     return within
 
 
 def _surrounds(outer: Float, inner: Float) -> bool:
     """Whether some cells, (N, 2), lie in most directions from the middle of others, (M, 2)."""
     away = outer - np.median(inner, 0)
-    direction = np.floor((np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) + 0.5) * DIRECTIONS).astype(np.int64)
+    direction = np.floor(
+        (np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) + 0.5) * DIRECTIONS
+    ).astype(np.int64)
     seen = np.bincount(np.minimum(direction, DIRECTIONS - 1), minlength=DIRECTIONS) > 0
     return bool(seen.mean() >= SURROUNDED)
 
@@ -217,31 +255,46 @@ def _lie_beside(some: Float, others: Float) -> bool:
 def _links(
     footprints: Sequence[Footprint], shared: Float, beside: Mask, within: Mask, joins: Joins
 ) -> tuple[Float, Mask, Mask]:
-    """How strongly each two pieces are linked, 0 for not, which stand apart and which may, (N, N) each."""
+    """How strongly each two pieces are linked, 0 for not, which stand apart and which may, (N,
+    N) each.
+    """
     every = [f.pieces for f in footprints]
-    same, stands = block_diag(*(np.ones_like(p.touch) for p in every)) > 0, np.concatenate([p.stands for p in every])
+    same = block_diag(*(np.ones_like(p.touch) for p in every)) > 0
+    stands = np.concatenate([p.stands for p in every])
     names = "touch", "low", "inside", "hangs"
-    touch, low, inside, hangs = (block_diag(*(getattr(p, name) for p in every)) > 0 for name in names)
+    touch, low, inside, hangs = (
+        block_diag(*(getattr(p, name) for p in every)) > 0 for name in names
+    )
     inside |= within | hangs
     inside |= inside.T
-    both, neither = np.logical_and.outer(stands, stands), ~np.logical_or.outer(stands, stands)
+    both = np.logical_and.outer(stands, stands)
+    neither = ~np.logical_or.outer(stands, stands)
     strength = np.where(shared >= np.where(same, OVERLAP, LIES_OVER), shared, 0)
     touch &= ~(both & low) if joins == "by their border" else joins == "always"
     strength[touch | inside] = TOUCH
     side_by_side = same & beside & (strength == 0)
-    return strength, same & beside & both & (shared < OVERLAP) & ~inside & ~touch, side_by_side & neither
+    return (
+        strength,
+        same & beside & both & (shared < OVERLAP) & ~inside & ~touch,
+        side_by_side & neither,
+    )
 
 
-def _joined(strength: Float, apart: Mask, size: Float) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
-    """Cluster of each of N pieces, of a size (N,), by links of a strength, (N, N), 0 for none, strong ones first.
+def _joined(
+    strength: Float, apart: Mask, size: Float
+) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
+    """Cluster of each of N pieces, of a size (N,), by links of a strength, (N, N), 0 for none,
+    strong ones first.
 
-    A link that would join two pieces that stand apart is refused; these links are given too. A piece that is small
-    beside two clusters does not join them.
+    A link that would join two pieces that stand apart is refused; these links are given too. A
+    piece that is small beside two clusters does not join them.
     """
-    cluster, refused = np.arange(len(strength)), []
+    cluster = np.arange(len(strength))
+    refused = []
     a, b = np.nonzero(np.triu(strength, 1))
     for k in np.argsort(-strength[a, b], kind="stable"):
-        one, other = cluster[a[k]], cluster[b[k]]
+        one = cluster[a[k]]
+        other = cluster[b[k]]
         largest = min(size[cluster == one].max(), size[cluster == other].max())
         if one == other or min(size[a[k]], size[b[k]]) < BRIDGE * largest:
             continue
@@ -253,7 +306,9 @@ def _joined(strength: Float, apart: Mask, size: Float) -> tuple[NDArray[np.int64
 
 
 def on_ground(points: Float, plane: Float) -> Mask:
-    """Which points, (N, 2), lie within the hull of what was seen of the plane, (M, 2), (N,) bool."""
+    """Which points, (N, 2), lie within the hull of what was seen of the plane, (M, 2), (N,)
+    bool.
+    """
     if len(plane) < 3:
         return np.ones(len(points), bool)
     try:
@@ -266,7 +321,8 @@ def on_ground(points: Float, plane: Float) -> Mask:
 def central(foot: Footprint, labels: NDArray[np.int64], plane: Float, optical_axis: Float) -> int:
     """The cluster on the plane at which the camera is aimed; 0 if there is none.
 
-    It is the one with most pixels, each of which counts the less the farther the cluster lies from the optical axis.
+    It is the one with most pixels, each of which counts the less the farther the cluster lies from
+    the optical axis.
 
     Args:
         foot: the footprint of a frame.
@@ -277,7 +333,9 @@ def central(foot: Footprint, labels: NDArray[np.int64], plane: Float, optical_ax
     if not labels.any():
         return 0
     pixels = np.bincount(labels, foot.pixels)
-    over_plane = np.bincount(labels, foot.pixels * on_ground(foot.cells.astype(np.float64) + 0.5, plane))
+    over_plane = np.bincount(
+        labels, foot.pixels * on_ground(foot.cells.astype(np.float64) + 0.5, plane)
+    )
 
     cluster_of = np.zeros(len(foot.pieces.stands), np.int64)
     cluster_of[foot.piece] = labels
@@ -285,20 +343,28 @@ def central(foot: Footprint, labels: NDArray[np.int64], plane: Float, optical_ax
     step = max(1, label.shape[1] // AIM_WIDTH)
     cluster = cluster_of[label[::step, ::step]]
     stands = over_plane >= OVER_PLANE * pixels
-    stands[cluster[-BOTTOM_ROWS:]] = True  # cut off by the picture: nothing tells where it ends below
+    # cut off by the picture: nothing tells where it ends below
+    stands[cluster[-BOTTOM_ROWS:]] = True
     stands[0] = False
 
     rows, columns = (step * np.arange(n) for n in cluster.shape)
-    away = np.hypot(columns[None] - optical_axis[0], rows[:, None] - optical_axis[1]) / label.shape[1]
+    away = (
+        np.hypot(columns[None] - optical_axis[0], rows[:, None] - optical_axis[1]) / label.shape[1]
+    )
     nearest_pixel = np.asarray(ndimage.minimum(away, cluster, np.arange(len(pixels))))
 
     weight = stands * pixels * np.exp(-((nearest_pixel / AIM_SPREAD) ** 2))
     return int(weight.argmax()) if weight.max() > 0 else 0
 
 
-def nearest(footprints: Sequence[Footprint], labels: Sequence[NDArray[np.int64]], point: Float) -> int:
-    """The cluster nearest to a point, in cells, (2,), seen from above, in most frames; 0 if there is none."""
-    cells, label = np.concatenate([f.cells for f in footprints]), np.concatenate(labels)
+def nearest(
+    footprints: Sequence[Footprint], labels: Sequence[NDArray[np.int64]], point: Float
+) -> int:
+    """The cluster nearest to a point, in cells, (2,), seen from above, in most frames; 0 if
+    there is none.
+    """
+    cells = np.concatenate([f.cells for f in footprints])
+    label = np.concatenate(labels)
     if not label.any():
         return 0
     distance = np.where(label > 0, np.linalg.norm(cells + 0.5 - point, axis=1), np.inf)

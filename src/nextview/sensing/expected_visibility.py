@@ -1,4 +1,6 @@
-"""What depth frames say of each voxel around an object, and the share of it that is expected to show from elsewhere."""
+"""What depth frames say of each voxel around an object, and the share of it that is expected to
+show from elsewhere.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,12 +19,15 @@ if TYPE_CHECKING:
 
 Floating = NDArray[np.floating]
 Float32 = NDArray[np.float32]
-UNSEEN, FREE, OCCLUDER, OBJECT = np.arange(4, dtype=np.uint8)  # of a voxel; of several frames the largest counts
+# of a voxel; of several frames the largest counts
+UNSEEN, FREE, OCCLUDER, OBJECT = np.arange(4, dtype=np.uint8)
 
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """A cube of n x n x n voxels about a ``centre``, its side twice ``half``, in object radii or metres."""
+    """A cube of n x n x n voxels about a ``centre``, its side twice ``half``, in object radii or
+    metres.
+    """
 
     n: int = 64
     half: float = 1.0
@@ -45,16 +50,22 @@ class VoxelGrid:
 
     @cached_property
     def middles(self) -> NDArray[np.float32]:
-        """Of the voxels, in the order of ``cells.ravel()``, (3, n^3): contiguous along each axis, which is fast."""
+        """Of the voxels, in the order of ``cells.ravel()``, (3, n^3): contiguous along each
+        axis, which is fast.
+        """
         return np.stack(np.meshgrid(*self.axes, indexing="ij")).reshape(3, -1)
 
     def within(self, radius: float) -> NDArray[np.bool_]:
         """Voxels whose middle is no farther than this from that of the cube, (n, n, n) bool."""
-        x, y, z = ((axis - middle) ** 2 for axis, middle in zip(self.axes, self.centre, strict=True))
+        x, y, z = (
+            (axis - middle) ** 2 for axis, middle in zip(self.axes, self.centre, strict=True)
+        )
         return x[:, None, None] + y[:, None] + z <= radius**2
 
     def cell_of(self, points: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """The voxel of each point, (P, 3), as an index into ``cells.ravel()``, and whether there is one, each (P,)."""
+        """The voxel of each point, (P, 3), as an index into ``cells.ravel()``, and whether there
+        is one, each (P,).
+        """
         at = np.floor((points - np.array(self.centre) + self.half) / self.pitch).astype(np.int64)
         inside = ((at >= 0) & (at < self.n)).all(1)
         at = np.where(inside[:, None], at, 0)
@@ -65,8 +76,9 @@ class VoxelGrid:
 class Occupancy:
     """What is known of each voxel of a grid. Nothing changes in place: ``seen`` gives another one.
 
-    An occupied voxel stays occupied: a leg is thinner than a voxel, so that its middle may be free though it is there.
-    ``cells`` are UNSEEN, FREE, OCCLUDER or OBJECT, (n, n, n) uint8, axes x, y, z.
+    An occupied voxel stays occupied: a leg is thinner than a voxel, so that its middle may be free
+    though it is there. ``cells`` are UNSEEN, FREE, OCCLUDER or OBJECT, (n, n, n) uint8, axes x, y,
+    z.
     """
 
     grid: VoxelGrid
@@ -74,8 +86,13 @@ class Occupancy:
 
     @classmethod
     def unseen(cls, grid: VoxelGrid, region: NDArray[np.bool_] | None = None) -> "Occupancy":
-        """Before the first frame; outside of a region, (n, n, n) bool, if one is given, all is known to be free."""
-        return cls(grid, np.full((grid.n,) * 3, UNSEEN) if region is None else np.where(region, UNSEEN, FREE))
+        """Before the first frame; outside of a region, (n, n, n) bool, if one is given, all is
+        known to be free.
+        """
+        return cls(
+            grid,
+            np.full((grid.n,) * 3, UNSEEN) if region is None else np.where(region, UNSEEN, FREE),
+        )
 
     def seen(
         self,
@@ -87,20 +104,27 @@ class Occupancy:
     ) -> "Occupancy":
         """With what one more depth frame says.
 
-        The voxels that its points lie in are occupied. A voxel is free if its middle lies in front of what the pixel
-        that it falls on shows. So pixels have to be finer than voxels, or surfaces get holes. By default all pixels
-        show the object, and nothing is there where nothing was measured: not so for sensors.
+        The voxels that its points lie in are occupied. A voxel is free if its middle lies in front
+        of what the pixel that it falls on shows. So pixels have to be finer than voxels, or
+        surfaces get holes. By default all pixels show the object, and nothing is there where
+        nothing was measured: not so for sensors.
         """
         depth = np.asarray(depth).astype(np.float32, copy=False)
-        grid, cells = self.grid, self.cells.copy().reshape(-1)
-        unseen = np.flatnonzero(cells == UNSEEN)  # what was free before is so without being looked at again
+        grid = self.grid
+        cells = self.cells.copy().reshape(-1)
+        # what was free before is so without being looked at again
+        unseen = np.flatnonzero(cells == UNSEEN)
         reach = np.where(depth > 0, depth, FARTHEST if background_free else 0).astype(np.float32)
         cells[unseen[_in_front(grid.middles[:, unseen], reach, pose, intrinsics)]] = FREE
         rows, columns = np.nonzero(depth)
-        k, z = intrinsics, depth[rows, columns]
+        k = intrinsics
+        z = depth[rows, columns]
         x = (columns + np.float32(0.5 - k[0, 2])) * (z / np.float32(k[0, 0]))
         y = (rows + np.float32(0.5 - k[1, 2])) * (z / np.float32(k[1, 1]))
-        points = np.stack([x, y, z], 1).astype(np.float32) @ pose[:3, :3].T.astype(np.float32) + pose[:3, 3]
+        points = (
+            np.stack([x, y, z], 1).astype(np.float32) @ pose[:3, :3].T.astype(np.float32)
+            + pose[:3, 3]
+        )
         at, inside = grid.cell_of(points)
         mine = np.ones(len(at), bool) if object_mask is None else object_mask[rows, columns]
         for what in (OCCLUDER, OBJECT):
@@ -113,7 +137,9 @@ class Occupancy:
         return Occupancy(self.grid, np.maximum(self.cells, other.cells))
 
 
-def _in_front(points: Float32, reach: Float32, pose: Floating, intrinsics: Floating) -> NDArray[np.bool_]:
+def _in_front(
+    points: Float32, reach: Float32, pose: Floating, intrinsics: Floating
+) -> NDArray[np.bool_]:
     """Which points, (3, P), fall on a pixel and are nearer than its reach, (H, W)."""
     height, width = reach.shape
     to_image = (intrinsics @ pose[:3, :3].T).astype(np.float32)
@@ -121,15 +147,18 @@ def _in_front(points: Float32, reach: Float32, pose: Floating, intrinsics: Float
     x /= np.maximum(z, np.float32(1e-6))
     y /= np.maximum(z, np.float32(1e-6))
     inside = (z > 1e-6) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    pixel = np.where(inside, y, 0).astype(np.int32) * np.int32(width) + np.where(inside, x, 0).astype(np.int32)
+    pixel = np.where(inside, y, 0).astype(np.int32) * np.int32(width) + np.where(
+        inside, x, 0
+    ).astype(np.int32)
     return inside & (z < reach.reshape(-1).take(pixel))
 
 
-GRID = VoxelGrid(64, 2.0)  # around the object, in object radii: what stands beside it has a place there
+# around the object, in object radii: what stands beside it has a place there
+GRID = VoxelGrid(64, 2.0)
 BLOCK = 4  # voxels along the side of the blocks that stand for parts of the object
 UNSEEN_PART = 0.01
-"""Weight of an unseen voxel of the object's unit ball, where one of the object has 1: before anything of the object was
-seen they are all there is."""
+"""Weight of an unseen voxel of the object's unit ball, where one of the object has 1: before
+anything of the object was seen they are all there is."""
 DENSITY = 0.2  # how often unseen space is filled, per object radius: between the two bounds
 SOLID = 1e3  # a density, per voxel, through which nothing is seen
 TOGETHER = 400  # lines that are drawn at once
@@ -140,7 +169,8 @@ LOWEST = 0.02  # share of a frame's points that may lie below the height of the 
 class SeenScene:
     """The space around a target after some frames, in the object frame and object radii.
 
-    Table and other things are occluders; below the height ``floor`` is nothing of the target: infinity at first.
+    Table and other things are occluders; below the height ``floor`` is nothing of the target:
+    infinity at first.
 
     >>> seen = SeenScene.of(observation.scene for observation in observations)  # doctest: +SKIP
     >>> expected_visibility(seen, sphere.poses[:, :3, 3]).expected              # doctest: +SKIP
@@ -161,13 +191,19 @@ class SeenScene:
 
     def seen(self, view: SceneView) -> Self:
         """With what one more frame says."""
-        occupancy = self.occupancy.seen(view.depth, view.pose, view.intrinsics, view.target, view.background_free)
+        occupancy = self.occupancy.seen(
+            view.depth, view.pose, view.intrinsics, view.target, view.background_free
+        )
         rows, columns = np.nonzero(view.depth[::2, ::2])
         depth = view.depth[::2, ::2][rows, columns]
         ahead = np.stack([2 * columns + 0.5, 2 * rows + 0.5, np.ones(len(rows))])
-        heights = view.pose[2, :3] @ np.linalg.inv(view.intrinsics) @ ahead * depth + view.pose[2, 3]
+        heights = (
+            view.pose[2, :3] @ np.linalg.inv(view.intrinsics) @ ahead * depth + view.pose[2, 3]
+        )
         near = heights[np.abs(heights) <= 1.2]
-        return type(self)(occupancy, min(self.floor, float(np.quantile(near, LOWEST)) if len(near) else np.inf))
+        return type(self)(
+            occupancy, min(self.floor, float(np.quantile(near, LOWEST)) if len(near) else np.inf)
+        )
 
     def and_also(self, other: "SeenScene") -> Self:
         """As if all frames of both had been seen, of one grid."""
@@ -176,21 +212,33 @@ class SeenScene:
 
 @dataclass(frozen=True)
 class Visibility:
-    """Share of an object that shows from V positions, (V,) float64, 0 to 1, by what unseen space is."""
+    """Share of an object that shows from V positions, (V,) float64, 0 to 1, by what unseen space
+    is.
 
-    least: NDArray[np.float64]  # all of it solid
-    expected: NDArray[np.float64]  # as often filled as on the average
-    most: NDArray[np.float64]  # all of it free
+    Attributes:
+        least: all of it solid.
+        expected: as often filled as on the average.
+        most: all of it free.
+    """
+
+    least: NDArray[np.float64]
+    expected: NDArray[np.float64]
+    most: NDArray[np.float64]
 
 
 def expected_visibility(
-    seen: SeenScene, positions: NDArray[np.floating], density: float = DENSITY, unseen_part: float = UNSEEN_PART
+    seen: SeenScene,
+    positions: NDArray[np.floating],
+    density: float = DENSITY,
+    unseen_part: float = UNSEEN_PART,
 ) -> Visibility:
-    """Share of the object to which the line of sight will be clear of other things, from each position.
+    """Share of the object to which the line of sight will be clear of other things, from each
+    position.
 
-    The object is what was seen of it, and unseen voxels of its unit ball above the table, which count for less. It does
-    not hide itself. Unseen space elsewhere lets a sight of length s through with probability exp(-density * s). The
-    cameras stand at ``positions``, (V, 3), object frame, object radii.
+    The object is what was seen of it, and unseen voxels of its unit ball above the table, which
+    count for less. It does not hide itself. Unseen space elsewhere lets a sight of length s through
+    with probability exp(-density * s). The cameras stand at ``positions``, (V, 3), object frame,
+    object radii.
     """
     lines = sight_lines(seen.occupancy.grid, np.asarray(positions, np.float64).tobytes())
     return lines.visibility(seen, density, unseen_part)
@@ -204,7 +252,9 @@ def sight_lines(grid: VoxelGrid, positions: bytes) -> "SightLines":
 
 @dataclass(frozen=True)
 class SightLines:
-    """The voxels between an object's parts, on a grid, and some cameras, (V, 3); computed once for all scenes."""
+    """The voxels between an object's parts, on a grid, and some cameras, (V, 3); computed once
+    for all scenes.
+    """
 
     grid: VoxelGrid
     positions: NDArray[np.float64]
@@ -227,17 +277,21 @@ class SightLines:
 
     @cached_property
     def passed(self) -> "csr_array":
-        """How often the line from each part to each camera, in steps of a voxel, is in each voxel, (P * V, n^3)."""
+        """How often the line from each part to each camera, in steps of a voxel, is in each
+        voxel, (P * V, n^3).
+        """
         from scipy.sparse import csr_array  # slow to import, and few sessions are about scenes
 
-        grid, m = self.grid, self.grid.n // BLOCK
+        grid = self.grid
+        m = self.grid.n // BLOCK
         block = np.stack(np.unravel_index(self.parts, (m, m, m)), 1)
         start = (block + 0.5) * BLOCK  # in voxels from the grid's corner
         eyes = (self.positions - np.array(grid.centre) + grid.half) / grid.pitch
         towards = eyes[None] - start[:, None]
         length = np.linalg.norm(towards, axis=2)
         along = np.arange(0.5, np.sqrt(3) * grid.n)
-        voxels, steps = [], []
+        voxels = []
+        steps = []
         for some in np.array_split(np.arange(len(start)), -(-len(start) * len(eyes) // TOGETHER)):
             ahead = (towards[some] / length[some, :, None])[:, :, None]
             at = np.floor(start[some, None, None] + along[:, None] * ahead)
@@ -245,27 +299,40 @@ class SightLines:
             x, y, z = at[inside].astype(np.int32).T
             voxels.append((x * grid.n + y) * grid.n + z)
             steps.append(inside.sum(2).reshape(-1))
-        found, ends = np.concatenate(voxels), np.concatenate([[0], *steps]).cumsum()
-        return csr_array((np.ones(len(found), np.float32), found, ends), shape=(len(ends) - 1, grid.n**3))
+        found = np.concatenate(voxels)
+        ends = np.concatenate([[0], *steps]).cumsum()
+        return csr_array(
+            (np.ones(len(found), np.float32), found, ends), shape=(len(ends) - 1, grid.n**3)
+        )
 
     @cached_property
     def asked(self) -> NDArray[np.bool_]:
-        """The voxels that the answer depends on, (n, n, n): frames need not be asked about others."""
+        """The voxels that the answer depends on, (n, n, n): frames need not be asked about
+        others.
+        """
         found = self.own.copy()
         found.reshape(-1)[self.passed.indices] = True
         return found
 
     def visibility(self, seen: SeenScene, density: float, unseen_part: float) -> Visibility:
         """See ``expected_visibility``."""
-        cells, own = seen.occupancy.cells, self.own
-        above, mine, most = self.grid.middles[2][own.reshape(-1)] > seen.floor, cells[own], self.parts[-1] + 1
-        known, maybe = (np.bincount(self.blocks[above & (mine == what)], minlength=most) for what in (OBJECT, UNSEEN))
-        weights = (known + unseen_part * maybe)[self.parts]  # how much of the object each part is expected to hold
+        cells = seen.occupancy.cells
+        own = self.own
+        above = self.grid.middles[2][own.reshape(-1)] > seen.floor
+        mine = cells[own]
+        most = self.parts[-1] + 1
+        known, maybe = (
+            np.bincount(self.blocks[above & (mine == what)], minlength=most)
+            for what in (OBJECT, UNSEEN)
+        )
+        # how much of the object each part is expected to hold
+        weights = (known + unseen_part * maybe)[self.parts]
         if not weights.any():
             return Visibility(*np.ones((3, len(self.positions))))
         cost = ((cells == UNSEEN) & ~own).astype(np.float32)
         cost[cells == OCCLUDER] = SOLID
-        passed = (self.passed @ cost.reshape(-1)).reshape(len(weights), -1)  # thousands are occluders, else unseen
+        # thousands are occluders, else unseen
+        passed = (self.passed @ cost.reshape(-1)).reshape(len(weights), -1)
         free = passed < SOLID
         share = weights / weights.sum()
         veil = np.exp(-density * self.grid.pitch * np.where(free, passed, 0)) * free

@@ -1,9 +1,11 @@
-"""Clean a depth image by a small plane for every pixel of the object, and look at these as the networks were taught to.
+"""Clean a depth image by a small plane for every pixel of the object, and look at these as the
+networks were taught to.
 
-The sloped facet model of Haralick and Watson (A facet model for image data, Computer Graphics and Image Processing 15,
-1981), on inverse depth, where planes of the world are planes of the image: 1/z = n . (x, y, 1) for the ray (x, y, 1) of
-a pixel, so n . P = 1 for every point P of the plane. Noise is averaged, holes are filled, normals come with it, and
-edges stay sharp because a pixel may take the plane of a window beside it.
+The sloped facet model of Haralick and Watson (A facet model for image data, Computer Graphics and
+Image Processing 15, 1981), on inverse depth, where planes of the world are planes of the image: 1/z
+= n . (x, y, 1) for the ray (x, y, 1) of a pixel, so n . P = 1 for every point P of the plane. Noise
+is averaged, holes are filled, normals come with it, and edges stay sharp because a pixel may take
+the plane of a window beside it.
 """
 
 from dataclasses import dataclass
@@ -22,18 +24,26 @@ Index = NDArray[np.int64]
 CLOSE_ENOUGH = 1.5  # standard deviations of noise that a window may deviate from its plane
 STEEPEST_ERROR = 0.1  # error of the slope (tangent) that noise may leave: six degrees of the normal
 FINEST = 2e-4  # relative noise of depth that even the best frame is taken to have
-STEEPEST = np.tan(np.radians(85.0))  # slope towards the ray beyond which neighbouring pixels are taken for two surfaces
+# slope towards the ray beyond which neighbouring pixels are taken for two surfaces
+STEEPEST = np.tan(np.radians(85.0))
 BINS = 4  # ranges of depth in which the noise is measured, with equally many pixels
 ROWS = 20  # about so many rows of a picture are enough to measure it
-LAGS = (1, 2, 4, 6)  # distances of the pixels that are compared: in many sensors neighbours err together
-NEAREST, FARTHEST = 0.5, 100.0  # depth of what can be shown, object radii; all of the object is between 2 and 4
-WIDEST = 1 / 16  # half of what one sensor pixel covers here at most, as a part of the image: it bounds the time
-LAYER = 0.03  # object radii of depth within which facets are of one surface; the nearest to a pixel is shown
+# distances of the pixels that are compared: in many sensors neighbours err together
+LAGS = (1, 2, 4, 6)
+# depth of what can be shown, object radii; all of the object is between 2 and 4
+NEAREST = 0.5
+FARTHEST = 100.0
+# half of what one sensor pixel covers here at most, as a part of the image: it bounds the time
+WIDEST = 1 / 16
+# object radii of depth within which facets are of one surface; the nearest to a pixel is shown
+LAYER = 0.03
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of inverse depth, 1/metres, at ascending depths, and how many pixels err together."""
+    """Standard deviations of inverse depth, 1/metres, at ascending depths, and how many pixels
+    err together.
+    """
 
     depths: NDArray[np.float64]
     sigmas: NDArray[np.float64]
@@ -45,15 +55,20 @@ class Noise:
 
 
 def estimate_noise(depth: NDArray[np.float32], usable: NDArray[np.bool_]) -> Noise:
-    """Measure the noise of a depth image, (H, W), metres, on its usable pixels, (H, W) bool; zero where they are few.
+    """Measure the noise of a depth image, (H, W), metres, on its usable pixels, (H, W) bool; zero
+    where they are few.
 
-    On a plane the second difference of inverse depth along a row is noise alone, with the variance 6 sigma^2 if its
-    pixels do not err together; the median of its size does not mind the edges.
+    On a plane the second difference of inverse depth along a row is noise alone, with the variance
+    6 sigma^2 if its pixels do not err together; the median of its size does not mind the edges.
     """
     q = np.where(usable, 1 / np.where(usable, depth, 1), np.nan)
     found = []
     for lag in LAGS:
-        second = np.abs(q[:, : -2 * lag] - 2 * q[:, lag:-lag] + q[:, 2 * lag :]) if q.shape[1] > 2 * lag else q[:, :0]
+        second = (
+            np.abs(q[:, : -2 * lag] - 2 * q[:, lag:-lag] + q[:, 2 * lag :])
+            if q.shape[1] > 2 * lag
+            else q[:, :0]
+        )
         known = np.isfinite(second)
         if not known.any():
             break
@@ -75,13 +90,19 @@ def _sigma(second: NDArray[np.floating]) -> float:
 
 @dataclass(frozen=True)
 class Facets:
-    """Planes of the N pixels of an object, in the camera's frame."""
+    """Planes of the N pixels of an object, in the camera's frame.
 
-    planes: Float  # n of each, with n . P = 1 for points P of the plane, (N, 3), 1/metres
-    rays: Float  # (x, y, 1) through the pixels' centres, (N, 3)
+    Attributes:
+        planes: n of each, with n . P = 1 for points P of the plane, (N, 3), 1/metres.
+        rays: (x, y, 1) through the pixels' centres, (N, 3).
+        pitch: distance between neighbouring rays along x and y at depth 1, (2,).
+    """
+
+    planes: Float
+    rays: Float
     rows: Index
     columns: Index
-    pitch: Float  # distance between neighbouring rays along x and y at depth 1, (2,)
+    pitch: Float
 
     @cached_property
     def points(self) -> Float:
@@ -90,14 +111,17 @@ class Facets:
 
     def some(self, which: slice | Mask | Index) -> "Facets":
         """Those of some of the pixels."""
-        return Facets(self.planes[which], self.rays[which], self.rows[which], self.columns[which], self.pitch)
+        return Facets(
+            self.planes[which], self.rays[which], self.rows[which], self.columns[which], self.pitch
+        )
 
 
 def drop_flying(depth: NDArray[np.float32], usable: Mask, noise: float, pitch: float) -> Mask:
     """The usable pixels, (H, W) bool, without those that hang in the air between two surfaces.
 
-    A pixel stays if at least three of its eight neighbours are on its surface: as near in depth as noise of inverse
-    depth, 1/metres, and a steep slope allow. ``pitch`` is the angle between neighbouring pixels, radians.
+    A pixel stays if at least three of its eight neighbours are on its surface: as near in depth as
+    noise of inverse depth, 1/metres, and a steep slope allow. ``pitch`` is the angle between
+    neighbouring pixels, radians.
     """
     tolerance = 5 * noise * depth**2 + STEEPEST * pitch * depth
     return usable & (count_beside(depth, tolerance) >= 3)
@@ -125,16 +149,20 @@ def fit_facets(
     coarse: int = 1,
     frame_noise: Noise | None = None,
 ) -> Facets:
-    """Facets of an object, whose pixels are ``mask``, in a depth image, or in a part of it that starts at ``corner``.
+    """Facets of an object, whose pixels are ``mask``, in a depth image, or in a part of it that
+    starts at ``corner``.
 
-    One for each square of ``coarse`` pixels; none where there are too few pixels to fit one. ``intrinsics`` are of the
-    whole frame, as is ``frame_noise``: a thin object has too few pixels in a row to tell. Without ``denoise`` every
-    pixel keeps its depth, holes stay, and so do flying pixels.
+    One for each square of ``coarse`` pixels; none where there are too few pixels to fit one.
+    ``intrinsics`` are of the whole frame, as is ``frame_noise``: a thin object has too few pixels
+    in a row to tell. Without ``denoise`` every pixel keeps its depth, holes stay, and so do flying
+    pixels.
     """
     focal = intrinsics[[0, 1], [0, 1]]
     h, w = depth.shape
     usable = mask & (depth > 0)
-    noise, grain, wanted = 0.0, 1, usable
+    noise = 0.0
+    grain = 1
+    wanted = usable
     if denoise:
         if usable.any():
             noise, grain = _typical_noise(depth, usable, frame_noise)
@@ -153,9 +181,11 @@ def fit_facets(
     sums = _moments(weight, x - middle[0], y - middle[1], np.where(usable, inverse - middle[2], 0))
     pitch = coarse / focal
     if coarse > 1:
-        sums, wanted = _blocks(sums, coarse), _blocks(wanted[None].astype(np.float64), coarse)[0] >= coarse**2 / 2
+        sums = _blocks(sums, coarse)
+        wanted = _blocks(wanted[None].astype(np.float64), coarse)[0] >= coarse**2 / 2
         x, y = ((v[0] + coarse * np.arange(-(-len(v) // coarse)) * (v[1] - v[0])) for v in (x, y))
-        x, y = x + (coarse - 1) / 2 / focal[0], y + (coarse - 1) / 2 / focal[1]
+        x = x + (coarse - 1) / 2 / focal[0]
+        y = y + (coarse - 1) / 2 / focal[1]
     rows, columns = np.divmod(np.flatnonzero(wanted), wanted.shape[1])
     here = np.stack([x[columns] - middle[0], y[rows] - middle[1]], 1)
     count = sums[0, rows, columns]
@@ -173,14 +203,20 @@ def fit_facets(
     towards = np.einsum("ni,ni->n", planes, rays)  # inverse depth; NaN where there is no plane
     good = np.isfinite(towards) & (towards > 0.2 * middle[2])
     half = (coarse - 1) // 2
-    rows, columns = corner[0] + coarse * rows + half, corner[1] + coarse * columns + half
+    rows = corner[0] + coarse * rows + half
+    columns = corner[1] + coarse * columns + half
     facets = Facets(planes, rays, rows, columns, pitch)
     return facets if good.all() else facets.some(np.flatnonzero(good))
 
 
-def _typical_noise(depth: NDArray[np.float32], usable: Mask, frame_noise: Noise | None) -> tuple[float, int]:
-    """The noise at the object's median depth, and its grain: its own, or the frame's where that is smaller."""
-    few, typical = slice(None, None, max(1, len(depth) // ROWS)), float(np.median(depth[usable]))
+def _typical_noise(
+    depth: NDArray[np.float32], usable: Mask, frame_noise: Noise | None
+) -> tuple[float, int]:
+    """The noise at the object's median depth, and its grain: its own, or the frame's where that
+    is smaller.
+    """
+    few = slice(None, None, max(1, len(depth) // ROWS))
+    typical = float(np.median(depth[usable]))
     measured = estimate_noise(depth[few], usable[few])
     if frame_noise is not None and measured.at(typical) >= frame_noise.at(typical):
         measured = frame_noise
@@ -189,11 +225,20 @@ def _typical_noise(depth: NDArray[np.float32], usable: Mask, frame_noise: Noise 
 
 def _moments(weight: Float, x: Float, y: Float, q: Float) -> Float:
     """Moments for a fit of planes, (10, H, W): 1, x, y, xx, xy, yy, q, xq, yq, qq."""
-    x, y = x[None, :], y[:, None]
+    x = x[None, :]
+    y = y[:, None]
     moments = np.empty((10, *weight.shape))
     moments[0] = weight
     moments[6] = q
-    for product, one, other in ((1, 0, x), (2, 0, y), (3, 1, x), (4, 1, y), (5, 2, y), (7, 6, x), (8, 6, y)):
+    for product, one, other in (
+        (1, 0, x),
+        (2, 0, y),
+        (3, 1, x),
+        (4, 1, y),
+        (5, 2, y),
+        (7, 6, x),
+        (8, 6, y),
+    ):
         np.multiply(moments[one], other, out=moments[product])
     np.multiply(q, q, out=moments[9])
     return moments
@@ -212,19 +257,22 @@ def _blocks(images: Float, side: int) -> Float:
 
 
 def _radii(noise: float, inverse: float, pitch: Float, grain: float) -> tuple[int, int]:
-    """Half sides of two windows that grow with the noise, pixels, the larger first; slopes of the smaller are accurate.
+    """Half sides of two windows that grow with the noise, pixels, the larger first; slopes of the
+    smaller are accurate.
 
-    The slope of a plane fitted to k x k pixels that err for themselves has the standard deviation sigma sqrt(12) / k^2
-    per pixel; where grains of g x g pixels err together it is g times that.
+    The slope of a plane fitted to k x k pixels that err for themselves has the standard deviation
+    sigma sqrt(12) / k^2 per pixel; where grains of g x g pixels err together it is g times that.
     """
-    per_pixel = noise / inverse / pitch.mean()  # of depth, in units of the distance between pixels on the surface
+    # of depth, in units of the distance between pixels on the surface
+    per_pixel = noise / inverse / pitch.mean()
     side = np.sqrt(np.sqrt(12) * grain * per_pixel / STEEPEST_ERROR)
     small = int(np.clip(np.ceil((side - 1) / 2), 1, 8))
     return 2 * small, small
 
 
 def _fit(sums: Float, radius: int, enough: float) -> Float:
-    """Planes of windows of (2 radius + 1)^2 cells around every cell, (H W, 4): slopes, value at x = y = 0, variance.
+    """Planes of windows of (2 radius + 1)^2 cells around every cell, (H W, 4): slopes, value at x =
+    y = 0, variance.
 
     The last, of the residuals, is infinite for windows with fewer than ``enough`` pixels.
     """
@@ -234,8 +282,10 @@ def _fit(sums: Float, radius: int, enough: float) -> Float:
     x, y, xx, xy, yy, q, xq, yq, qq = means[1:] / np.maximum(means[0], 1e-9)
     for square, a, b in ((xx, x, x), (xy, x, y), (yy, y, y), (xq, x, q), (yq, y, q), (qq, q, q)):
         square -= a * b
-    ridge = 1e-5 * max(float(xx.max()), float(yy.max())) + 1e-30  # pixels in one line have no plane: a level one
-    xx, yy = xx + ridge, yy + ridge
+    # pixels in one line have no plane: a level one
+    ridge = 1e-5 * max(float(xx.max()), float(yy.max())) + 1e-30
+    xx = xx + ridge
+    yy = yy + ridge
     determinant = xx * yy - xy * xy
     along_x = (xq * yy - yq * xy) / determinant
     along_y = (yq * xx - xq * xy) / determinant
@@ -245,36 +295,58 @@ def _fit(sums: Float, radius: int, enough: float) -> Float:
 
 
 def _choose(
-    sums: Float, own: Float, rows: Index, columns: Index, here: Float, noise: float, radii: tuple[int, int]
+    sums: Float,
+    own: Float,
+    rows: Index,
+    columns: Index,
+    here: Float,
+    noise: float,
+    radii: tuple[int, int],
 ) -> Float:
-    """For every wanted cell the plane of the largest window that shows only the cell's own surface, (N, 3), or NaN.
+    """For every wanted cell the plane of the largest window that shows only the cell's own surface,
+    (N, 3), or NaN.
 
-    First the windows around the cell, the larger one before the smaller; then small ones that have it at their rim.
-    Windows lie so densely that one is centred within half the small radius of every cell. From the moments (10, H, W),
-    and of the wanted cells inverse depth (N,), NaN in holes, rows, columns, and x and y ``here`` (N, 2).
+    First the windows around the cell, the larger one before the smaller; then small ones that have
+    it at their rim. Windows lie so densely that one is centred within half the small radius of
+    every cell. From the moments (10, H, W), and of the wanted cells inverse depth (N,), NaN in
+    holes, rows, columns, and x and y ``here`` (N, 2).
     """
     step = max(1, radii[1] // 2)
     if step > 1:
         sums = _blocks(sums, step)
     h, w = sums.shape[1:]
-    rows, columns = rows // step, columns // step
+    rows = rows // step
+    columns = columns // step
     found = np.full((len(rows), 3), np.nan)
     left = np.arange(len(rows))
     for radius in radii:
-        windows = _fit(sums, max(1, radius // step), 4 if radius == radii[-1] else 0.3 * (2 * radius + 1) ** 2)
+        windows = _fit(
+            sums, max(1, radius // step), 4 if radius == radii[-1] else 0.3 * (2 * radius + 1) ** 2
+        )
         guess = windows[rows[left] * w + columns[left]]
         good = guess[:, 3] < (CLOSE_ENOUGH * noise) ** 2
-        good &= ~(np.abs(_deviation(guess, here[left], own[left])) > 3 * noise)  # NaN: a hole takes what there is
+        # NaN: a hole takes what there is
+        good &= ~(np.abs(_deviation(guess, here[left], own[left])) > 3 * noise)
         found[left[good]] = guess[good, :3]
         left = left[~good]
-    found[left] = _nearest_window(windows, (h, w), rows[left], columns[left], here[left], own[left], radii[-1] // step)
+    found[left] = _nearest_window(
+        windows, (h, w), rows[left], columns[left], here[left], own[left], radii[-1] // step
+    )
     return found
 
 
 def _nearest_window(
-    windows: Float, shape: tuple[int, int], rows: Index, columns: Index, here: Float, own: Float, reach: int
+    windows: Float,
+    shape: tuple[int, int],
+    rows: Index,
+    columns: Index,
+    here: Float,
+    own: Float,
+    reach: int,
 ) -> Float:
-    """Of the windows, (H W, 4), around each cell and a reach beside it, the plane that fits it best, (N, 3), or NaN."""
+    """Of the windows, (H W, 4), around each cell and a reach beside it, the plane that fits it
+    best, (N, 3), or NaN.
+    """
     steps = (-max(1, reach), 0, max(1, reach))
     down = np.stack([np.clip(rows + step, 0, shape[0] - 1) * shape[1] for step in steps])
     right = np.stack([np.clip(columns + step, 0, shape[1] - 1) for step in steps])
@@ -287,12 +359,16 @@ def _nearest_window(
 
 
 def _deviation(planes: Float, here: Float, own: Float) -> Float:
-    """Distance of planes, (..., N, 3 or more), at x and y, (N, 2), from the cells' own inverse depth, (N,), or NaN."""
+    """Distance of planes, (..., N, 3 or more), at x and y, (N, 2), from the cells' own inverse
+    depth, (N,), or NaN.
+    """
     return planes[..., 0] * here[:, 0] + planes[..., 1] * here[:, 1] + planes[..., 2] - own
 
 
 def virtual_pose(pose: Float) -> Float:
-    """The pose, (4, 4), that the networks would have looked from: in a camera's direction, at their distance, level."""
+    """The pose, (4, 4), that the networks would have looked from: in a camera's direction, at
+    their distance, level.
+    """
     position = pose[:3, 3]
     outward = position / np.linalg.norm(position) if position.any() else -pose[:3, 2]
     right = np.array([-outward[1], outward[0], 0.0])
@@ -305,12 +381,15 @@ def virtual_pose(pose: Float) -> Float:
     return virtual
 
 
-def look_again(facets: Facets, pose: Float, radius: float, size: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """The depth image of the facets from the virtual pose, object radii, and the facet in each pixel, -1 for none.
+def look_again(
+    facets: Facets, pose: Float, radius: float, size: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """The depth image of the facets from the virtual pose, object radii, and the facet in each
+    pixel, -1 for none.
 
-    Each facet is cast where the virtual camera sees it; a pixel shows the nearest surface, at the depth where its own
-    ray meets the facet's plane, so that planes stay planes. ``pose`` is that of the camera that saw them, object frame,
-    object radii; ``radius`` in metres.
+    Each facet is cast where the virtual camera sees it; a pixel shows the nearest surface, at the
+    depth where its own ray meets the facet's plane, so that planes stay planes. ``pose`` is that of
+    the camera that saw them, object frame, object radii; ``radius`` in metres.
     """
     target = virtual_pose(pose)
     focal = pinhole(size, DISTANCE)[0, 0]
@@ -324,9 +403,13 @@ def look_again(facets: Facets, pose: Float, radius: float, size: int) -> tuple[N
     z = points[:, 2]
     front = np.flatnonzero((z > NEAREST) & (z < FARTHEST))
     x, y = focal * points[front, :2].T / z[front] + size / 2
-    # A facet is as wide as a sensor's pixel: so many pixels here, half to each side; somewhat more where it is turned.
-    # A sensor that stands within the object has wider ones; they fill gaps no farther than WIDEST.
-    half = np.clip(0.6 * focal * facets.pitch.mean() * seen_from[front] / z[front], 0.5, WIDEST * size) + 0.05
+    # A facet is as wide as a sensor's pixel: so many pixels here, half to each side; somewhat more
+    # where it is turned. A sensor that stands within the object has wider ones; they fill gaps no
+    # farther than WIDEST.
+    half = (
+        np.clip(0.6 * focal * facets.pitch.mean() * seen_from[front] / z[front], 0.5, WIDEST * size)
+        + 0.05
+    )
     # The first column and row whose centres it covers:
     left, top = (np.clip(np.ceil(at - half - 0.5), -size, size).astype(np.int64) for at in (x, y))
     layer = (z[front] / LAYER).astype(np.int64) << 48 | front
@@ -348,7 +431,11 @@ def look_again(facets: Facets, pose: Float, radius: float, size: int) -> tuple[N
     facet[shown] = chosen = best[shown] & 0xFFFFFFFF
     slopes = (np.arange(size) + 0.5 - size / 2) / focal
     normal_x, normal_y, normal_z = normals.T.copy()
-    towards = normal_x[chosen] * slopes[shown % size] + normal_y[chosen] * slopes[shown // size] + normal_z[chosen]
+    towards = (
+        normal_x[chosen] * slopes[shown % size]
+        + normal_y[chosen] * slopes[shown // size]
+        + normal_z[chosen]
+    )
     with np.errstate(divide="ignore"):
         meets = offset[chosen] / towards
     depth = np.zeros(size * size, np.float32)

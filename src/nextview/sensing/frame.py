@@ -14,7 +14,8 @@ from nextview.sensing.holes import fill_regular_gaps, filled_mask
 Part = tuple[slice, slice]  # rows and columns of a picture
 WHOLE = slice(None), slice(None)
 FARTHEST = 65.0  # metres: float depth beyond is nothing; uint16 millimetres reach as far
-LARGEST_MEDIAN = 20.0  # metres; a depth image beyond is of another unit: inches are 39 times as many
+# metres; a depth image beyond is of another unit: inches are 39 times as many
+LARGEST_MEDIAN = 20.0
 NEAREST_MEDIAN = 0.01  # metres; no depth camera measures nearer
 ASPECTS = (4 / 3, 16 / 9, 16 / 10, 512 / 424, 640 / 576)  # width over height of whole pictures
 AXES = {
@@ -22,28 +23,34 @@ AXES = {
     "opengl": np.diag([1.0, -1.0, -1.0]),
     "ros": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
 }
-"""Of a camera pose: OpenCV's (x right, y down, z forward), OpenGL's (x right, y up, z backward) and those of a robot's
-body (x forward, y left, z up; ROS REP 103). Columns: OpenCV's axes in the named ones."""
-LUMA = np.array([0.299, 0.587, 0.114])  # weights of red, green and blue in a grey image (ITU-R BT.601)
+"""Of a camera pose: OpenCV's (x right, y down, z forward), OpenGL's (x right, y up, z backward) and
+those of a robot's body (x forward, y left, z up; ROS REP 103). Columns: OpenCV's axes in the named
+ones."""
+# weights of red, green and blue in a grey image (ITU-R BT.601)
+LUMA = np.array([0.299, 0.587, 0.114])
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What a depth camera gave at one moment. Only depth and intrinsics are needed. ObservationError names mistakes.
+    """What a depth camera gave at one moment. Only depth and intrinsics are needed.
+    ObservationError names mistakes.
 
     Attributes:
-        depth: along the optical axis, (H, W). Handed in as float metres, where NaN, infinity, zero and negative numbers
-            mean nothing, or as uint16 millimetres, where 0 and 65535 do. What a masked array hides means nothing, too.
-            Becomes float32, metres, 0 = nothing; gaps that come again every few pixels are filled.
-        intrinsics: pinhole matrix, (3, 3), pixels. Becomes float64, with the first pixel's centre at 0.5.
-        pose: camera-to-world, (4, 4), metres, any world frame; becomes OpenCV's axes. None: the camera itself is the
-            world; good for a single frame only.
+        depth: along the optical axis, (H, W). Handed in as float metres, where NaN, infinity, zero
+            and negative numbers mean nothing, or as uint16 millimetres, where 0 and 65535 do. What
+            a masked array hides means nothing, too. Becomes float32, metres, 0 = nothing; gaps that
+            come again every few pixels are filled.
+        intrinsics: pinhole matrix, (3, 3), pixels. Becomes float64, with the first pixel's centre
+            at 0.5.
+        pose: camera-to-world, (4, 4), metres, any world frame; becomes OpenCV's axes. None: the
+            camera itself is the world; good for a single frame only.
         mask: where the object is, (H, W) bool; None if that is to be found.
         image: grey (H, W) or colour (H, W, 3) uint8, registered to the depth; becomes grey.
-        counted: whether the depth was handed in as uint16, in steps that may be other than millimetres.
+        counted: whether the depth was handed in as uint16, in steps that may be other than
+            millimetres.
         axes: of the pose handed in: "opencv", "opengl" or "ros", see AXES.
-        pixel_centre: of the first pixel in the intrinsics handed in: 0 for OpenCV and ROS, 0.5 for OpenGL and for
-            nextview's own ``Observation``.
+        pixel_centre: of the first pixel in the intrinsics handed in: 0 for OpenCV and ROS, 0.5 for
+            OpenGL and for nextview's own ``Observation``.
     """
 
     depth: NDArray[np.float32]
@@ -61,12 +68,16 @@ class Frame:
         depth, source = fill_regular_gaps(_metres(values))
         intrinsics = _check_intrinsics(self.intrinsics, depth.shape)
         if not isinstance(pixel_centre, int | float) or not abs(pixel_centre) <= 1:
-            raise ObservationError(f"the first pixel's centre has the coordinate 0 or 0.5, not {pixel_centre!r}")
+            raise ObservationError(
+                f"the first pixel's centre has the coordinate 0 or 0.5, not {pixel_centre!r}"
+            )
         intrinsics[:2, 2] += 0.5 - pixel_centre
         object.__setattr__(self, "depth", depth)
         object.__setattr__(self, "intrinsics", intrinsics)
         if not isinstance(axes, str) or axes not in AXES:
-            raise ObservationError(f"the axes of a pose are {', '.join(AXES)}, not {one_line(repr(axes))}")
+            raise ObservationError(
+                f"the axes of a pose are {', '.join(AXES)}, not {one_line(repr(axes))}"
+            )
         if self.pose is not None:
             pose = check_pose(self.pose)
             pose[:3, :3] = pose[:3, :3] @ AXES[axes]
@@ -75,16 +86,24 @@ class Frame:
             mask = array_of(self.mask, "the mask")
             if mask.shape != depth.shape or mask.dtype != bool:
                 given = f"{mask.shape} {mask.dtype}"
-                raise ObservationError(f"a mask is (H, W) bool as the depth, {depth.shape}, not {given}")
+                raise ObservationError(
+                    f"a mask is (H, W) bool as the depth, {depth.shape}, not {given}"
+                )
             if not (mask & (depth > 0)).any():
-                raise ObservationError("no pixel of the mask has a depth: a mask of another image, or empty")
-            object.__setattr__(self, "mask", mask.copy() if source is None else filled_mask(mask, source))
+                raise ObservationError(
+                    "no pixel of the mask has a depth: a mask of another image, or empty"
+                )
+            object.__setattr__(
+                self, "mask", mask.copy() if source is None else filled_mask(mask, source)
+            )
         if self.image is not None:
             image = array_of(self.image, "the image")
             if image.dtype != np.uint8 or image.shape not in (depth.shape, (*depth.shape, 3)):
                 wanted = f"(H, W) or (H, W, 3) uint8 registered to the depth, {depth.shape}"
                 raise ObservationError(f"an image is {wanted}, not {image.shape} {image.dtype}")
-            object.__setattr__(self, "image", image if image.ndim == 2 else np.rint(image @ LUMA).astype(np.uint8))
+            object.__setattr__(
+                self, "image", image if image.ndim == 2 else np.rint(image @ LUMA).astype(np.uint8)
+            )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -109,14 +128,20 @@ class Frame:
         pose = self.camera_to_world
         return self.positions_in_camera(rows, columns) @ pose[:3, :3].T + pose[:3, 3]
 
-    def positions_in_camera(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
+    def positions_in_camera(
+        self, rows: NDArray[np.int64], columns: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
         """What some pixels show, (N, 3) float64, camera frame, metres."""
         x, y = self.rays
         z = self.depth[rows, columns].astype(np.float64)
         return np.stack([x[columns], y[rows], np.ones(len(z))], 1) * z[:, None]
 
-    def along(self, direction: NDArray[np.float64], offset: float = 0.0, part: Part = WHOLE) -> NDArray[np.float32]:
-        """``direction @ position + offset`` of what every pixel shows, world, (H, W) float32; void at depth 0."""
+    def along(
+        self, direction: NDArray[np.float64], offset: float = 0.0, part: Part = WHOLE
+    ) -> NDArray[np.float32]:
+        """``direction @ position + offset`` of what every pixel shows, world, (H, W) float32;
+        void at depth 0.
+        """
         (x, y), pose = self.rays, self.camera_to_world
         a, b, c = (pose[:3, :3].T @ direction).astype(np.float32)
         towards = (a * x)[None, part[1]] + (b * y + c)[part[0], None]
@@ -151,14 +176,17 @@ def _metres(depth: NDArray) -> NDArray[np.float32]:
         metres = np.where(depth == np.iinfo(np.uint16).max, 0, depth) * np.float32(0.001)
     elif np.issubdtype(depth.dtype, np.floating):
         metres = depth.astype(np.float32)
-        metres = np.where((metres > 0) & (metres < np.inf), metres, np.float32(0))  # no NaN passes a comparison
+        # no NaN passes a comparison
+        metres = np.where((metres > 0) & (metres < np.inf), metres, np.float32(0))
     else:
         raise ObservationError(f"depth is float metres or uint16 millimetres, not {depth.dtype}")
     seen = metres[::4, ::4]
     middle = float(np.median(seen[seen > 0])) if (seen > 0).any() else 0.0
     wrong = ""
     if middle > FARTHEST:
-        wrong = "where metres are expected: millimetres? Divide them by 1000, or hand them in as uint16"
+        wrong = (
+            "where metres are expected: millimetres? Divide them by 1000, or hand them in as uint16"
+        )
     elif middle > LARGEST_MEDIAN:
         wrong = "m, and no depth camera measures so far: is it in inches or feet?"
     elif 0 < middle < NEAREST_MEDIAN:
@@ -174,7 +202,11 @@ def _metres(depth: NDArray) -> NDArray[np.float32]:
 def _matrix(values: ArrayLike, what: str, shape: tuple[int, int]) -> NDArray[np.float64]:
     matrix = numbers(values, what).astype(np.float64)
     if matrix.shape != shape or not (np.abs(matrix) < LARGEST).all():
-        given = f"of the shape {matrix.shape}" if matrix.shape != shape else "with NaN, infinity or what no camera has"
+        given = (
+            f"of the shape {matrix.shape}"
+            if matrix.shape != shape
+            else "with NaN, infinity or what no camera has"
+        )
         raise ObservationError(f"{what} is a {shape} matrix of finite numbers, not one {given}")
     return matrix
 
@@ -182,7 +214,9 @@ def _matrix(values: ArrayLike, what: str, shape: tuple[int, int]) -> NDArray[np.
 def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
     k = _matrix(intrinsics, "the matrix of intrinsics", (3, 3))
     if not np.array_equal(k[2], [0, 0, 1]) or k[1, 0] != 0 or abs(k[0, 1]) > 1e-3 * abs(k[0, 0]):
-        raise ObservationError("intrinsics are [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: transposed, or with a skew?")
+        raise ObservationError(
+            "intrinsics are [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: transposed, or with a skew?"
+        )
     k[0, 1] = 0
     height, width = shape
     if not (k[0, 0] > 0 and k[1, 1] > 0):
@@ -190,25 +224,38 @@ def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> NDArray[
     focal = min(k[0, 0], k[1, 1])
     if focal < 0.1 * max(shape):
         short = f"a focal length of {focal:.3g} is too short for an image of {width} x {height}"
-        raise ObservationError(f"{short}: it is expected in pixels, not in millimetres or parts of the image")
+        raise ObservationError(
+            f"{short}: it is expected in pixels, not in millimetres or parts of the image"
+        )
     point = f"the principal point ({k[0, 2]:.0f}, {k[1, 2]:.0f}) is"
     if not (-width < k[0, 2] < 2 * width and -height < k[1, 2] < 2 * height):
-        raise ObservationError(f"{point} far off an image of {width} x {height}: intrinsics of another resolution?")
-    across, down = 2 * k[0, 2] / width, 2 * k[1, 2] / height  # 1 in the middle
-    scale, whole = (across + down) / 2, min(abs(width / height / aspect - 1) for aspect in ASPECTS) < 0.01
+        raise ObservationError(
+            f"{point} far off an image of {width} x {height}: intrinsics of another resolution?"
+        )
+    # 1 in the middle
+    across = 2 * k[0, 2] / width
+    down = 2 * k[1, 2] / height
+    scale = (across + down) / 2
+    whole = min(abs(width / height / aspect - 1) for aspect in ASPECTS) < 0.01
     if whole and abs(scale - 1) > 0.2 and abs(across - down) < 0.08 * scale:
         sizes = f"{scale * width:.0f} x {scale * height:.0f}, and the depth is {width} x {height}"
-        raise ObservationError(f"{point} the middle of an image of {sizes}: intrinsics of another resolution")
+        raise ObservationError(
+            f"{point} the middle of an image of {sizes}: intrinsics of another resolution"
+        )
     return k
 
 
 def check_pose(pose: ArrayLike) -> NDArray[np.float64]:
-    """A copy of a rigid pose, (4, 4); an ObservationError names the likely mistake if it is not rigid."""
+    """A copy of a rigid pose, (4, 4); an ObservationError names the likely mistake if it is not
+    rigid.
+    """
     pose = _matrix(pose, "the pose", (4, 4))
     if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
         transposed = np.allclose(pose[:, 3], [0, 0, 0, 1], atol=1e-6)
         last = np.round(pose[3], 3).tolist()
-        raise ObservationError(f"the last row of a pose is 0, 0, 0, 1, not {last}" + ": transposed?" * transposed)
+        raise ObservationError(
+            f"the last row of a pose is 0, 0, 0, 1, not {last}" + ": transposed?" * transposed
+        )
     rotation = pose[:3, :3]
     gram = rotation.T @ rotation
     scale = np.sqrt(np.trace(gram) / 3)
@@ -217,7 +264,9 @@ def check_pose(pose: ArrayLike) -> NDArray[np.float64]:
         what = f"its rotation is scaled by {scale:.3g}" if scaled else "no rotation matrix"
         raise ObservationError(f"the pose is not rigid: {what}")
     if np.linalg.det(rotation) < 0:
-        raise ObservationError("the pose is mirrored (left-handed axes): one axis has the wrong sign")
+        raise ObservationError(
+            "the pose is mirrored (left-handed axes): one axis has the wrong sign"
+        )
     u, _, vt = np.linalg.svd(rotation)
     pose[:3, :3] = u @ vt  # poses from text files are rounded
     return pose

@@ -47,7 +47,8 @@ def fill_regular_gaps(depth: Depth) -> tuple[Depth, NDArray[np.int64] | None]:
 
 
 def filled_mask(mask: Mask, source: NDArray[np.int64]) -> Mask:
-    """The mask of an image whose gaps were filled: where it has the same gaps, they are filled, too.
+    """The mask of an image whose gaps were filled: where it has the same gaps, they are filled,
+    too.
 
     Args:
         mask: (H, W) bool.
@@ -73,13 +74,16 @@ def _period(measured: Mask) -> int:
 
 
 def _fill_once(inverse: Depth, source: NDArray[np.int64], widest: int) -> None:
-    """Fill, in place, the holes between two pixels of a row or a column, at most ``widest`` pixels wide."""
+    """Fill, in place, the holes between two pixels of a row or a column, at most ``widest``
+    pixels wide.
+    """
     best_span = np.full(inverse.size, np.iinfo(np.int32).max, np.int32)
     best_value = inverse.ravel().copy()
     best_source = source.ravel().copy()
     for along_rows in (True, False):
         hole, first, second, before, after = _gaps(inverse, widest, along_rows)
-        one, other = inverse.ravel()[first], inverse.ravel()[second]
+        one = inverse.ravel()[first]
+        other = inverse.ravel()[second]
         span = before + after
 
         one_surface = np.abs(one - other) <= ONE_SURFACE * span * np.minimum(one, other)
@@ -113,7 +117,9 @@ def _gaps(inverse: Depth, widest: int, along_rows: bool) -> tuple[NDArray[np.int
     place = np.arange(size, dtype=np.int32)
     place = place[None, :] if along_rows else place[:, None]
     last = np.maximum.accumulate(np.where(measured, place, -size), axis)
-    ahead = np.flip(np.minimum.accumulate(np.flip(np.where(measured, place, 2 * size), axis), axis), axis)
+    ahead = np.flip(
+        np.minimum.accumulate(np.flip(np.where(measured, place, 2 * size), axis), axis), axis
+    )
     hole = np.flatnonzero(~measured & (ahead - last <= widest + 1))
 
     row, column = np.divmod(hole, inverse.shape[1])

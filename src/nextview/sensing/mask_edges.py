@@ -1,4 +1,6 @@
-"""Masks as segmenters give them: pixels at their edge that belong to what is behind are taken away."""
+"""Masks as segmenters give them: pixels at their edge that belong to what is behind are taken
+away.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +10,8 @@ from nextview.sensing.facets import Noise
 from nextview.sensing.frame import holes_of, within
 
 EDGE = 6  # a segmenter's edge may be off by so many pixels
-STEP = 0.01  # neighbouring pixels of one surface differ by at most this part of their depth, and THICK
+# neighbouring pixels of one surface differ by at most this part of their depth, and THICK
+STEP = 0.01
 THICK = 0.004  # metres
 NOISE_STEP = 2.5  # standard deviations by which a pixel may differ from the mean of its neighbours
 AROUND = 5  # pixels across the square of these
@@ -18,10 +21,11 @@ Mask = NDArray[np.bool_]
 def trimmed(depth: NDArray[np.float32], mask: Mask, noise: Noise, high: Mask | None = None) -> Mask:
     """The pixels of a mask that hang together with its inside without a step in depth, (H, W) bool.
 
-    Up to EDGE pixels at the edge of a mask may show the background, or hang in the air before it. The inside is what is
-    farther from the edge; of a thing that is too thin for that, as much farther as leaves a third of it. From there the
-    mask grows back over pixels as near as their neighbours: EDGE pixels, and as far as they are ``high`` over the
-    support plane, for the legs of a chair are as thin as an edge.
+    Up to EDGE pixels at the edge of a mask may show the background, or hang in the air before it.
+    The inside is what is farther from the edge; of a thing that is too thin for that, as much
+    farther as leaves a third of it. From there the mask grows back over pixels as near as their
+    neighbours: EDGE pixels, and as far as they are ``high`` over the support plane, for the legs of
+    a chair are as thin as an edge.
 
     Args:
         depth: metres, (H, W), 0 where nothing was measured.
@@ -33,7 +37,8 @@ def trimmed(depth: NDArray[np.float32], mask: Mask, noise: Noise, high: Mask | N
     part = within(measured)
     if not measured[part].size:
         return mask
-    own, z = measured[part], depth[part].astype(np.float64)
+    own = measured[part]
+    z = depth[part].astype(np.float64)
     step = np.maximum(STEP * z + THICK, NOISE_STEP * noise.at(z) * z**2)
     whole = np.pad(mask[part] | holes_of(own) & (z == 0), 1)
     for width in range(EDGE, 0, -1):

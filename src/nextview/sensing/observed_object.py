@@ -18,7 +18,16 @@ from nextview.geometry.observation import Observation, SceneView, pinhole
 from nextview.geometry.viewsphere import DISTANCE
 from nextview.sensing import clusters, plausibility, segmentation, support
 from nextview.sensing.clusters import Footprint
-from nextview.sensing.facets import ROWS, Facets, Index, Noise, estimate_noise, fit_facets, look_again, virtual_pose
+from nextview.sensing.facets import (
+    ROWS,
+    Facets,
+    Index,
+    Noise,
+    estimate_noise,
+    fit_facets,
+    look_again,
+    virtual_pose,
+)
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, ObjectFrame, enclose, three, upright_axes
@@ -30,26 +39,37 @@ from nextview.sensing.walls import before_walls, find_walls
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Found = tuple[list["Sighting"], float, bool]  # earlier and new, the side of a cell, whether it may be two things
+# earlier and new, the side of a cell, whether it may be two things
+Found = tuple[list["Sighting"], float, bool]
 
 SIZE = 224  # side of the observations' images: what the bundled networks take
 FEWEST = 60  # pixels that an object has to have in a frame
-NEAREST = 0.01  # metres between the camera and the point that names an object: nothing nearer can be measured
-MENDED = 0.03  # share of an object's pixels in an earlier frame that has to change before they are looked at again
+# metres between the camera and the point that names an object: nothing nearer can be measured
+NEAREST = 0.01
+# share of an object's pixels in an earlier frame that has to change before they are looked at again
+MENDED = 0.03
 PART = 0.1  # of the most pixels that a frame shows of an object: others say too little of its size
-LESS_NOVEL = 1.0  # the novelty score has to be so much lower for an object to be joined or taken apart otherwise
+# the novelty score has to be so much lower for an object to be joined or taken apart otherwise
+LESS_NOVEL = 1.0
 SIZE_CHANGE = 2.0  # factor by which the radius may change where an object is looked at anew
-FINEST = 1 / 32  # object radii that a pixel of the scene may show: half a voxel of ``expected_visibility``
-SAME = 0.01  # change of the centre or the radius, in object radii, below which the object frame is left as it is
-BELOW = 0.02  # metres below the support plane at which the point of an object may lie: on it, but for a pose's error
+# object radii that a pixel of the scene may show: half a voxel of ``expected_visibility``
+FINEST = 1 / 32
+# change of the centre or the radius, in object radii, below which the object frame is left as it is
+SAME = 0.01
+# metres below the support plane at which the point of an object may lie: on it, but for a pose's
+# error
+BELOW = 0.02
 AHEAD = 16  # half the width of the middle of the picture, as a part of the picture
 MASK_POINTS = 2000  # pixels of a mask that tell where its bottom is
 TOO_LITTLE = "too little is seen of the object"
 NO_PLANE = ViewWarning(
-    "support", "no support plane is seen, so where the object ends below is guessed: support=False if it stands on none"
+    "support",
+    "no support plane is seen, so where the object ends below is guessed: support=False if it"
+    " stands on none",
 )
 MAY_BE_TWO = ViewWarning(
-    "outline", "the object may be two things that touch: name it by a mask or a box, or move them apart"
+    "outline",
+    "the object may be two things that touch: name it by a mask or a box, or move them apart",
 )
 
 
@@ -57,9 +77,10 @@ MAY_BE_TWO = ViewWarning(
 class Sighting:
     """What one frame, with the noise of it all, shows of the object.
 
-    ``facets`` are its surface, camera frame, ``mask`` its pixels, (H, W) bool, and ``hull`` the corners of its convex
-    hull, world, (K, 3). ``plane`` is the support plane, if it is seen, ``footprint`` that of all that is above it,
-    where the object was found so, and ``chosen`` which of its cells are the object's, (cells,) bool.
+    ``facets`` are its surface, camera frame, ``mask`` its pixels, (H, W) bool, and ``hull`` the
+    corners of its convex hull, world, (K, 3). ``plane`` is the support plane, if it is seen,
+    ``footprint`` that of all that is above it, where the object was found so, and ``chosen`` which
+    of its cells are the object's, (cells,) bool.
     """
 
     frame: Frame
@@ -74,7 +95,12 @@ class Sighting:
 
 @dataclass(frozen=True)
 class ObjectState:
-    """All that is known of an object after some frames."""
+    """All that is known of an object after some frames.
+
+    Attributes:
+        cell: side of a cell of the footprints, metres.
+        joins: whether what touches it is a part of it.
+    """
 
     rng: np.random.Generator
     frame: ObjectFrame | None = None
@@ -82,31 +108,34 @@ class ObjectState:
     observations: tuple[Observation, ...] = ()
     warnings: tuple[ViewWarning, ...] = ()
     revision: int = 0
-    cell: float = 0.0  # side of a cell of the footprints, metres
-    joins: clusters.Joins = "by their border"  # whether what touches it is a part of it
+    cell: float = 0.0
+    joins: clusters.Joins = "by their border"
 
 
 class ObservedObject:
     """One object, seen in more and more frames. ``add`` takes a frame and gives an observation.
 
-    The object is found in each frame: by the frame's mask; else as what lies in a ``box``; else as the cluster on the
-    support plane that is nearest to a ``point``, or at which the first camera is aimed. Its centre and radius are those
-    of the box, or estimated from all frames that show enough of it. When they get better the earlier frames are
-    expressed anew: ``observations`` are always all in the same, latest object frame, and ``revision`` counts how often
-    it changed. Its x axis points towards the first camera, unless a box or a known frame says otherwise.
+    The object is found in each frame: by the frame's mask; else as what lies in a ``box``; else as
+    the cluster on the support plane that is nearest to a ``point``, or at which the first camera is
+    aimed. Its centre and radius are those of the box, or estimated from all frames that show enough
+    of it. When they get better the earlier frames are expressed anew: ``observations`` are always
+    all in the same, latest object frame, and ``revision`` counts how often it changed. Its x axis
+    points towards the first camera, unless a box or a known frame says otherwise.
 
     >>> thing = ObservedObject()                                                # doctest: +SKIP
     >>> observation = thing.add(Frame(depth, intrinsics, pose))                 # doctest: +SKIP
 
     Args:
-        up: direction against gravity in the world, (3,); z by default. None: the normal of the support plane of the
-            first frame. Frames without a pose have no other way.
+        up: direction against gravity in the world, (3,); z by default. None: the normal of the
+            support plane of the first frame. Frames without a pose have no other way.
         point: near the object, world, metres, (3,).
         box: upright, into which the object just fits.
-        support: whether the object stands on a plane in view. False for a gripper or a turntable that masks cut out.
+        support: whether the object stands on a plane in view. False for a gripper or a turntable
+            that masks cut out.
         known: the object frame, if it need not be estimated; the object is what lies in its sphere.
         denoise: smooth depth, fill holes and drop flying pixels. For sensors; renders need it not.
-        life_size: whether the object is as large as its kind is in life: then the radius is evidence of the class.
+        life_size: whether the object is as large as its kind is in life: then the radius is
+            evidence of the class.
         rng: for the search for planes, is copied; seed 0 by default.
     """
 
@@ -122,12 +151,19 @@ class ObservedObject:
         rng: np.random.Generator | None = None,
     ) -> None:
         if sum(asked is not None for asked in (point, box, known)) > 1:
-            raise UsageError("an object is asked for by a point, by a box or by its known frame: by one of them")
+            raise UsageError(
+                "an object is asked for by a point, by a box or by its known frame: by one of them"
+            )
         self.point = None if point is None else three(point, "a point")
         self.up = None if up is None else upright_axes(up)[2]
-        self.box, self.support, self.known = box, support, known if box is None else box.object_frame
-        self.denoise, self.life_size = denoise, life_size
-        self.state = ObjectState(np.random.default_rng(0) if rng is None else deepcopy(rng), self.known)
+        self.box = box
+        self.support = support
+        self.known = known if box is None else box.object_frame
+        self.denoise = denoise
+        self.life_size = life_size
+        self.state = ObjectState(
+            np.random.default_rng(0) if rng is None else deepcopy(rng), self.known
+        )
 
     @property
     def object_frame(self) -> ObjectFrame:
@@ -157,7 +193,8 @@ class ObservedObject:
         return self.state.revision
 
     def add(self, frame: Frame) -> Observation:
-        """Take in a frame: it is seen anew from three object radii in the camera's direction, as the networks take it.
+        """Take in a frame: it is seen anew from three object radii in the camera's direction, as
+        the networks take it.
 
         ObservationError where the object is not found in it; the frame is then not taken in.
         """
@@ -165,15 +202,19 @@ class ObservedObject:
         return self.state.observations[-1]
 
     def reconsider(self, novelty: Callable[[Sequence[Observation]], float]) -> None:
-        """Count what touches the object as a part of it, or do not, where its observations are less novel then.
+        """Count what touches the object as a part of it, or do not, where its observations are less
+        novel then.
 
-        An object of another order of size is another thing, such as the wall behind it, and is not considered.
+        An object of another order of size is another thing, such as the wall behind it, and is not
+        considered.
         """
         found = [(novelty(self.observations), self.state)]
         radius = self.object_frame.radius
         for joins in self.other_joins():
             other = copy(self)
-            other.state = ObjectState(self.state.rng, self.known, revision=self.revision + 1, joins=joins)
+            other.state = ObjectState(
+                self.state.rng, self.known, revision=self.revision + 1, joins=joins
+            )
             with suppress(ObservationError):
                 for sighting in self.sightings:
                     other.add(sighting.frame)
@@ -183,42 +224,63 @@ class ObservedObject:
 
     def other_joins(self) -> list[clusters.Joins]:
         """Other rules for what touches the object, by which it has other pixels."""
-        old = [(s.footprint, s.chosen) for s in self.sightings if s.footprint is not None and s.chosen is not None]
+        old = [
+            (s.footprint, s.chosen)
+            for s in self.sightings
+            if s.footprint is not None and s.chosen is not None
+        ]
         found: list[clusters.Joins] = []
         for joins in (j for j in get_args(clusters.Joins) if old and j != self.state.joins):
             labels, _ = clusters.clusters([foot for foot, _ in old], joins)
-            votes = np.concatenate([label[was] for label, (_, was) in zip(labels, old, strict=True)])
+            votes = np.concatenate(
+                [label[was] for label, (_, was) in zip(labels, old, strict=True)]
+            )
             target = np.bincount(votes, minlength=1).argmax()
-            if any(_changed(*pair, label == target) for pair, label in zip(old, labels, strict=True)):
+            if any(
+                _changed(*pair, label == target) for pair, label in zip(old, labels, strict=True)
+            ):
                 found.append(joins)
         return found
 
     def _after(self, frame: Frame) -> ObjectState:
         before = self.state
         if not isinstance(frame, Frame):
-            raise ObservationError(f"what a depth camera gave is a Frame, not {one_line(repr(frame))}")
+            raise ObservationError(
+                f"what a depth camera gave is a Frame, not {one_line(repr(frame))}"
+            )
         if before.sightings and (frame.pose is None or before.sightings[0].frame.pose is None):
-            raise ObservationError("a second frame needs a pose, and the first one too: how else do they fit together?")
-        target, radius = (self.point, 0.0) if self.known is None else (self.known.centre, self.known.radius)
+            raise ObservationError(
+                "a second frame needs a pose, and the first one too: how else do they fit together?"
+            )
+        target, radius = (
+            (self.point, 0.0) if self.known is None else (self.known.centre, self.known.radius)
+        )
         last = before.sightings[-1].frame if before.sightings else None
         plausibility.refuse_far(frame, last, target, radius)
         few = slice(None, None, max(1, frame.shape[0] // ROWS))
         noise = estimate_noise(frame.depth[few], frame.depth[few] > 0)
         seen = frame.depth > 0 if frame.mask is None else (frame.depth > 0) & ~frame.mask
-        samples, up, rng = sample(frame, seen, noise), None if frame.pose is None else self.up, before.rng
+        samples = sample(frame, seen, noise)
+        up = None if frame.pose is None else self.up
+        rng = before.rng
         if before.frame is not None:
             up = before.frame.axes[2]
         plane = None
         if self.support:
             earlier = [s.plane for s in before.sightings if s.plane is not None]
             rng = rng if earlier else deepcopy(rng)
-            plane = refine_plane(earlier[0], samples, loose=2) if earlier else self._plane(frame, samples, up, rng)
+            plane = (
+                refine_plane(earlier[0], samples, loose=2)
+                if earlier
+                else self._plane(frame, samples, up, rng)
+            )
         if up is None:
             if plane is None:
                 why = "no support plane is seen, so there is no telling where up is"
                 raise ObservationError(f"{why}: give it, and the camera's pose")
             up = plane.normal
-        ahead, down = frame.camera_to_world[:3, 2], frame.camera_to_world[:3, 1]
+        ahead = frame.camera_to_world[:3, 2]
+        down = frame.camera_to_world[:3, 1]
         front = -ahead if abs(ahead @ up) < 0.99 else down  # from above the bottom of the image
         axes = upright_axes(up, front) if before.frame is None else before.frame.axes
         sightings, cell, two = self._find(frame, upright_axes(up), plane, samples, noise)
@@ -229,7 +291,9 @@ class ObservedObject:
         for i, (sighting, old) in enumerate(zip(sightings, before.sightings, strict=False)):
             if latest is not before.frame or sighting is not old:
                 made[i] = self._observe(sighting, latest)
-        revision = before.revision + any(new is not old for new, old in zip(made, before.observations, strict=True))
+        revision = before.revision + any(
+            new is not old for new, old in zip(made, before.observations, strict=True)
+        )
         made.append(self._observe(sightings[-1], latest))
         warnings = check_frame(frame) + check_observation(made[-1]) + [MAY_BE_TWO] * two
         if last is not None:
@@ -240,9 +304,20 @@ class ObservedObject:
         warnings += [NO_PLANE] * (self.support and plane is None and self.known is None)
         for view in made[-4:-1]:
             warnings = warnings or check_views(view, made[-1])
-        return ObjectState(rng, latest, tuple(sightings), tuple(made), tuple(warnings), revision, cell, before.joins)
+        return ObjectState(
+            rng,
+            latest,
+            tuple(sightings),
+            tuple(made),
+            tuple(warnings),
+            revision,
+            cell,
+            before.joins,
+        )
 
-    def _plane(self, frame: Frame, samples: Samples, up: Float | None, rng: np.random.Generator) -> Plane | None:
+    def _plane(
+        self, frame: Frame, samples: Samples, up: Float | None, rng: np.random.Generator
+    ) -> Plane | None:
         """The support plane of the first frame."""
         every = samples
         if up is not None:  # the foot of a wall is no part of the floor
@@ -254,25 +329,40 @@ class ObservedObject:
             higher = self.point + (2 * np.median(samples.tolerance) + BELOW) * up
             under = find_plane(samples, deepcopy(rng), up, higher)
             if under is not None and (more := float(under.holds(samples).mean())) > 2 * share:
-                plane, share = under, more
-        if up is not None and frame.mask is None and share < 1 / 3:  # else no other is twice as large
+                plane = under
+                share = more
+        # else no other is twice as large
+        if up is not None and frame.mask is None and share < 1 / 3:
             largest = find_plane(every, rng)
-            mistake = None if largest is None else segmentation.mistake_in_pose(largest, frame.camera_to_world, up)
+            mistake = (
+                None
+                if largest is None
+                else segmentation.mistake_in_pose(largest, frame.camera_to_world, up)
+            )
             if largest is not None and mistake and largest.holds(every).mean() > 2 * share:
-                raise ObservationError(f"the largest plane in view is not level: {mistake} Or up is another direction")
+                raise ObservationError(
+                    f"the largest plane in view is not level: {mistake} Or up is another direction"
+                )
         if segmentation.lies_better_as_range(frame, plane, samples, rng, up, self._above()):
-            raise ObservationError("the depth is measured along the rays, a range: give it along the optical axis")
+            raise ObservationError(
+                "the depth is measured along the rays, a range: give it along the optical axis"
+            )
         return plane if plane is None or up is None else self._under_the_object(frame, every, plane)
 
     def _under_the_object(self, frame: Frame, samples: Samples, plane: Plane) -> Plane:
-        """That of the level planes in the first frame on which the object stands; one of them is given."""
+        """That of the level planes in the first frame on which the object stands; one of them is
+        given.
+        """
         planes = support.level_planes(samples, plane)
         if len(planes) == 1 or self.known is not None:
             return plane
         if frame.mask is not None:
             rows, columns = np.nonzero(frame.mask & (frame.depth > 0))
             few = slice(None, None, max(1, len(rows) // MASK_POINTS))
-            return support.under_points(samples, planes, frame.positions(rows[few], columns[few])) or plane
+            return (
+                support.under_points(samples, planes, frame.positions(rows[few], columns[few]))
+                or plane
+            )
 
         walls = find_walls(samples, planes[-1], np.random.default_rng(0), self.point)
         of_walls = np.zeros(len(samples.points), bool)
@@ -289,37 +379,62 @@ class ObservedObject:
             quarter = (self.box.low + self.box.high) / 2
             quarter[2] = self.box.low[2] + (self.box.high[2] - self.box.low[2]) / 4
             return quarter @ self.box.axes
-        return self.point if self.known is None else self.known.centre - 0.2 * self.known.radius * self.known.axes[2]
+        return (
+            self.point
+            if self.known is None
+            else self.known.centre - 0.2 * self.known.radius * self.known.axes[2]
+        )
 
-    def _find(self, frame: Frame, axes: Float, plane: Plane | None, samples: Samples, noise: Noise) -> Found:
+    def _find(
+        self, frame: Frame, axes: Float, plane: Plane | None, samples: Samples, noise: Noise
+    ) -> Found:
         if frame.mask is not None:
             mask = frame.mask
             if self.known is None:  # else its size does not hang on pixels at the edge
-                high = None if plane is None else frame.along(plane.normal, plane.offset) > STANDS * frame.depth
+                high = (
+                    None
+                    if plane is None
+                    else frame.along(plane.normal, plane.offset) > STANDS * frame.depth
+                )
                 mask = trimmed(frame.depth, mask, noise, high)
                 above = mask.copy()
                 if plane is not None:
                     part = within(mask)
                     above[part] &= segmentation.above_plane(frame, plane, noise, part)
-                mask = above if 2 * above.sum() > mask.sum() else mask  # a plane may lie above what is hidden or flat
+                # a plane may lie above what is hidden or flat
+                mask = above if 2 * above.sum() > mask.sum() else mask
         elif self.known is not None:
             if self.box is not None:
                 mask = segmentation.inside_box(frame, self.box)
             else:
-                mask = segmentation.inside_sphere(frame, self.known.centre, 1.02 * self.known.radius)
+                mask = segmentation.inside_sphere(
+                    frame, self.known.centre, 1.02 * self.known.radius
+                )
             if plane is not None:
                 mask &= segmentation.above_plane(frame, plane, noise)
             if mask.sum() < FEWEST:
-                raise ObservationError("nothing is seen where the object should be: a wrong pose, or a wrong box?")
+                raise ObservationError(
+                    "nothing is seen where the object should be: a wrong pose, or a wrong box?"
+                )
         elif plane is not None:
             return self._on_the_plane(frame, axes, plane, samples, noise)
         else:
-            what = "give a mask or a box, or check the pose (inverse? OpenGL axes?) and which way is up"
+            what = (
+                "give a mask or a box, or check the pose (inverse? OpenGL axes?) and which way"
+                " is up"
+            )
             raise ObservationError(f"no support plane is seen below the camera: {what}")
-        return [*self.state.sightings, self._sighting(frame, mask, plane, noise)], self.state.cell, False
+        return (
+            [*self.state.sightings, self._sighting(frame, mask, plane, noise)],
+            self.state.cell,
+            False,
+        )
 
-    def _on_the_plane(self, frame: Frame, axes: Float, plane: Plane, samples: Samples, noise: Noise) -> Found:
-        earlier, cell = self.state.sightings, self.state.cell
+    def _on_the_plane(
+        self, frame: Frame, axes: Float, plane: Plane, samples: Samples, noise: Noise
+    ) -> Found:
+        earlier = self.state.sightings
+        cell = self.state.cell
         height = frame.along(plane.normal, plane.offset)
         above = segmentation.above_plane(frame, plane, noise)
         place = self._place()
@@ -328,11 +443,14 @@ class ObservedObject:
         above &= free
         ground = plane.extent(samples) @ axes[:2].T
         if not cell:  # by the distance from the camera to the object
-            camera, distance = frame.camera_to_world[:3, 3], 1.0
+            camera = frame.camera_to_world[:3, 3]
+            distance = 1.0
             if self.point is not None:
                 distance = float(np.linalg.norm(self.point - camera))
                 if distance < NEAREST:
-                    raise ObservationError(f"the object's point is {distance:.2g} m from the camera: of the world?")
+                    raise ObservationError(
+                        f"the object's point is {distance:.2g} m from the camera: of the world?"
+                    )
             else:
                 points = sample(frame, above, noise).points
                 points = points[clusters.on_ground(points @ axes[:2].T, ground)]
@@ -346,10 +464,13 @@ class ObservedObject:
         foot = clusters.footprint(frame, pieces, axes, cell, middle / cell)
         footprints = [*(s.footprint for s in earlier if s.footprint is not None), foot]
         labels, two = clusters.clusters(footprints, self.state.joins)
-        target = self._target(labels, footprints, ground / cell, axes[:2] / cell, frame.intrinsics[:2, 2])
+        target = self._target(
+            labels, footprints, ground / cell, axes[:2] / cell, frame.intrinsics[:2, 2]
+        )
         for now, s in zip(labels, (s for s in earlier if s.footprint is not None), strict=False):
             was = int(np.bincount(now[s.chosen], minlength=1).argmax())
-            if was and not any(was in label and target in label for label in labels):  # another side of the object
+            # another side of the object
+            if was and not any(was in label and target in label for label in labels):
                 for label in labels:
                     label[label == was] = target
         chosen = labels[-1] == target
@@ -358,55 +479,88 @@ class ObservedObject:
             mask = trimmed(frame.depth, mask, noise, height > STANDS * frame.depth)
         if target == 0 or mask.sum() < FEWEST:
             where = "of the object known so far" if earlier else "on the support plane"
-            raise ObservationError(f"this frame shows nothing {where}: check its pose, or aim the camera at the object")
-        sightings, old_labels = list[Sighting](), iter(labels[:-1])
+            raise ObservationError(
+                f"this frame shows nothing {where}: check its pose, or aim the camera at the object"
+            )
+        sightings = list[Sighting]()
+        old_labels = iter(labels[:-1])
         for s in earlier:
             if s.footprint is not None and s.chosen is not None:
                 now = next(old_labels) == target
                 if _changed(s.footprint, s.chosen, now):
-                    mended = replace(s, facets=s.facets.some(slice(0)), mask=np.zeros_like(s.mask), hull=s.hull[:0])
-                    with suppress(ObservationError):  # what was taken for the object was what hid it
-                        mended = self._sighting(s.frame, s.footprint.pixels_of(now), s.plane, s.noise)
+                    mended = replace(
+                        s,
+                        facets=s.facets.some(slice(0)),
+                        mask=np.zeros_like(s.mask),
+                        hull=s.hull[:0],
+                    )
+                    # what was taken for the object was what hid it
+                    with suppress(ObservationError):
+                        mended = self._sighting(
+                            s.frame, s.footprint.pixels_of(now), s.plane, s.noise
+                        )
                     s = replace(mended, footprint=s.footprint, chosen=now)
             sightings.append(s)
         latest = replace(self._sighting(frame, mask, plane, noise), footprint=foot, chosen=chosen)
         return [*sightings, latest], cell, bool(two[target])
 
     def _place(self) -> Float | None:
-        """Where the object is known to be, (3,), world, metres: by the point that asks for it, or earlier frames."""
+        """Where the object is known to be, (3,), world, metres: by the point that asks for it,
+        or earlier frames.
+        """
         if self.point is not None:
             return self.point
         return None if self.state.frame is None else self.state.frame.centre
 
     def _target(
-        self, labels: list[Index], footprints: list[Footprint], ground: Float, to_cells: Float, optical_axis: Float
+        self,
+        labels: list[Index],
+        footprints: list[Footprint],
+        ground: Float,
+        to_cells: Float,
+        optical_axis: Float,
     ) -> int:
-        """The object's label: by the point; else that of most cells that were the object's before; else as aimed at."""
+        """The object's label: by the point; else that of most cells that were the object's
+        before; else as aimed at.
+        """
         if self.point is not None:
-            asked, here = to_cells @ self.point, labels[-1]
+            asked = to_cells @ self.point
+            here = labels[-1]
             target = clusters.nearest(footprints, labels, asked)
             return target if target in here else clusters.nearest(footprints[-1:], [here], asked)
         before = [s.chosen for s in self.sightings if s.chosen is not None]
-        votes = np.concatenate([[0], *(now[then] for now, then in zip(labels[:-1], before, strict=True))]).astype(int)
+        votes = np.concatenate(
+            [[0], *(now[then] for now, then in zip(labels[:-1], before, strict=True))]
+        ).astype(int)
         count = np.bincount(votes)
         count[0] = 0
         if count.any():
-            target, here = int(count.argmax()), labels[-1]
+            target = int(count.argmax())
+            here = labels[-1]
             if target not in here:  # what was found was a part: the whole stands in the same place
-                off = np.linalg.norm(footprints[-1].cells + 0.5 - to_cells @ self.object_frame.centre, axis=1)
-                there = here[(off < self.object_frame.radius * np.linalg.norm(to_cells[0])) & (here > 0)]
+                off = np.linalg.norm(
+                    footprints[-1].cells + 0.5 - to_cells @ self.object_frame.centre, axis=1
+                )
+                there = here[
+                    (off < self.object_frame.radius * np.linalg.norm(to_cells[0])) & (here > 0)
+                ]
                 target = int(np.bincount(there).argmax()) if len(there) else 0
             return target
         if self.sightings:
-            return clusters.nearest(footprints[-1:], labels[-1:], to_cells @ self.object_frame.centre)
+            return clusters.nearest(
+                footprints[-1:], labels[-1:], to_cells @ self.object_frame.centre
+            )
         return clusters.central(footprints[-1], labels[-1], ground, optical_axis)
 
     def _sighting(self, frame: Frame, mask: Mask, plane: Plane | None, noise: Noise) -> Sighting:
         if mask.sum() < FEWEST:
             raise ObservationError(TOO_LITTLE)
         part = within(mask, 2)
-        corner, coarse = (part[0].start, part[1].start), max(1, max(mask[part].shape) // SIZE)
-        facets = fit_facets(frame.depth[part], mask[part], frame.intrinsics, corner, self.denoise, coarse, noise)
+        corner = (part[0].start, part[1].start)
+        coarse = max(1, max(mask[part].shape) // SIZE)
+        facets = fit_facets(
+            frame.depth[part], mask[part], frame.intrinsics, corner, self.denoise, coarse, noise
+        )
         if self.denoise and len(facets.planes):
             facets = without_outliers(facets, noise, coarse)
         if len(facets.planes) * coarse**2 < FEWEST:
@@ -422,29 +576,40 @@ class ObservedObject:
         if self.known is not None:
             return self.known
         shown = np.array([s.mask.sum() for s in sightings])
-        points = np.concatenate([s.hull for s, n in zip(sightings, shown, strict=True) if n >= PART * shown.max()])
+        points = np.concatenate(
+            [s.hull for s, n in zip(sightings, shown, strict=True) if n >= PART * shown.max()]
+        )
         planes = [s.plane for s in sightings if s.plane is not None]
-        floor, here = None, points.mean(0)
+        floor = None
+        here = points.mean(0)
         if planes:  # their height along up, where the object is: they may lean a little
-            floor = float(np.median([axes[2] @ here - p.height(here) / (p.normal @ axes[2]) for p in planes]))
+            floor = float(
+                np.median([axes[2] @ here - p.height(here) / (p.normal @ axes[2]) for p in planes])
+            )
         return enclose(points, axes, floor)
 
     def _observe(self, sighting: Sighting, latest: ObjectFrame) -> Observation:
         pose = latest.pose_in_object(sighting.frame.camera_to_world)
         depth, facet = look_again(sighting.facets, pose, latest.radius, SIZE)
-        image, facets = sighting.frame.image, sighting.facets
+        image = sighting.frame.image
+        facets = sighting.facets
         if image is not None and not len(facets.rows):
             image = np.zeros((SIZE, SIZE, 3), image.dtype)
         elif image is not None:
             image = np.where(facet >= 0, image[facets.rows[facet], facets.columns[facet]], 0)
-        radius, scene = latest.radius if self.life_size else None, _scene(sighting, pose, latest.radius)
+        radius = latest.radius if self.life_size else None
+        scene = _scene(sighting, pose, latest.radius)
         return Observation(depth, virtual_pose(pose), pinhole(SIZE, DISTANCE), radius, image, scene)
 
 
 def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
-    """All that a frame shows, from a pose in the object frame, in object radii; no finer than it has to be."""
+    """All that a frame shows, from a pose in the object frame, in object radii; no finer than it
+    has to be.
+    """
     k = sighting.frame.intrinsics.copy()
-    step = max(1, int(FINEST * min(k[0, 0], k[1, 1]) / max(float(np.linalg.norm(pose[:3, 3])), 1.0)))
+    step = max(
+        1, int(FINEST * min(k[0, 0], k[1, 1]) / max(float(np.linalg.norm(pose[:3, 3])), 1.0))
+    )
     k[:2] /= step
     k[:2, 2] += 0.5 - (step // 2 + 0.5) / step
     few = (slice(step // 2, None, step),) * 2
@@ -452,10 +617,15 @@ def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
 
 
 def _ahead(frame: Frame) -> Float:
-    """What the middle of the picture, or all of it, shows in the median, straight ahead, (3,), world, metres."""
+    """What the middle of the picture, or all of it, shows in the median, straight ahead, (3,),
+    world, metres.
+    """
     height, width = frame.shape
-    down, across = height // AHEAD + 1, width // AHEAD + 1
-    depth = frame.depth[height // 2 - down : height // 2 + down, width // 2 - across : width // 2 + across]
+    down = height // AHEAD + 1
+    across = width // AHEAD + 1
+    depth = frame.depth[
+        height // 2 - down : height // 2 + down, width // 2 - across : width // 2 + across
+    ]
     if not depth.any():
         depth = frame.depth
     pose = frame.camera_to_world
@@ -469,4 +639,6 @@ def _changed(foot: Footprint, old: Mask, new: Mask) -> bool:
 
 def _same(new: ObjectFrame, old: ObjectFrame) -> bool:
     moved = np.linalg.norm(new.centre - old.centre) / old.radius
-    return bool(moved < SAME and abs(new.radius / old.radius - 1) < SAME and np.allclose(new.axes, old.axes))
+    return bool(
+        moved < SAME and abs(new.radius / old.radius - 1) < SAME and np.allclose(new.axes, old.axes)
+    )

@@ -1,8 +1,8 @@
 """Facets that belong to no surface of the object: flying pixels, and scraps of what is behind it.
 
-One of them would set the object's radius. Two filters, as in the Point Cloud Library (Rusu and Cousins 2011): a point
-with few neighbours in space is an outlier, and so is a small group of points away from all others. Neighbours in space
-are looked for among the neighbours in the picture.
+One of them would set the object's radius. Two filters, as in the Point Cloud Library (Rusu and
+Cousins 2011): a point with few neighbours in space is an outlier, and so is a small group of points
+away from all others. Neighbours in space are looked for among the neighbours in the picture.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ STEEPEST_SLOPE = 4.0  # of a surface towards the ray, between neighbours
 NOISE_GAP = 4.0  # standard deviations of depth that neighbours may differ by
 SMALLEST_GROUP = 0.01  # share of all points that a group away from the others has at least
 GAP_PIXELS = 6  # pixels that two groups are apart
-TRIMMED_BY_NOISE = 0.1  # share of the nearest and the farthest points left out, by the noise as a part of the size
+# share of the nearest and the farthest points left out, by the noise as a part of the size
+TRIMMED_BY_NOISE = 0.1
 MOST_TRIMMED = 0.01
 
 
@@ -43,7 +44,8 @@ def without_outliers(facets: Facets, noise: Noise, coarse: int) -> Facets:
     points = facets.points
     depth = points[:, 2]
 
-    spacing = float(facets.pitch.mean()) * depth  # between neighbouring points of a surface that faces the camera
+    # between neighbouring points of a surface that faces the camera
+    spacing = float(facets.pitch.mean()) * depth
     error = NOISE_GAP * noise.at(depth) * depth**2 / coarse
     kept = np.flatnonzero(_enough_neighbours(rows, columns, depth, STEEPEST_SLOPE * spacing, error))
     if not len(kept):
@@ -61,8 +63,9 @@ def without_outliers(facets: Facets, noise: Noise, coarse: int) -> Facets:
 def _within_its_depths(points: Float, error: Float) -> Mask:
     """Which points, (N, 3), are not the nearest or the farthest few, (N,) bool.
 
-    Where the noise is a large part of an object's size no neighbour tells a flying pixel, which lies before or behind
-    the object, from noise. So the more noise there is for its size, the more of its outermost depths are left out.
+    Where the noise is a large part of an object's size no neighbour tells a flying pixel, which
+    lies before or behind the object, from noise. So the more noise there is for its size, the more
+    of its outermost depths are left out.
     """
     if not len(points):
         return np.zeros(0, bool)
@@ -73,13 +76,19 @@ def _within_its_depths(points: Float, error: Float) -> Mask:
     return np.asarray((depth >= nearest) & (depth <= farthest))
 
 
-def _enough_neighbours(rows: Index, columns: Index, depth: Float, slope: Float, error: Float) -> Mask:
+def _enough_neighbours(
+    rows: Index, columns: Index, depth: Float, slope: Float, error: Float
+) -> Mask:
     """Which pixels, (N,), have FEWEST_NEIGHBOURS around them that are as deep.
 
-    Depths may differ by a slope for each pixel between, and an error. Most pixels have so many among the eight beside
-    them; the wider window is looked at for the others only.
+    Depths may differ by a slope for each pixel between, and an error. Most pixels have so many
+    among the eight beside them; the wider window is looked at for the others only.
     """
-    picture = np.full((int(np.ptp(rows)) + 1 + 2 * WINDOW, int(np.ptp(columns)) + 1 + 2 * WINDOW), np.nan, np.float32)
+    picture = np.full(
+        (int(np.ptp(rows)) + 1 + 2 * WINDOW, int(np.ptp(columns)) + 1 + 2 * WINDOW),
+        np.nan,
+        np.float32,
+    )
     at = (rows - rows.min() + WINDOW) * picture.shape[1] + columns - columns.min() + WINDOW
     picture.ravel()[at] = depth
     limit = np.zeros_like(picture)
@@ -102,7 +111,9 @@ def _enough_neighbours(rows: Index, columns: Index, depth: Float, slope: Float, 
 
 
 def _groups(rows: Index, columns: Index, layers: Index) -> Index:
-    """The group of each point, (N,): cells of the view, as wide as deep, that touch are of one group."""
+    """The group of each point, (N,): cells of the view, as wide as deep, that touch are of one
+    group.
+    """
     at = (rows - rows.min(), columns - columns.min(), layers)
     size = [int(index.max()) + 1 for index in at]
     cells = np.zeros(size, bool)

@@ -1,7 +1,9 @@
-"""Cut what stands on a plane into pieces along concave edges and jumps in depth: neighbours meet in such edges.
+"""Cut what stands on a plane into pieces along concave edges and jumps in depth: neighbours meet in
+such edges.
 
-After the convexity rule of LCCP (Stein et al., "Object Partitioning Using Local Convexity", CVPR 2014), on the image.
-Objects have concave edges too: ``clusters`` joins the pieces of one object again.
+After the convexity rule of LCCP (Stein et al., "Object Partitioning Using Local Convexity", CVPR
+2014), on the image. Objects have concave edges too: ``clusters`` joins the pieces of one object
+again.
 """
 
 from __future__ import annotations
@@ -22,19 +24,30 @@ Inverse = NDArray[np.float32]
 WIDTH = 320  # columns in which edges are searched: a wider image is taken in steps
 LAG = 4  # pixels from an edge at which the surfaces to both sides of it are looked at
 VALLEY = 0.004  # depth of a concave edge, as a part of the distance, from which it cuts
-STEP = 0.08  # part of the distance by which a pixel lies behind another one LAG away, from which it is cut at an end
+# part of the distance by which a pixel lies behind another one LAG away, from which it is cut at an
+# end
+STEP = 0.08
 LEAST = 12  # pixels of a piece
 GROWN = 12  # pixels that a piece grows at its edges, at most
 LED = 2, 5  # pixels from a border that tell to which depth a surface leads at it
-STANDS = 0.02  # height over the plane, as a part of the distance, down to which a piece is seen if it stands there
-BOTTOM = 0.002  # height of a bottom over the plane, as a part of the distance, from which it is no hole
-CONTACT = 0.3  # pixels in which two pieces touch, as a part of the root of those of the smaller one: fewer are a corner
+# height over the plane, as a part of the distance, down to which a piece is seen if it stands there
+STANDS = 0.02
+# height of a bottom over the plane, as a part of the distance, from which it is no hole
+BOTTOM = 0.002
+# pixels in which two pieces touch, as a part of the root of those of the smaller one: fewer are a
+# corner
+CONTACT = 0.3
 ENCLOSED = 0.7
-"""Share of the border of a piece that it has to one other, from which it lies inside it: the bottom of a bathtub."""
+"""Share of the border of a piece that it has to one other, from which it lies inside it: the
+bottom of a bathtub.
+"""
 NEXT: Any = ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]))
 """All pairs of pixels side by side: the first of each, and the second."""
-HELD, HIDDEN = 0.1, 0.1
-"""Share of the lower edge of a piece under which what holds it shows, at least; and behind a nearer one, at most."""
+HELD = 0.1
+HIDDEN = 0.1
+"""Share of the lower edge of a piece under which what holds it shows, at least; and behind a
+nearer one, at most.
+"""
 LOWEST = 5  # pixels of a piece that may be so low by noise
 LOW = 2  # pixels, that low, of the border of two things that stand side by side
 
@@ -43,11 +56,12 @@ LOW = 2  # pixels, that low, of the border of two things that stand side by side
 class Pieces:
     """Pieces of what stands on a plane.
 
-    ``label`` is that of each pixel, (H, W) int32, 0 for none; ``grown`` with those of edges, that are less sure.
-    ``stands`` tells which pieces reach down to the plane, (pieces + 1,) bool, by label. Of each two pieces ``touch``
-    tells whether they touch in space, ``low`` whether their border comes down to the plane, and ``inside`` whether the
-    first lies inside the outline of the second, and ``hangs`` whether the first, which does not reach down to the
-    plane, is held by the second: (pieces + 1, pieces + 1) bool.
+    ``label`` is that of each pixel, (H, W) int32, 0 for none; ``grown`` with those of edges, that
+    are less sure. ``stands`` tells which pieces reach down to the plane, (pieces + 1,) bool, by
+    label. Of each two pieces ``touch`` tells whether they touch in space, ``low`` whether their
+    border comes down to the plane, and ``inside`` whether the first lies inside the outline of the
+    second, and ``hangs`` whether the first, which does not reach down to the plane, is held by the
+    second: (pieces + 1, pieces + 1) bool.
     """
 
     label: NDArray[np.int32]
@@ -73,8 +87,8 @@ def cut(
         above: the pixels that are above the plane, (H, W) bool.
         height: of each pixel over the plane, metres, (H, W).
         noise: of the depth.
-        before_walls: pixels that show no wall, (H, W) bool: others are seen through a hole, and are no bottom of one.
-            All by default.
+        before_walls: pixels that show no wall, (H, W) bool: others are seen through a hole, and are
+            no bottom of one. All by default.
     """
     label, grown = np.zeros((2, *depth.shape), np.int32)
     part = within(above)
@@ -82,12 +96,15 @@ def cut(
         return Pieces(label, grown, np.zeros(1, bool), *np.zeros((4, 1, 1), bool))
     step = max(1, round(depth.shape[1] / WIDTH))
     few = (slice(None, None, step),) * 2
-    z, mask, high = depth[part][few], above[part][few], height[part][few]
+    z = depth[part][few]
+    mask = above[part][few]
+    high = height[part][few]
     bottom = _bottoms(z, mask, high)
     if before_walls is not None:
         bottom &= before_walls[part][few]
     mask = mask | bottom
-    inverse, usual = _smooth(z, mask), np.where(mask, z, 1).astype(np.float32)
+    inverse = _smooth(z, mask)
+    usual = np.where(mask, z, 1).astype(np.float32)
     error = (2 * noise.at(usual) * usual).astype(np.float32)  # as a part of the distance
     tolerance = (VALLEY + error) / usual
     found: Any
@@ -97,7 +114,8 @@ def cut(
     found = np.asarray(np.cumsum(kept) * kept)[found]
     # A pixel of an edge goes to the nearest piece that is as near to the camera.
     away, nearest = ndimage.distance_transform_edt(found == 0, return_indices=True)
-    close, found_near = away <= 2 * LAG, found[tuple(nearest)]
+    close = away <= 2 * LAG
+    found_near = found[tuple(nearest)]
     around = np.where((mask | (z == 0)) & close, found_near, found)
     with np.errstate(invalid="ignore"):
         joins = mask & close & (np.abs(inverse[tuple(nearest)] - inverse) < 4 * tolerance)
@@ -116,10 +134,17 @@ def cut(
     return Pieces(label, grown, stands, touch, at_plane, _enclosed(around), hangs)
 
 
-def _grown(label: NDArray[np.int64], mask: Mask, inverse: Inverse, tolerance: Inverse) -> NDArray[np.int64]:
-    """Pieces with the pixels of edges: each goes to the piece beside it from whose pixel it differs least in depth."""
-    wide, deep, limit = np.pad(label, 1), np.pad(inverse, 1).ravel(), np.pad(tolerance, 1).ravel()
-    flat, row = wide.ravel(), wide.shape[1]
+def _grown(
+    label: NDArray[np.int64], mask: Mask, inverse: Inverse, tolerance: Inverse
+) -> NDArray[np.int64]:
+    """Pieces with the pixels of edges: each goes to the piece beside it from whose pixel it
+    differs least in depth.
+    """
+    wide = np.pad(label, 1)
+    deep = np.pad(inverse, 1).ravel()
+    limit = np.pad(tolerance, 1).ravel()
+    flat = wide.ravel()
+    row = wide.shape[1]
     bare = np.flatnonzero(np.pad(mask & (label == 0), 1))
     for _ in range(GROWN):
         beside = bare[:, None] + (1, row, -1, -row)
@@ -139,7 +164,9 @@ def _enlarged(small: NDArray[Any], step: int, shape: tuple[int, ...]) -> NDArray
 
 
 def _bottoms(depth: NDArray[np.float32], mask: Mask, height: NDArray[np.float32]) -> Mask:
-    """Pixels of holes of the mask that lie over the plane as a whole, (H, W) bool: the bottom of a bowl."""
+    """Pixels of holes of the mask that lie over the plane as a whole, (H, W) bool: the bottom of
+    a bowl.
+    """
     holes = holes_of(mask) & (depth > 0)
     label, count = ndimage.label(holes)
     if not count:
@@ -149,7 +176,9 @@ def _bottoms(depth: NDArray[np.float32], mask: Mask, height: NDArray[np.float32]
 
 
 def _smooth(depth: NDArray[np.float32], mask: Mask) -> Inverse:
-    """Mean inverse depth of those of 3 x 3 pixels that are in the mask, (H, W), 1/metres; NaN outside of it."""
+    """Mean inverse depth of those of 3 x 3 pixels that are in the mask, (H, W), 1/metres; NaN
+    outside of it.
+    """
     weight = ndimage.uniform_filter(mask.astype(np.float32), 3, mode="constant")
     inverse = np.where(mask, 1 / np.where(mask, depth, 1), 0).astype(np.float32)
     total = ndimage.uniform_filter(inverse, 3, mode="constant")
@@ -157,15 +186,18 @@ def _smooth(depth: NDArray[np.float32], mask: Mask) -> Inverse:
 
 
 def _concave(inverse: Inverse, tolerance: Inverse) -> Mask:
-    """Pixels in a concave edge, (H, W) bool: farther than the line between two others to both sides of them.
+    """Pixels in a concave edge, (H, W) bool: farther than the line between two others to both sides
+    of them.
 
-    Inverse depth is linear over the image of a plane; ``tolerance`` is of its unit, (H, W). Where one of the two is no
-    pixel of a thing, as in a narrow strip that shows beside what hides the rest, a step in depth does.
+    Inverse depth is linear over the image of a plane; ``tolerance`` is of its unit, (H, W). Where
+    one of the two is no pixel of a thing, as in a narrow strip that shows beside what hides the
+    rest, a step in depth does.
     """
     found = np.zeros(inverse.shape, bool)
     padded = np.pad(inverse, LAG, constant_values=np.nan)
     height, width = inverse.shape
-    limit, step = 2 * (inverse + tolerance), (1 + np.float32(STEP)) * inverse + tolerance
+    limit = 2 * (inverse + tolerance)
+    step = (1 + np.float32(STEP)) * inverse + tolerance
     with np.errstate(invalid="ignore"):
         for dy, dx in ((0, LAG), (LAG, 0), (LAG, LAG), (LAG, -LAG)):
             one = padded[LAG + dy : LAG + dy + height, LAG + dx : LAG + dx + width]
@@ -176,19 +208,29 @@ def _concave(inverse: Inverse, tolerance: Inverse) -> Mask:
 
 
 def _touching(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse) -> Mask:
-    """Which two pieces meet in space, (pieces + 1, pieces + 1) bool: both lead to one depth at their border."""
-    # Its own pixels do not tell: where one thing hides another one, a sensor gives a slope between them.
+    """Which two pieces meet in space, (pieces + 1, pieces + 1) bool: both lead to one depth at
+    their border.
+    """
+    # Its own pixels do not tell: where one thing hides another one, a sensor gives a slope between
+    # them.
     near, far = LED
-    wide, deep = np.pad(label, far), np.pad(inverse, far, constant_values=np.nan)
+    wide = np.pad(label, far)
+    deep = np.pad(inverse, far, constant_values=np.nan)
     meeting = []
     for (one, other), (down, right) in zip(NEXT, ((0, 1), (1, 0)), strict=True):
-        a, b = label[one], label[other]
+        a = label[one]
+        b = label[other]
         meet = np.zeros(a.shape, bool)
         row, column = np.nonzero((a != b) & (a > 0) & (b > 0))
-        a, b, limit = a[row, column], b[row, column], tolerance[row, column]
+        a = a[row, column]
+        b = b[row, column]
+        limit = tolerance[row, column]
         led = []
         for piece, start, way in ((a, 0, -1), (b, 1, 1)):
-            at = [(far + row + down * k, far + column + right * k) for k in (start + way * np.array([0, near, far]))]
+            at = [
+                (far + row + down * k, far + column + right * k)
+                for k in (start + way * np.array([0, near, far]))
+            ]
             there = (wide[at[1]] == piece) & (wide[at[2]] == piece)
             slope = (deep[at[1]] - deep[at[2]]) / (far - near)
             led.append(np.where(there, deep[at[1]] + (near + 0.5) * slope, deep[at[0]]))
@@ -213,12 +255,13 @@ def _enclosed(label: NDArray[np.int64]) -> Mask:
 def _hanging(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse, stands: Mask) -> Mask:
     """Which pieces are held by which other one, (pieces + 1, pieces + 1) bool.
 
-    Nothing hangs in the air. Where the lower edge of a piece is in sight, and not on the plane, it is held by the piece
-    that shows below: the legs of a table, which stand back under its top. Where a nearer piece hides the lower edge it
-    may stand behind that.
+    Nothing hangs in the air. Where the lower edge of a piece is in sight, and not on the plane, it
+    is held by the piece that shows below: the legs of a table, which stand back under its top.
+    Where a nearer piece hides the lower edge it may stand behind that.
     """
     n = len(stands)
-    beneath, deep = np.zeros_like(label), np.full(inverse.shape, np.nan, np.float32)
+    beneath = np.zeros_like(label)
+    deep = np.full(inverse.shape, np.nan, np.float32)
     for step in range(LAG, 0, -1):  # an edge is some pixels wide: the nearest comes last
         shown = label[step:] > 0
         beneath[:-step][shown] = label[step:][shown]
@@ -242,11 +285,14 @@ def _hanging(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse, sta
 
 
 def _borders(label: NDArray[np.int64], counted: list[Mask]) -> NDArray[np.int64]:
-    """How many pairs of pixels side by side, of those ``counted``, each two pieces share, (pieces + 1, pieces + 1)."""
+    """How many pairs of pixels side by side, of those ``counted``, each two pieces share,
+    (pieces + 1, pieces + 1).
+    """
     n = int(label.max()) + 1
     count = np.zeros((n, n), np.int64)
     for (one, other), wanted in zip(NEXT, counted, strict=True):
-        a, b = label[one], label[other]
+        a = label[one]
+        b = label[other]
         use = wanted & (a != b)
         count += np.bincount(a[use] * n + b[use], minlength=n * n).reshape(n, n)
     return count + count.T

@@ -12,32 +12,51 @@ from nextview.sensing.frame import AXES, Frame
 Float = NDArray[np.float64]
 SAMPLE = 500  # pixels that are looked at
 FEWEST = 20  # pixels with a depth below which nothing is seen
-OUTERMOST = 1.15  # how far from the origin a surface may be, object radii: centre and radius are estimates
+# how far from the origin a surface may be, object radii: centre and radius are estimates
+OUTERMOST = 1.15
 INNERMOST = 0.4  # how far from the origin the outermost of what is seen has to be
 CONTRADICTION = 0.2  # views contradict if one misses this share of the surface that the other saw
-OFF_CENTRE = 0.25  # how far a principal point is from the middle of an uncropped picture, at most, half sides of it
-FAR_DEPTH = 10.0  # metres: few depth cameras measure farther, and nothing fills a picture from there
-ASIDE = 3.0  # how far from a thing, object radii, the point that asks for it may be, seen from above
-TOO_FAR = 2.5  # so many times as far as a frame shows anything an object cannot be: of a near one only the front shows
-STILL, CHANGED, CHANGED_SHARE = 1e-3, 0.04, 0.03
-"""Metres, and parts of a rotation, up to which a pose is the same; and the part of the distance by which a pixel has
-changed, and the share of pixels that have to."""
+# how far a principal point is from the middle of an uncropped picture, at most, half sides of it
+OFF_CENTRE = 0.25
+# metres: few depth cameras measure farther, and nothing fills a picture from there
+FAR_DEPTH = 10.0
+# how far from a thing, object radii, the point that asks for it may be, seen from above
+ASIDE = 3.0
+# so many times as far as a frame shows anything an object cannot be: of a near one only the front
+# shows
+TOO_FAR = 2.5
+STILL = 1e-3
+CHANGED = 0.04
+CHANGED_SHARE = 0.03
+"""Metres, and parts of a rotation, up to which a pose is the same; and the part of the distance by
+which a pixel has changed, and the share of pixels that have to."""
 TIMES_TOO_LARGE = (2.0, 4.0, 5.0, 8.0, 10.0)
-"""As the depth is if 16 bits in steps of 0.5, 0.25, 0.2, 0.125 and 0.1 mm are taken for millimetres."""
-NOTHING_NEARER, MUCH_FARTHER = 1.2, 1.7
-"""Times the distance of a target: nothing is nearer, and what is seen in its place is so far, if depth is too large."""
-HALF_AGREES, MOST_AGREES = 0.5, 0.8
-"""Share of the surface on which two frames agree: from which their depth scale is right, and that names another one."""
+"""As the depth is if 16 bits in steps of 0.5, 0.25, 0.2, 0.125 and 0.1 mm are taken for
+millimetres.
+"""
+NOTHING_NEARER = 1.2
+MUCH_FARTHER = 1.7
+"""Times the distance of a target: nothing is nearer, and what is seen in its place is so far, if
+depth is too large.
+"""
+HALF_AGREES = 0.5
+MOST_AGREES = 0.8
+"""Share of the surface on which two frames agree: from which their depth scale is right, and
+that names another one.
+"""
 FEWEST_SHARED = 50  # points on which two frames have to agree or not before a depth scale is named
-FAR_ORIGIN = 30.0  # metres from the origin of the world, within which robots work; where positions in millimetres begin
+# metres from the origin of the world, within which robots work; where positions in millimetres
+# begin
+FAR_ORIGIN = 30.0
 
 
 @dataclass(frozen=True)
 class ViewWarning:
     """Something that is likely to be wrong, in a sentence.
 
-    Names are "nothing seen", "opengl axes", "ros axes", "inverse pose", "scale", "outside", "contradiction" and
-    "repeated"; of a frame "intrinsics", "unit", "far origin", "outline", "support", "point" and "stale pose".
+    Names are "nothing seen", "opengl axes", "ros axes", "inverse pose", "scale", "outside",
+    "contradiction" and "repeated"; of a frame "intrinsics", "unit", "far origin", "outline",
+    "support", "point" and "stale pose".
     """
 
     name: str
@@ -45,21 +64,35 @@ class ViewWarning:
 
 
 def refuse_far(frame: Frame, last: Frame | None, target: Float | None, radius: float) -> None:
-    """Refuse a camera that is much farther from where it stood, or from its target, than anything that it sees."""
-    camera, farthest = frame.camera_to_world[:3, 3], float(frame.depth.max())
+    """Refuse a camera that is much farther from where it stood, or from its target, than
+    anything that it sees.
+    """
+    camera = frame.camera_to_world[:3, 3]
+    farthest = float(frame.depth.max())
     if last is not None:
-        moved, reach = np.linalg.norm(camera - last.camera_to_world[:3, 3]), farthest + float(last.depth.max())
+        moved = np.linalg.norm(camera - last.camera_to_world[:3, 3])
+        reach = farthest + float(last.depth.max())
         if moved > TOO_FAR * reach:
-            what = f"the camera is {moved:.0f} m from where it was, and what it sees is within {reach:.1f} m"
+            what = (
+                f"the camera is {moved:.0f} m from where it was, and what it sees is within"
+                f" {reach:.1f} m"
+            )
             raise ObservationError(f"{what}: is the pose in millimetres?")
     distance = 0.0 if target is None or frame.mask is not None else np.linalg.norm(target - camera)
     if distance - radius > TOO_FAR * farthest:
-        what = f"the target is {distance:.0f} m away, and nothing in the frame is farther than {farthest:.1f} m"
-        raise ObservationError(f"{what}: is the pose in millimetres, or are target and pose of different worlds?")
+        what = (
+            f"the target is {distance:.0f} m away, and nothing in the frame is farther than"
+            f" {farthest:.1f} m"
+        )
+        raise ObservationError(
+            f"{what}: is the pose in millimetres, or are target and pose of different worlds?"
+        )
     refuse_depth_scale(frame, last, target, radius)
 
 
-def refuse_depth_scale(frame: Frame, last: Frame | None, target: Float | None, radius: float) -> None:
+def refuse_depth_scale(
+    frame: Frame, last: Frame | None, target: Float | None, radius: float
+) -> None:
     """Refuse depth that is some times too large, as 16 bits in steps of less than a millimetre are.
 
     Either all that is seen lies behind the target, at so many times its distance. Or the frame and
@@ -73,7 +106,9 @@ def refuse_depth_scale(frame: Frame, last: Frame | None, target: Float | None, r
     if not times:
         return
     steps = f"its steps look like {1 / times:.3g} mm" if frame.counted else "is it in another unit?"
-    hint = ", and uint16 is taken for millimetres: hand it in as float metres" if frame.counted else ""
+    hint = (
+        ", and uint16 is taken for millimetres: hand it in as float metres" if frame.counted else ""
+    )
     raise ObservationError(f"the depth is {times:g} times too large: {steps}{hint}")
 
 
@@ -84,7 +119,8 @@ def _times_behind(frame: Frame, target: Float, radius: float) -> float:
     if z <= 0:
         return 0.0
     k, (height, width) = frame.intrinsics, frame.shape
-    column, row = int(k[0, 0] * x / z + k[0, 2]), int(k[1, 1] * y / z + k[1, 2])
+    column = int(k[0, 0] * x / z + k[0, 2])
+    row = int(k[1, 1] * y / z + k[1, 2])
     if not (0 <= column < width and 0 <= row < height):
         return 0.0
     few = frame.depth[::4, ::4]
@@ -99,7 +135,9 @@ def _times_behind(frame: Frame, target: Float, radius: float) -> float:
 
 
 def _times_too_large(frame: Frame, last: Frame) -> float:
-    """How many times smaller the depth of two frames has to be for them to agree; 0 if they do, or never."""
+    """How many times smaller the depth of two frames has to be for them to agree; 0 if they do,
+    or never.
+    """
     as_given, share = _agreeing(last, frame, 1.0)
     if as_given >= FEWEST_SHARED and share > HALF_AGREES:
         return 0.0
@@ -110,17 +148,22 @@ def _times_too_large(frame: Frame, last: Frame) -> float:
 
 
 def _agreeing(first: Frame, second: Frame, scale: float) -> tuple[int, float]:
-    """How many points of a frame another one confirms, and their share of those that it confirms or sees through."""
+    """How many points of a frame another one confirms, and their share of those that it confirms
+    or sees through.
+    """
     step = max(1, int(np.sqrt(first.depth.size / SAMPLE)))
     rows, columns = np.nonzero(first.depth[::step, ::step])
     points = scale * first.positions_in_camera(step * rows, step * columns)
-    there, here = second.camera_to_world, first.camera_to_world
+    there = second.camera_to_world
+    here = first.camera_to_world
     points = (points @ here[:3, :3].T + here[:3, 3] - there[:3, 3]) @ there[:3, :3]
     points = points[points[:, 2] > 1e-3]
     k, (height, width) = second.intrinsics, second.shape
     column, row = (points[:, i] / points[:, 2] * k[i, i] + k[i, 2] for i in (0, 1))
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    row, column, z = row[inside].astype(int), column[inside].astype(int), points[inside, 2]
+    row = row[inside].astype(int)
+    column = column[inside].astype(int)
+    z = points[inside, 2]
     seen = scale * second.depth[row, column]
     confirmed = int(((seen > 0) & (np.abs(seen - z) < CHANGED * z)).sum())
     seen_through = int((seen > (1 + CHANGED) * z).sum())
@@ -132,49 +175,81 @@ def check_frame(frame: Frame) -> list[ViewWarning]:
     found, (height, width), k = [], frame.shape, frame.intrinsics
     off = max(abs(2 * k[0, 2] / width - 1), abs(2 * k[1, 2] / height - 1))
     if off > OFF_CENTRE:
-        message = f"the principal point ({k[0, 2]:.0f}, {k[1, 2]:.0f}) is far from the middle of an image of {width} x "
-        message += f"{height}: intrinsics of another resolution, unless the image is a part of a larger one"
+        message = (
+            f"the principal point ({k[0, 2]:.0f}, {k[1, 2]:.0f}) is far from the middle of an image"
+            f" of {width} x "
+        )
+        message += (
+            f"{height}: intrinsics of another resolution, unless the image is a part of a"
+            " larger one"
+        )
         found.append(ViewWarning("intrinsics", message))
     seen = frame.depth[::4, ::4]
     middle = float(np.median(seen[seen > 0])) if seen.any() else 0.0
     if middle > FAR_DEPTH:
-        found.append(ViewWarning("unit", f"the depth has a median of {middle:.0f} m: is it in inches or feet?"))
+        found.append(
+            ViewWarning(
+                "unit", f"the depth has a median of {middle:.0f} m: is it in inches or feet?"
+            )
+        )
     origin = float(np.linalg.norm(frame.camera_to_world[:3, 3]))
     if origin > max(FAR_ORIGIN, 20 * middle):
-        message = f"the camera is {origin:.0f} m from the world's origin, and sees {middle:.2g} m far: is the"
+        message = (
+            f"the camera is {origin:.0f} m from the world's origin, and sees {middle:.2g} m far:"
+            " is the"
+        )
         found.append(ViewWarning("far origin", message + " pose in millimetres?"))
     return found
 
 
 def check_point(aside: Float, radius: float) -> list[ViewWarning]:
-    """Whether what was found is far from the point that asked for it, by so much, metres, (2,); usually not."""
+    """Whether what was found is far from the point that asked for it, by so much, metres, (2,);
+    usually not.
+    """
     distance = float(np.linalg.norm(aside))
     if distance <= ASIDE * radius:
         return []
-    message = f"the thing nearest to the point is {distance:.2g} m away from it, of {radius:.2g} m radius"
-    return [ViewWarning("point", f"{message}: is the point of another world, or what stands there out of view?")]
+    message = (
+        f"the thing nearest to the point is {distance:.2g} m away from it, of {radius:.2g} m radius"
+    )
+    return [
+        ViewWarning(
+            "point", f"{message}: is the point of another world, or what stands there out of view?"
+        )
+    ]
 
 
 def check_pose_moved(frame: Frame, last: Frame) -> list[ViewWarning]:
     """Whether the picture changed since the last frame though the pose did not; usually not."""
-    if frame.shape != last.shape or np.abs(frame.camera_to_world - last.camera_to_world).max() > STILL:
+    if (
+        frame.shape != last.shape
+        or np.abs(frame.camera_to_world - last.camera_to_world).max() > STILL
+    ):
         return []
     now, then = (f.depth[::4, ::4] for f in (frame, last))
     both = (now > 0) & (then > 0)
     if not both.any() or np.mean(np.abs(now - then)[both] > CHANGED * now[both]) <= CHANGED_SHARE:
         return []
-    return [ViewWarning("stale pose", "the picture changed, the pose did not: an old pose, or a moved object?")]
+    return [
+        ViewWarning(
+            "stale pose", "the picture changed, the pose did not: an old pose, or a moved object?"
+        )
+    ]
 
 
 def check_observation(observation: Observation) -> list[ViewWarning]:
     """What is likely to be wrong with an observation; usually nothing.
 
-    The object fills most of the unit sphere about the origin and nothing of it is outside. Where that is not so, the
-    usual mistake without which it would be so is named.
+    The object fills most of the unit sphere about the origin and nothing of it is outside. Where
+    that is not so, the usual mistake without which it would be so is named.
     """
-    seen, pose = np.flatnonzero(observation.depth), np.asarray(observation.pose, np.float64)
+    seen = np.flatnonzero(observation.depth)
+    pose = np.asarray(observation.pose, np.float64)
     if len(seen) < FEWEST:
-        message = f"only {len(seen)} pixels have a depth: is the object in the picture, and the depth in object radii?"
+        message = (
+            f"only {len(seen)} pixels have a depth: is the object in the picture, and the depth in"
+            " object radii?"
+        )
         return [ViewWarning("nothing seen", message)]
     points = _surface(observation, seen)
     return [] if _plausible(points, pose) else [ViewWarning(*_diagnose(points, pose))]
@@ -183,12 +258,17 @@ def check_observation(observation: Observation) -> list[ViewWarning]:
 def _surface(observation: Observation, seen: NDArray[np.int64]) -> Float:
     """Some of the surface that pixels, by index, show, (N, 3), camera frame."""
     rows, columns = np.divmod(seen[:: max(1, len(seen) // SAMPLE)], observation.depth.shape[1])
-    k, z = observation.intrinsics, observation.depth[rows, columns].astype(np.float64)
-    return np.stack([(columns + 0.5 - k[0, 2]) / k[0, 0] * z, (rows + 0.5 - k[1, 2]) / k[1, 1] * z, z], 1)
+    k = observation.intrinsics
+    z = observation.depth[rows, columns].astype(np.float64)
+    return np.stack(
+        [(columns + 0.5 - k[0, 2]) / k[0, 0] * z, (rows + 0.5 - k[1, 2]) / k[1, 1] * z, z], 1
+    )
 
 
 def _reach(points: Float, pose: Float) -> float:
-    """How far from the origin the outermost points are, but for two in a hundred that a sensor may have made up."""
+    """How far from the origin the outermost points are, but for two in a hundred that a sensor
+    may have made up.
+    """
     squares = ((points @ pose[:3, :3].T + pose[:3, 3]) ** 2).sum(1)
     rank = int(0.98 * (len(squares) - 1))
     return float(np.sqrt(np.partition(squares, rank)[rank]))
@@ -200,51 +280,83 @@ def _plausible(points: Float, pose: Float) -> bool:
 
 def _diagnose(points: Float, pose: Float) -> tuple[str, str]:
     """Name and message of the mistake without which the points would lie in the unit sphere."""
-    reach, distance = _reach(points, pose), float(np.linalg.norm(pose[:3, 3]))
+    reach = _reach(points, pose)
+    distance = float(np.linalg.norm(pose[:3, 3]))
     if reach < INNERMOST:
         what = f"all that is seen lies within {reach:.2g} object radii of the object's centre"
-        return "scale", f"{what}: lengths in metres? Divide depth and camera position by the object radius"
-    for name, said in (("opengl", "OpenGL's (x right, y up, z backward)"), ("ros", "a ROS body's (x forward, z up)")):
+        return (
+            "scale",
+            f"{what}: lengths in metres? Divide depth and camera position by the object radius",
+        )
+    for name, said in (
+        ("opengl", "OpenGL's (x right, y up, z backward)"),
+        ("ros", "a ROS body's (x forward, z up)"),
+    ):
         turned = pose.copy()
         turned[:3, :3] = pose[:3, :3] @ AXES[name]
         if _plausible(points, turned):
-            wrong = f"the camera's axes are {said}, OpenCV's (x right, y down, z forward) are expected"
+            wrong = (
+                f"the camera's axes are {said}, OpenCV's (x right, y down, z forward) are expected"
+            )
             return f"{name} axes", f"the view looks away from the object: {wrong}"
     if _plausible(points, np.asarray(np.linalg.inv(pose), np.float64)):
-        return "inverse pose", "the pose is inverse: camera-to-world is expected, this is world-to-camera"
+        return (
+            "inverse pose",
+            "the pose is inverse: camera-to-world is expected, this is world-to-camera",
+        )
     middle = float(np.median(np.linalg.norm(points, axis=1)))
     factor = distance / middle if middle > 0 else 1.0
     for scale in factor * np.array([1, 0.9, 0.8, 1.1, 1.2]):
         scaled = pose.copy()
         scaled[:3, 3] /= scale
         if _plausible(points * scale, pose) or _plausible(points, scaled):
-            unfit = f"depth and the camera's distance of {distance:.2g} do not fit, by a factor of {scale:.2g}"
+            unfit = (
+                f"depth and the camera's distance of {distance:.2g} do not fit, by a factor of"
+                f" {scale:.2g}"
+            )
             return "scale", f"{unfit}: is one in metres? Both are expected in object radii"
-    what = f"the surface that is seen reaches {reach:.2g} object radii from the object's centre, more than 1"
-    return "outside", f"{what}: a wrong pose, centre or radius, or more in the picture than the object?"
+    what = (
+        f"the surface that is seen reaches {reach:.2g} object radii from the object's centre, more"
+        " than 1"
+    )
+    return (
+        "outside",
+        f"{what}: a wrong pose, centre or radius, or more in the picture than the object?",
+    )
 
 
 def check_views(first: Observation, second: Observation) -> list[ViewWarning]:
-    """Whether one of two views of an object looks through a surface that the other saw; usually not."""
+    """Whether one of two views of an object looks through a surface that the other saw; usually
+    not.
+    """
     share = max(_seen_through(first, second), _seen_through(second, first))
     if share < CONTRADICTION:
         return []
-    message = f"two views contradict each other: {share:.0%} of the surface that one saw is missing in the other: a "
+    message = (
+        f"two views contradict each other: {share:.0%} of the surface that one saw is missing in"
+        " the other: a "
+    )
     return [ViewWarning("contradiction", message + "wrong pose, or the object has moved")]
 
 
 def _seen_through(first: Observation, second: Observation) -> float:
-    """Share of the surface in the first view, within the second's picture, through which the second looks.
+    """Share of the surface in the first view, within the second's picture, through which the second
+    looks.
 
-    Where all that the second camera saw is known, it has to have measured something behind: a hole is no contradiction.
+    Where all that the second camera saw is known, it has to have measured something behind: a hole
+    is no contradiction.
     """
     seen = np.flatnonzero(first.depth)
     if len(seen) == 0 or not second.depth.any():
         return 0.0
     scene = second.scene
-    depth, pose, k = second.depth, second.pose, second.intrinsics
+    depth = second.depth
+    pose = second.pose
+    k = second.intrinsics
     if scene is not None:
-        depth, pose, k = np.where(scene.depth > 0, scene.depth, -np.inf), scene.pose, scene.intrinsics
+        depth = np.where(scene.depth > 0, scene.depth, -np.inf)
+        pose = scene.pose
+        k = scene.intrinsics
     points = _surface(first, seen) @ first.pose[:3, :3].T + first.pose[:3, 3]
     points = (points - pose[:3, 3]) @ pose[:3, :3]
     points = points[points[:, 2] > 0.1]
@@ -254,10 +366,14 @@ def _seen_through(first: Observation, second: Observation) -> float:
     at = points[:, :2] / points[:, 2:] * k[[0, 1], [0, 1]] + k[:2, 2]
     column, row = np.floor(at).astype(np.int64).T
     margin = max(2, width // 50) if scene is None else 2  # what the object frame may be off
-    inside = (column >= margin) & (column < width - margin) & (row >= margin) & (row < height - margin)
+    inside = (
+        (column >= margin) & (column < width - margin) & (row >= margin) & (row < height - margin)
+    )
     if not inside.any():
         return 0.0
-    column, row, away = column[inside], row[inside], points[inside, 2]
+    column = column[inside]
+    row = row[inside]
+    away = points[inside, 2]
     missing = np.ones(len(away), bool)
     for dy in (-margin, 0, margin):
         for dx in (-margin, 0, margin):

@@ -14,21 +14,28 @@ from nextview.sensing.object_frame import Box
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-TRIALS = 200  # planes that are tried: with one point in ten on the plane, 0.8 of all draws hit it at least once
-TILT = np.cos(np.radians(12.0))  # cosine of the lean of a support plane, at most: errors of a calibration
-LEAST = 0.04  # share of what is seen that lies on a support plane, at least; more if gravity is not known
+# planes that are tried: with one point in ten on the plane, 0.8 of all draws hit it at least once
+TRIALS = 200
+# cosine of the lean of a support plane, at most: errors of a calibration
+TILT = np.cos(np.radians(12.0))
+# share of what is seen that lies on a support plane, at least; more if gravity is not known
+LEAST = 0.04
 LEAST_ALONE = 0.15
-RANGE = 1.05  # times as much of a frame lies on a plane as range, if it is range: narrow lenses hardly bend one
+# times as much of a frame lies on a plane as range, if it is range: narrow lenses hardly bend one
+RANGE = 1.05
 SAMPLES = 1500  # blocks of pixels in which planes are searched
 LARGE_SIDE = 8  # pixels across such a block from which on every second one is looked at
 STEEP_LAG = 2  # samples between two that tell how steep a surface is
 STEEP_RISE = 0.7  # rise of a steep surface, as a part of the way
-MOST_ALONE = 4.0  # times by which the mean over a block is more exact than a pixel, at most: the lens errs, too
+# times by which the mean over a block is more exact than a pixel, at most: the lens errs, too
+MOST_ALONE = 4.0
 
 
 @dataclass(frozen=True)
 class Samples:
-    """A grid of points of a frame, world, metres, with the distance from a plane up to which each is on it."""
+    """A grid of points of a frame, world, metres, with the distance from a plane up to which
+    each is on it.
+    """
 
     points: Float
     tolerance: Float
@@ -38,14 +45,21 @@ class Samples:
 
     def some(self, which: NDArray[np.bool_]) -> "Samples":
         """Those of a choice, (N,) bool."""
-        return Samples(self.points[which], self.tolerance[which], self.rows[which], self.columns[which], self.camera)
+        return Samples(
+            self.points[which],
+            self.tolerance[which],
+            self.rows[which],
+            self.columns[which],
+            self.camera,
+        )
 
 
 def sample(frame: Frame, pixels: NDArray[np.bool_], noise: Noise) -> Samples:
     """What blocks of the given pixels, (H, W) bool, which all have a depth, show in the mean.
 
-    The mean inverse depth of some pixels of a plane is that at the mean of their places in the picture, with less noise
-    than that of one. A block is left out where fewer than half of its pixels are given.
+    The mean inverse depth of some pixels of a plane is that at the mean of their places in the
+    picture, with less noise than that of one. A block is left out where fewer than half of its
+    pixels are given.
     """
     step = 1
     side = max(1, int(np.sqrt(np.count_nonzero(pixels) / SAMPLES)))
@@ -68,12 +82,15 @@ def sample(frame: Frame, pixels: NDArray[np.bool_], noise: Noise) -> Samples:
     pose = frame.camera_to_world
     points = (np.stack([x, y, np.ones(len(z))], 1) * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
     erring_together = max(1.0, (2 * noise.grain + 1) / step)  # pixels across
-    alone = np.clip(np.sqrt(count) / erring_together, 1, MOST_ALONE)  # root of how many err for themselves
+    # root of how many err for themselves
+    alone = np.clip(np.sqrt(count) / erring_together, 1, MOST_ALONE)
     return Samples(points, 3 * noise.at(z) * z**2 / alone + 0.003 * z, rows, columns, pose[:3, 3])
 
 
 def _block_sums(values: NDArray[np.floating], side: int) -> Float:
-    """Sums over squares of so many pixels; what is left over at the right and at the bottom is left out."""
+    """Sums over squares of so many pixels; what is left over at the right and at the bottom is
+    left out.
+    """
     height, width = (n // side for n in values.shape)
     rows = values[: height * side].reshape(height, side, -1).sum(1)
     return np.asarray(rows[:, : width * side].reshape(height, width, side).sum(2), np.float64)
@@ -81,7 +98,9 @@ def _block_sums(values: NDArray[np.floating], side: int) -> Float:
 
 @dataclass(frozen=True)
 class Plane:
-    """Positions p with ``normal @ p + offset`` = 0, normal of unit length; above it that is the height in metres."""
+    """Positions p with ``normal @ p + offset`` = 0, normal of unit length; above it that is the
+    height in metres.
+    """
 
     normal: Float
     offset: float
@@ -95,7 +114,9 @@ class Plane:
         return np.abs(self.height(samples.points)) < samples.tolerance
 
     def extent(self, samples: Samples) -> Float:
-        """The samples on it, (M, 3), connected with most of them in the picture: no wall at its height."""
+        """The samples on it, (M, 3), connected with most of them in the picture: no wall at its
+        height.
+        """
         on = self.holds(samples)
         if not on.any():
             return samples.points[on]
@@ -106,7 +127,9 @@ class Plane:
 
 
 def steep(samples: Samples, up: Float) -> Mask:
-    """Which samples lie on a surface that rises steeply, by what is seen above or below them in the picture."""
+    """Which samples lie on a surface that rises steeply, by what is seen above or below them in
+    the picture.
+    """
     upright = np.zeros(len(samples.points), bool)
     if not len(upright):
         return upright
@@ -121,11 +144,14 @@ def steep(samples: Samples, up: Float) -> Mask:
     return upright
 
 
-def find_plane(samples: Samples, rng: Generator, up: Float | None = None, above: Float | None = None) -> Plane | None:
-    """The plane with most samples on it, by RANSAC (Fischler and Bolles 1981), with all trials in one product.
+def find_plane(
+    samples: Samples, rng: Generator, up: Float | None = None, above: Float | None = None
+) -> Plane | None:
+    """The plane with most samples on it, by RANSAC (Fischler and Bolles 1981), with all trials in
+    one product.
 
-    The camera and a point ``above``, (3,), lie above it, and it is level against ``up``, (3,), where these are given.
-    None if too few samples lie on any.
+    The camera and a point ``above``, (3,), lie above it, and it is level against ``up``, (3,),
+    where these are given. None if too few samples lie on any.
     """
     points = samples.points
     if len(points) < 10:
@@ -133,18 +159,22 @@ def find_plane(samples: Samples, rng: Generator, up: Float | None = None, above:
     a, b, c = points[rng.integers(len(points), size=(3, TRIALS))]
     normals = np.cross(b - a, c - a)
     if up is not None:
-        normals[::2] = up  # one point is enough where the direction is known; the triples find what leans a little
+        # one point is enough where the direction is known; the triples find what leans a little
+        normals[::2] = up
     length = np.linalg.norm(normals, axis=1)
-    normals, through = normals[length > 0] / length[length > 0, None], a[length > 0]
+    normals = normals[length > 0] / length[length > 0, None]
+    through = a[length > 0]
     offsets = -(normals * through).sum(1)
     turn = np.where((normals @ samples.camera + offsets if up is None else normals @ up) < 0, -1, 1)
-    normals, offsets = normals * turn[:, None], offsets * turn
+    normals = normals * turn[:, None]
+    offsets = offsets * turn
     fits = normals @ samples.camera + offsets > 0
     if up is not None:
         fits &= normals @ up > TILT
     if above is not None:
         fits &= normals @ above + offsets > np.median(samples.tolerance)
-    normals, offsets = normals[fits], offsets[fits]
+    normals = normals[fits]
+    offsets = offsets[fits]
     if len(normals) == 0:
         return None
     # From the camera on, so that half as many digits are enough.
@@ -154,12 +184,19 @@ def find_plane(samples: Samples, rng: Generator, up: Float | None = None, above:
     best = int(count.argmax())
     plane = refine_plane(Plane(normals[best], float(offsets[best])), samples)
     level = up is None or plane.normal @ up > TILT
-    return plane if level and plane.holds(samples).mean() > (LEAST_ALONE if up is None else LEAST) else None
+    return (
+        plane
+        if level and plane.holds(samples).mean() > (LEAST_ALONE if up is None else LEAST)
+        else None
+    )
 
 
 def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:
-    """The plane of least squares through the samples within ``loose`` tolerances of one, if ten are; three times."""
-    points, tolerance = samples.points, loose * samples.tolerance
+    """The plane of least squares through the samples within ``loose`` tolerances of one, if ten
+    are; three times.
+    """
+    points = samples.points
+    tolerance = loose * samples.tolerance
     for _ in range(3):
         on = np.abs(plane.height(points)) < tolerance
         if on.sum() < 10:
@@ -174,18 +211,28 @@ def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:
 
 
 def lies_better_as_range(
-    frame: Frame, plane: Plane | None, samples: Samples, rng: Generator, up: Float | None, above: Float | None = None
+    frame: Frame,
+    plane: Plane | None,
+    samples: Samples,
+    rng: Generator,
+    up: Float | None,
+    above: Float | None = None,
 ) -> bool:
-    """Whether more of a frame lies on a plane if its depth is taken for the distance along each ray."""
+    """Whether more of a frame lies on a plane if its depth is taken for the distance along each
+    ray.
+    """
     along = samples.points - samples.camera
     depth = along @ frame.camera_to_world[:3, 2]
-    nearer = replace(samples, points=samples.camera + along * (depth / np.linalg.norm(along, axis=1))[:, None])
+    nearer = replace(
+        samples, points=samples.camera + along * (depth / np.linalg.norm(along, axis=1))[:, None]
+    )
     other = find_plane(nearer, deepcopy(rng), up, above)
     usual = 0.0 if plane is None else float(plane.holds(samples).mean())
     if other is None or other.holds(nearer).mean() <= RANGE * usual:
         return False
 
-    # Two planes of one room may be found: each is refined for both readings of the depth, so that like is compared.
+    # Two planes of one room may be found: each is refined for both readings of the depth, so that
+    # like is compared.
     share = held = 0.0
     for found, its_samples in ((plane, samples), (other, nearer)):
         if found is None:
@@ -204,10 +251,12 @@ def _share_held(samples: Samples, on: NDArray[np.bool_], normal: Float) -> float
 
 
 def mistake_in_pose(plane: Plane, pose: Float, up: Float) -> str | None:
-    """The mistake in a camera-to-world pose, (4, 4), without which the largest plane in view would be level; or None.
+    """The mistake in a camera-to-world pose, (4, 4), without which the largest plane in view would
+    be level; or None.
 
-    Floors and tables are level and walls upright. A plane that leans in between points to a wrong pose; so does one
-    that is level but lies over the camera. Of a wall nothing is said: seen from the side it would pass for a floor.
+    Floors and tables are level and walls upright. A plane that leans in between points to a wrong
+    pose; so does one that is level but lies over the camera. Of a wall nothing is said: seen from
+    the side it would pass for a floor.
     """
     if plane.normal @ up > TILT or abs(plane.normal @ up) < np.sqrt(1 - TILT**2):
         return None
@@ -232,19 +281,25 @@ def inside_box(frame: Frame, box: Box) -> Mask:
 
 def inside_sphere(frame: Frame, centre: Float, radius: float, part: Part = WHOLE) -> Mask:
     """Pixels whose position lies in a sphere, (H, W) bool; or those of a part of the frame."""
-    x, y, z = (frame.along(axis, float(-at), part) for axis, at in zip(np.eye(3), centre, strict=True))
+    x, y, z = (
+        frame.along(axis, float(-at), part) for axis, at in zip(np.eye(3), centre, strict=True)
+    )
     return (frame.depth[part] > 0) & (x * x + y * y + z * z < radius**2)
 
 
 def above_plane(frame: Frame, plane: Plane, noise: Noise, part: Part = WHOLE) -> Mask:
-    """Pixels that are higher above a plane than the noise of the frame explains, (H, W) bool; or those of a part."""
-    depth, height = frame.depth[part], frame.along(plane.normal, plane.offset, part)
+    """Pixels that are higher above a plane than the noise of the frame explains, (H, W) bool; or
+    those of a part.
+    """
+    depth = frame.depth[part]
+    height = frame.along(plane.normal, plane.offset, part)
     least = np.float32(0.003) * depth
     high = (height > least) & (depth > 0)
 
     # Noise moves a point along its ray: it rises by so much as the ray does.
     a, b, c = (frame.camera_to_world[:3, :3].T @ plane.normal).astype(np.float32)
-    x, y = frame.rays[0][part[1]], frame.rays[1][part[0]]
+    x = frame.rays[0][part[1]]
+    y = frame.rays[1][part[0]]
     most_noise = 4 * float(noise.sigmas.max(initial=0.0))
     steepest = float(np.abs(a) * np.abs(x).max() + np.abs(b) * np.abs(y).max() + np.abs(c))
     unsure = height < least + np.float32(most_noise * steepest) * depth**2

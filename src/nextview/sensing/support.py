@@ -1,7 +1,8 @@
 """Which of the level planes in a frame the object stands on: the floor, the table, or a shelf.
 
-The largest level plane is not always the support. A monitor stands on a desk that shows less of itself than the floor;
-the mattress of a bed, or the seat of a sofa, is a level plane too, and a part of the object.
+The largest level plane is not always the support. A monitor stands on a desk that shows less of
+itself than the floor; the mattress of a bed, or the seat of a sofa, is a level plane too, and a
+part of the object.
 """
 
 from __future__ import annotations
@@ -24,20 +25,31 @@ Mask = NDArray[np.bool_]
 LEAST_SHARE = 0.03  # share of all samples on a further level plane, at least
 MOST_PLANES = 5
 HEIGHTS_TRIED = 300
-PARALLEL = np.cos(np.radians(3.0))  # cosine of the angle up to which two planes are parallel, but for noise
-GROUND_WIDTH = 1.5  # distances of the camera from what it is aimed at: no object is so wide, so the plane is no part
-AIM = 0.12  # picture widths between the optical axis and what stands on a plane, at most, if the camera is aimed at it
-POINT_ASIDE = 0.08  # distances of the camera between the object's point and what stands on a plane, at most
+# cosine of the angle up to which two planes are parallel, but for noise
+PARALLEL = np.cos(np.radians(3.0))
+# distances of the camera from what it is aimed at: no object is so wide, so the plane is no part
+GROUND_WIDTH = 1.5
+# picture widths between the optical axis and what stands on a plane, at most, if the camera is
+# aimed at it
+AIM = 0.12
+# distances of the camera between the object's point and what stands on a plane, at most
+POINT_ASIDE = 0.08
 LARGEST_SHARE = 0.25  # area, seen from above, of what stands on a plane, as a part of the plane's
-WELL_INSIDE = 0.85  # what stands on a plane has its middle in the plane's outline, drawn together to so much of it
-LARGE_PART = 0.2  # samples of a part of a level surface, of those of its largest part: smaller ones are scraps
+# what stands on a plane has its middle in the plane's outline, drawn together to so much of it
+WELL_INSIDE = 0.85
+# samples of a part of a level surface, of those of its largest part: smaller ones are scraps
+LARGE_PART = 0.2
 LOWEST_THING = 0.015  # height of what stands on a plane, as a part of its distance, at least
 GROUND_STEP = 0.25  # the same of a level surface: at a grazing angle its samples lie far apart
-TOLD_APART = 0.5  # tolerance of samples that tell a plane from the next one, as a part of the height between them
-SURFACE_STEP = 0.04  # neighbouring samples of one surface differ by at most this part of their depth, and noise
+# tolerance of samples that tell a plane from the next one, as a part of the height between them
+TOLD_APART = 0.5
+# neighbouring samples of one surface differ by at most this part of their depth, and noise
+SURFACE_STEP = 0.04
 BOTTOM_SHARE = 0.04  # share of a mask's points that may lie lower than its bottom: noise
-BOTTOM_MARGIN = 0.02  # height over a plane of the bottom of what stands on it, as a part of the distance
-BOTTOM_ASIDE = 0.08  # from there, to the side, to where the plane is seen, at most, as a part of the distance
+# height over a plane of the bottom of what stands on it, as a part of the distance
+BOTTOM_MARGIN = 0.02
+# from there, to the side, to where the plane is seen, at most, as a part of the distance
+BOTTOM_ASIDE = 0.08
 
 
 def level_planes(samples: Samples, first: Plane) -> list[Plane]:
@@ -77,7 +89,8 @@ def _only(chosen: Index, count: int) -> Mask:
 
 
 def under_points(samples: Samples, planes: list[Plane], points: Float) -> Plane | None:
-    """The highest of some planes that is seen beside the bottom of an object, whose surface shows some points, (N, 3).
+    """The highest of some planes that is seen beside the bottom of an object, whose surface shows
+    some points, (N, 3).
 
     None where no plane is seen there: the bottom is hidden, or the object hangs in the air.
     """
@@ -118,13 +131,17 @@ class Target:
             pixels = np.hypot(samples.rows - self.axis[0], samples.columns - self.axis[1])
             return np.asarray(pixels / (AIM * self.width))
         aside = _in_plane(samples.points, plane) - _in_plane(self.place[None], plane)
-        return np.asarray(np.linalg.norm(aside, axis=1) / (POINT_ASIDE * np.linalg.norm(self.place - samples.camera)))
+        return np.asarray(
+            np.linalg.norm(aside, axis=1)
+            / (POINT_ASIDE * np.linalg.norm(self.place - samples.camera))
+        )
 
 
 def aimed_at(samples: Samples, planes: list[Plane], in_the_way: Mask, target: Target) -> Plane:
     """The support plane of what the camera is aimed at, or of what stands at a place.
 
-    From the highest plane down, the first is taken that carries something there; the lowest where none does.
+    From the highest plane down, the first is taken that carries something there; the lowest where
+    none does.
 
     Args:
         samples: of the frame.
@@ -134,14 +151,18 @@ def aimed_at(samples: Samples, planes: list[Plane], in_the_way: Mask, target: Ta
     """
     level = ~in_the_way & ~steep(samples, planes[0].normal)
     for plane, lower in pairwise(planes):
-        exact = samples.tolerance < TOLD_APART * np.abs(lower.height(samples.points) - plane.height(samples.points))
+        exact = samples.tolerance < TOLD_APART * np.abs(
+            lower.height(samples.points) - plane.height(samples.points)
+        )
         if _carries(samples, plane, level & exact, ~in_the_way, target):
             return plane
     return planes[-1]
 
 
 def _carries(samples: Samples, plane: Plane, level: Mask, free: Mask, target: Target) -> bool:
-    """Whether a plane carries what the camera is aimed at, or what stands at a place; it is no part of it."""
+    """Whether a plane carries what the camera is aimed at, or what stands at a place; it is no
+    part of it.
+    """
     on = plane.holds(samples) & level
     if on.sum() < 3:
         return False
@@ -149,7 +170,9 @@ def _carries(samples: Samples, plane: Plane, level: Mask, free: Mask, target: Ta
     surface = _surfaces(samples, on, GROUND_STEP)
     size = np.bincount(surface, on)
     large = on & (size[surface] > LARGE_PART * size.max())
-    ground = _in_plane(samples.points[surface == surface[np.where(large, off, np.inf).argmin()]], plane)
+    ground = _in_plane(
+        samples.points[surface == surface[np.where(large, off, np.inf).argmin()]], plane
+    )
     try:
         outline = ConvexHull(ground)
     except (QhullError, ValueError):  # too few points, or all in a line
@@ -158,18 +181,24 @@ def _carries(samples: Samples, plane: Plane, level: Mask, free: Mask, target: Ta
     nearest = samples.points[off.argmin()] if target.place is None else target.place
     away = float(np.linalg.norm(nearest - samples.camera))
     wide = bool(np.linalg.norm(np.ptp(ground[outline.vertices], 0)) > GROUND_WIDTH * away)
-    if target.place is not None and plane.height(target.place) < (-1 if wide else 1) * np.median(samples.tolerance):
+    if target.place is not None and plane.height(target.place) < (-1 if wide else 1) * np.median(
+        samples.tolerance
+    ):
         return False
 
     above = (plane.height(samples.points) > samples.tolerance) & free
     thing = _thing_there(samples, above, off)
     if thing is None or plane.height(samples.points[thing]).max() < LOWEST_THING * away:
         return wide
-    return _stands_within(samples, plane, thing, outline) and not _goes_on_below(samples, plane, thing)
+    return _stands_within(samples, plane, thing, outline) and not _goes_on_below(
+        samples, plane, thing
+    )
 
 
 def _thing_there(samples: Samples, above: Mask, off: Float) -> Index | None:
-    """The samples of the surface above a plane that is nearest to where the object is looked for; None if none is."""
+    """The samples of the surface above a plane that is nearest to where the object is looked
+    for; None if none is.
+    """
     if not above.any():
         return None
     group = _surfaces(samples, above)
@@ -179,7 +208,8 @@ def _thing_there(samples: Samples, above: Mask, off: Float) -> Index | None:
 
 
 def _surfaces(samples: Samples, chosen: Mask, step: float = SURFACE_STEP) -> Index:
-    """The number of the surface of each chosen sample, (N,), 0 for others: of one are neighbours in the grid.
+    """The number of the surface of each chosen sample, (N,), 0 for others: of one are neighbours in
+    the grid.
 
     Their depths differ by at most so large a part, and noise.
     """
@@ -190,7 +220,8 @@ def _surfaces(samples: Samples, chosen: Mask, step: float = SURFACE_STEP) -> Ind
     links = []
     for down, right in ((0, 1), (1, 0)):
         other = grid[samples.rows[at] + down, samples.columns[at] + right]
-        one, other = at[other >= 0], other[other >= 0]
+        one = at[other >= 0]
+        other = other[other >= 0]
         limit = step * depth[one] + samples.tolerance[one]
         joined = np.abs(depth[one] - depth[other]) < limit
         links.append(np.stack([one[joined], other[joined]]))
@@ -198,7 +229,9 @@ def _surfaces(samples: Samples, chosen: Mask, step: float = SURFACE_STEP) -> Ind
 
 
 def _components(count: int, links: Index, nodes: Index) -> Index:
-    """The connected component of some of ``count`` nodes, (count,), 1 and more; 0 for the others."""
+    """The connected component of some of ``count`` nodes, (count,), 1 and more; 0 for the
+    others.
+    """
     graph = coo_array((np.ones(links.shape[1], bool), (links[0], links[1])), shape=(count, count))
     group = np.zeros(count, np.int64)
     group[nodes] = connected_components(graph, directed=False)[1][nodes] + 1
@@ -206,7 +239,9 @@ def _components(count: int, links: Index, nodes: Index) -> Index:
 
 
 def _stands_within(samples: Samples, plane: Plane, thing: Index, outline: ConvexHull) -> bool:
-    """Whether a thing covers a smaller part of the plane, away from its outline: no back of a sofa on its seat."""
+    """Whether a thing covers a smaller part of the plane, away from its outline: no back of a
+    sofa on its seat.
+    """
     shown = _in_plane(samples.points[thing], plane)
     middle = outline.points[outline.vertices].mean(0)
     centre = middle + (np.median(shown, 0) - middle) / WELL_INSIDE
@@ -225,7 +260,8 @@ def _goes_on_below(samples: Samples, plane: Plane, thing: Index) -> bool:
     grid = np.full((samples.rows.max() + 2, samples.columns.max() + 1), -1)
     grid[samples.rows, samples.columns] = np.arange(len(height))
     beneath = grid[samples.rows[thing] + 1, samples.columns[thing]]
-    one, other = thing[beneath >= 0], beneath[beneath >= 0]
+    one = thing[beneath >= 0]
+    other = beneath[beneath >= 0]
     same = np.abs(depth[one] - depth[other]) < SURFACE_STEP * depth[one] + samples.tolerance[one]
     on = np.abs(height[other]) < samples.tolerance[other]
     below = (height[other] < -samples.tolerance[other]) & same

@@ -1,8 +1,9 @@
 """Walls of a room: upright planes that end the scene and are no part of any object.
 
-A wall is found among what rises above the support plane. Seen from above an upright plane is a line, so the search is
-a RANSAC for lines (Fischler and Bolles 1981). An object has upright sides, too: a wall is wider than an object,
-goes on to the edge of the picture, and has next to nothing behind it.
+A wall is found among what rises above the support plane. Seen from above an upright plane is a
+line, so the search is a RANSAC for lines (Fischler and Bolles 1981). An object has upright sides,
+too: a wall is wider than an object, goes on to the edge of the picture, and has next to nothing
+behind it.
 """
 
 from __future__ import annotations
@@ -26,20 +27,28 @@ MOST_LINES = 6  # upright planes that are looked at, the largest first
 FEWEST_SAMPLES = 0.02  # share of all samples that lie on a wall, at least
 WIDE = 1.5  # metres: an upright plane that reaches a side of the picture and is as wide is a wall
 WIDEST = 3.0  # metres: no object is so wide
-WIDE_SHARE = 0.8  # share of the columns of the picture over which a narrower wall extends, from side to side
+# share of the columns of the picture over which a narrower wall extends, from side to side
+WIDE_SHARE = 0.8
 SIDE_CELLS = 1  # columns of the grid of samples that count as the side of the picture
-MOST_BEHIND = 0.1  # samples behind a wall, as a part of those on it, at most: flying pixels and doors ajar
+# samples behind a wall, as a part of those on it, at most: flying pixels and doors ajar
+MOST_BEHIND = 0.1
 PARALLEL = np.cos(np.radians(25.0))  # cosine of the angle up to which two walls are parallel
 COARSE_WIDTH = 320  # columns of the picture in which pixels are compared with walls
-MEAN_SIDE = 3  # pixels of that picture across the square over which the distance from a wall is averaged
+# pixels of that picture across the square over which the distance from a wall is averaged
+MEAN_SIDE = 3
 WALL_NOISE = 2.0  # standard deviations of one pixel up to which a mean is on the wall
-WALL_ERROR = 0.006  # distance from a wall up to which a pixel is on it without noise, as a part of its depth
-CAMERA_BEHIND = 0.1  # how far behind a wall noise may put the camera, as a part of the distance of what it sees
-CORNER_GAP = 0.05  # from the next wall to a sample of a wall that meets it, as a part of its distance, at most
+# distance from a wall up to which a pixel is on it without noise, as a part of its depth
+WALL_ERROR = 0.006
+# how far behind a wall noise may put the camera, as a part of the distance of what it sees
+CAMERA_BEHIND = 0.1
+# from the next wall to a sample of a wall that meets it, as a part of its distance, at most
+CORNER_GAP = 0.05
 NEAREST_TO_PLACE = 0.02  # metres that the place of an object lies before a wall, at least
 
 
-def find_walls(samples: Samples, plane: Plane, rng: Generator, place: Float | None = None) -> list[Plane]:
+def find_walls(
+    samples: Samples, plane: Plane, rng: Generator, place: Float | None = None
+) -> list[Plane]:
     """Find the walls in a frame, as planes whose normals point into the room.
 
     Args:
@@ -78,8 +87,9 @@ def find_walls(samples: Samples, plane: Plane, rng: Generator, place: Float | No
 def before_walls(frame: Frame, walls: Sequence[Plane], noise: Noise) -> Mask:
     """Pixels that are farther before every wall than the noise of the frame explains, (H, W) bool.
 
-    At some metres the noise of a pixel is as deep as a thing that stands against the wall. So what counts is the mean
-    over the pixels around each, in a coarser picture; beside a thing that is off the wall, and the pixel is not.
+    At some metres the noise of a pixel is as deep as a thing that stands against the wall. So what
+    counts is the mean over the pixels around each, in a coarser picture; beside a thing that is off
+    the wall, and the pixel is not.
     """
     if not walls:
         return np.ones(frame.shape, bool)
@@ -103,9 +113,14 @@ def before_walls(frame: Frame, walls: Sequence[Plane], noise: Noise) -> Mask:
     return np.repeat(np.repeat(before, step, 0), step, 1)[: frame.shape[0], : frame.shape[1]]
 
 
-def _largest_upright_plane(samples: Samples, chosen: NDArray[np.int64], up: Float, rng: Generator) -> Plane | None:
-    """The upright plane with most of the chosen samples on it, its normal to the side where most is seen."""
-    points, tolerance = samples.points[chosen], samples.tolerance[chosen]
+def _largest_upright_plane(
+    samples: Samples, chosen: NDArray[np.int64], up: Float, rng: Generator
+) -> Plane | None:
+    """The upright plane with most of the chosen samples on it, its normal to the side where most
+    is seen.
+    """
+    points = samples.points[chosen]
+    tolerance = samples.tolerance[chosen]
     one, other = points[rng.integers(len(points), size=(2, LINE_TRIALS))]
     normals = np.cross(other - one, up)
     length = np.linalg.norm(normals, axis=1)
@@ -118,7 +133,8 @@ def _largest_upright_plane(samples: Samples, chosen: NDArray[np.int64], up: Floa
     on = np.abs(points @ normals.T + offsets) < tolerance[:, None]
     best = int(on.sum(0).argmax())
     plane = _refined(points, tolerance, normals[best], on[:, best], up)
-    distance = plane.height(samples.points)  # a camera that looks along a wall may stand on either side by noise
+    # a camera that looks along a wall may stand on either side by noise
+    distance = plane.height(samples.points)
     off = np.abs(distance) > samples.tolerance
     facing = 1.0 if np.sign(distance[off]).sum() >= 0 else -1.0
     return Plane(facing * plane.normal, facing * plane.offset)
@@ -145,29 +161,39 @@ def _is_wall(
     walls: Sequence[Plane],
     place: Float | None,
 ) -> bool:
-    """Whether an upright plane with some samples on it is as wide as a wall and goes on to the picture's edge."""
+    """Whether an upright plane with some samples on it is as wide as a wall and goes on to the
+    picture's edge.
+    """
     if place is not None and upright.height(place) < NEAREST_TO_PLACE:
         return False
     away = float(np.median(np.linalg.norm(samples.points[on] - samples.camera, axis=1)))
     if upright.height(samples.camera) < -CAMERA_BEHIND * away:
         return False
 
-    first, last = samples.columns.min() + SIDE_CELLS, samples.columns.max() - SIDE_CELLS
+    first = samples.columns.min() + SIDE_CELLS
+    last = samples.columns.max() - SIDE_CELLS
     columns = samples.columns[on]
-    at_left, at_right = columns.min() <= first, columns.max() >= last
+    at_left = columns.min() <= first
+    at_right = columns.max() >= last
     along = samples.points[on] @ np.cross(up, upright.normal)
     width = float(np.ptp(along))
 
-    from_side_to_side = at_left and at_right and len(np.unique(columns)) >= WIDE_SHARE * (last - first)
+    from_side_to_side = (
+        at_left and at_right and len(np.unique(columns)) >= WIDE_SHARE * (last - first)
+    )
     to_the_top = samples.rows[on].min() <= samples.rows.min() + SIDE_CELLS
     gap = CORNER_GAP * away + float(np.median(samples.tolerance[on]))
-    in_corner = to_the_top and any((np.abs(wall.height(samples.points[on])) < gap).any() for wall in walls)
+    in_corner = to_the_top and any(
+        (np.abs(wall.height(samples.points[on])) < gap).any() for wall in walls
+    )
     wide = width > WIDE or in_corner
     return bool(width > WIDEST or (wide and (at_left or at_right)) or from_side_to_side)
 
 
 def _hides_much(samples: Samples, upright: Plane, walls: Sequence[Plane], many: int) -> bool:
-    """Whether much more is seen behind an upright plane than flying pixels, walls across it left out."""
+    """Whether much more is seen behind an upright plane than flying pixels, walls across it left
+    out.
+    """
     behind = upright.height(samples.points) < -2 * samples.tolerance
     for wall in walls:
         if abs(wall.normal @ upright.normal) < PARALLEL:

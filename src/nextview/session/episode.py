@@ -1,4 +1,7 @@
-"""The loop: observe, believe, stop or choose, move. One for a robot and for a hundred thousand replays."""
+"""The loop: observe, believe, stop or choose, move.
+
+One for a robot and for a hundred thousand replays.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,56 +21,89 @@ from nextview.recognition.protocol import JointBelief
 from nextview.sensing.expected_visibility import SeenScene, expected_visibility
 
 Float = NDArray[np.float64]
-VISITED = np.radians(6.0)  # views within this angle of where a camera stood count as visited: it saw what they show
+# views within this angle of where a camera stood count as visited: it saw what they show
+VISITED = np.radians(6.0)
 
 
 @dataclass(frozen=True)
 class Step:
-    """One view in the episodes that were still running, A of them."""
+    """One view in the episodes that were still running, A of them.
 
-    episodes: NDArray[np.int64]  # which ones, (A,)
-    views: NDArray[np.int64]  # the view taken, or the one nearest to where the camera stood, (A,)
+    Attributes:
+        episodes: which ones, (A,).
+        views: the view taken, or the one nearest to where the camera stood, (A,).
+        belief: fused after it, (A, classes).
+        enough: whether belief is enough to stop, (A,).
+        stopped: whether the episode ended here, (A,).
+        next_views: where it goes next, (A,); -1 where it ended.
+        total: sum of the log-evidence in it and before, (A, D), see ``belief.log_evidence_of``.
+        seen: views so far in which anything was seen, each by its weight, (A,), see
+            ``Calibration.weights``.
+        state: what the policy was shown of the episodes that go on; None where all ended.
+        joint: what all views so far say together, of each of the A episodes, None before anything
+            is seen; () where views are judged one by one.
+    """
+
+    episodes: NDArray[np.int64]
+    views: NDArray[np.int64]
     evidence: Evidence
-    belief: Float  # fused after it, (A, classes)
-    enough: NDArray[np.bool_]  # whether belief is enough to stop, (A,)
-    stopped: NDArray[np.bool_]  # whether the episode ended here, (A,)
-    next_views: NDArray[np.int64]  # where it goes next, (A,); -1 where it ended
-    total: Float  # sum of the log-evidence in it and before, (A, D), see ``belief.log_evidence_of``
-    seen: Float  # views so far in which anything was seen, each by its weight, (A,), see ``Calibration.weights``
-    state: EpisodeState | None = None  # what the policy was shown of the episodes that go on; None where all ended
-    # what all views so far say together, of each of the A episodes, None before anything is seen; () where views are
-    # judged one by one
+    belief: Float
+    enough: NDArray[np.bool_]
+    stopped: NDArray[np.bool_]
+    next_views: NDArray[np.int64]
+    total: Float
+    seen: Float
+    state: EpisodeState | None = None
     joint: tuple[JointBelief | None, ...] = ()
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How B episodes ended, (B,) each."""
+    """How B episodes ended, (B,) each.
 
-    answer: NDArray[np.int64]  # most believed class
-    confidence: Float  # its belief
+    Attributes:
+        answer: most believed class.
+        confidence: its belief.
+        confident: whether the threshold was reached; else no view was left.
+        travel: over the moves between these views, grid cells.
+        arc: the same in radians.
+        views: in order, (B, max views), -1 after the end.
+    """
+
+    answer: NDArray[np.int64]
+    confidence: Float
     n_views: NDArray[np.int64]
-    confident: NDArray[np.bool_]  # whether the threshold was reached; else no view was left
-    travel: Float  # over the moves between these views, grid cells
-    arc: Float  # the same in radians
-    views: NDArray[np.int64]  # in order, (B, max views), -1 after the end
+    confident: NDArray[np.bool_]
+    travel: Float
+    arc: Float
+    views: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Taken:
-    """A step that is not taken in yet, and what goes with it in its A episodes."""
+    """A step that is not taken in yet, and what goes with it in its A episodes.
+
+    Attributes:
+        counts: whether anything is seen in the view, (A,).
+        visited: views that count as visited after it, (A, V).
+        azimuth: of the cameras, radians, (A,).
+        places: where they stood so far, (A, step, 3); None where these are the views themselves.
+    """
 
     step: Step
-    counts: NDArray[np.bool_]  # whether anything is seen in the view, (A,)
-    visited: NDArray[np.bool_]  # views that count as visited after it, (A, V)
-    azimuth: Float  # of the cameras, radians, (A,)
-    places: Float | None  # where they stood so far, (A, step, 3); None where these are the views themselves
+    counts: NDArray[np.bool_]
+    visited: NDArray[np.bool_]
+    azimuth: Float
+    places: Float | None
 
 
-Visible = Callable[[EpisodeState], Float]  # expected share of the object that shows from each view, (B, V)
+# expected share of the object that shows from each view, (B, V)
+Visible = Callable[[EpisodeState], Float]
 Constrain = Callable[[EpisodeState], EpisodeState]  # with where robots can go, and what it costs
-Together = Callable[[Sequence[Observation], Float, int], JointBelief]  # see ``protocol.JudgesTogether.together``
-LookAhead = Callable[[Sequence[Observation], JointBelief], Any]  # see ``protocol.LooksAhead.outlook``
+# see ``protocol.JudgesTogether.together``
+Together = Callable[[Sequence[Observation], Float, int], JointBelief]
+# see ``protocol.LooksAhead.outlook``
+LookAhead = Callable[[Sequence[Observation], JointBelief], Any]
 
 
 def unconstrained(state: EpisodeState) -> EpisodeState:
@@ -76,40 +112,61 @@ def unconstrained(state: EpisodeState) -> EpisodeState:
 
 
 class Episodes:
-    """B episodes side by side. Give ``update`` what was seen from ``current``, until ``running`` is empty."""
+    """B episodes side by side.
+
+    Give ``update`` what was seen from ``current``, until ``running`` is empty.
+    """
 
     def __init__(
         self,
         sphere: Viewpoints,
         policy: Policy,  # chooses where to go
         starts: NDArray[np.int64],  # first view of each episode, (B,)
-        stopping: Stopping,  # when an episode ends; a sphere with fewer views than ``max_views`` ends it too
+        # when an episode ends; a sphere with fewer views than ``max_views`` ends it too
+        stopping: Stopping,
         rng: np.random.Generator,  # for policies that draw
-        calibration: Calibration = PLAIN_SUM,  # how far to trust the sum of the logits; fully by default
-        # for policies that need it; by default from the scenes in the observations, see ``SeenScene``
+        # how far to trust the sum of the logits; fully by default
+        calibration: Calibration = PLAIN_SUM,
+        # for policies that need it; by default from the scenes in the observations, see
+        # ``SeenScene``
         visibility: Visible | None = None,
-        together: Together | None = None,  # judges all views of an episode; by default their evidence is added up
-        outlook: LookAhead | None = None,  # what it foresees of other views, for policies that need it
+        # judges all views of an episode; by default their evidence is added up
+        together: Together | None = None,
+        # what it foresees of other views, for policies that need it
+        outlook: LookAhead | None = None,
     ) -> None:
-        self.sphere, self.policy, self.stopping, self.rng = sphere, policy, stopping, rng
-        self.calibration, self.visibility, self.together = calibration, visibility, together
+        self.sphere = sphere
+        self.policy = policy
+        self.stopping = stopping
+        self.rng = rng
+        self.calibration = calibration
+        self.visibility = visibility
+        self.together = together
         self.outlook = outlook
         self.running = np.arange(len(starts))
         self.current = np.array(starts, np.int64)
         if ((self.current < 0) | (self.current >= len(sphere))).any():
-            raise UsageError(f"a first view has to be one of the {len(sphere)} views, 0 to {len(sphere) - 1}")
+            raise UsageError(
+                f"a first view has to be one of the {len(sphere)} views, 0 to {len(sphere) - 1}"
+            )
         self.steps: list[Step] = []
         self._last: Taken | None = None
         self._scenes: dict[int, tuple[list[SceneView], SeenScene]] = {}
 
-    def update(self, evidence: Evidence, directions: Float | None = None, constrain: Constrain = unconstrained) -> Step:
+    def update(
+        self,
+        evidence: Evidence,
+        directions: Float | None = None,
+        constrain: Constrain = unconstrained,
+    ) -> Step:
         """Take in the evidence of one view in every running episode; stop or choose its next view.
 
-        A view in which nothing was seen is taken, but changes no belief and ends no episode as a confident one. Where
-        this raises, nothing is taken in: the same view can be handed in again. ``directions`` are unit vectors towards
-        where the cameras really stood, (A, 3), in all updates or in none; by default they stood at ``current``. The
-        nearest views then count as taken, those within VISITED as visited too, and azimuths and travel are measured
-        from the places. ``constrain`` is asked before the policy. An episode without a free view ends.
+        A view in which nothing was seen is taken, but changes no belief and ends no episode as a
+        confident one. Where this raises, nothing is taken in: the same view can be handed in again.
+        ``directions`` are unit vectors towards where the cameras really stood, (A, 3), in all
+        updates or in none; by default they stood at ``current``. The nearest views then count as
+        taken, those within VISITED as visited too, and azimuths and travel are measured from the
+        places. ``constrain`` is asked before the policy. An episode without a free view ends.
         """
         taken = self.next_step(evidence, directions, constrain)
         self.keep(taken)
@@ -127,7 +184,8 @@ class Episodes:
         No threshold stops on ``hold``, which is asked where belief is enough.
         """
         taken = self._taken(evidence, directions)
-        step, n_views = taken.step, len(self.steps) + 1
+        step = taken.step
+        n_views = len(self.steps) + 1
         enough = self.stopping.reached(step.belief, np.maximum(step.seen, 1)) & (step.seen > 0)
         enough &= not (enough.any() and hold(step))
         stopped = enough & taken.counts
@@ -146,9 +204,11 @@ class Episodes:
         directions: Float | None = None,
         joint: tuple[JointBelief | None, ...] | None = None,
     ) -> None:
-        """Take in a view after which it is known that the episodes went on: neither stop nor choose.
+        """Take in a view after which it is known that the episodes went on: neither stop nor
+        choose.
 
-        ``joint`` is what all views said together after it, where that is known: they are not judged once more.
+        ``joint`` is what all views said together after it, where that is known: they are not judged
+        once more.
         """
         self.keep(self._taken(evidence, directions, joint))
 
@@ -159,14 +219,18 @@ class Episodes:
         self._go(taken.step)
 
     def next_choice(self, constrain: Constrain = unconstrained) -> Step:
-        """Ask the policy once more where to go from here, for what ``constrain`` says has changed; see ``update``.
+        """Ask the policy once more where to go from here, for what ``constrain`` says has changed;
+        see ``update``.
 
-        Nothing is changed; ``keep_choice`` takes in the last step with other ``next_views``. Where no view is free any
-        more the episode ends.
+        Nothing is changed; ``keep_choice`` takes in the last step with other ``next_views``. Where
+        no view is free any more the episode ends.
         """
         if not self.steps or self.steps[-1].state is None or len(self.running) == 0:
-            raise SessionError("there is nothing to choose: no view was taken yet, or the episodes have ended")
-        step, before = self.steps[-1], self.steps[-1].state
+            raise SessionError(
+                "there is nothing to choose: no view was taken yet, or the episodes have ended"
+            )
+        step = self.steps[-1]
+        before = self.steps[-1].state
         state, chosen = self._move(before.select(np.isin(before.episodes, self.running)), constrain)
         next_views = np.full(len(step.episodes), -1)
         next_views[np.isin(step.episodes, self.running)] = chosen
@@ -184,10 +248,17 @@ class Episodes:
 
     def _state(self, taken: Taken, going: NDArray[np.bool_]) -> EpisodeState:
         """What the policy may see of the episodes that go on."""
-        step, needs, azimuth_bins, joint = taken.step, self.policy.needs, None, None
-        total, weighed, classes = step.total[going], np.maximum(step.seen, 1)[going], step.belief.shape[1]
+        step = taken.step
+        needs = self.policy.needs
+        azimuth_bins = None
+        joint = None
+        total = step.total[going]
+        weighed = np.maximum(step.seen, 1)[going]
+        classes = step.belief.shape[1]
         if "azimuth_bins" in needs:
-            azimuth_bins = self.calibration.azimuth_bins(total, weighed, classes, taken.azimuth[going])
+            azimuth_bins = self.calibration.azimuth_bins(
+                total, weighed, classes, taken.azimuth[going]
+            )
         if "joint" in needs:
             joint = self.calibration.joint(total, weighed, classes, taken.azimuth[going])
         state = EpisodeState(
@@ -200,10 +271,16 @@ class Episodes:
             azimuth_bins,
             places=None if taken.places is None else taken.places[going],
             joint=joint,
-            observations=self._observations(step, step.episodes[going]) if "observations" in needs else None,
+            observations=self._observations(step, step.episodes[going])
+            if "observations" in needs
+            else None,
             outlook=self.outlooks(step, going) if "outlook" in needs else None,
         )
-        return replace(state, visibility=self._visibility(step, state)) if "visibility" in needs else state
+        return (
+            replace(state, visibility=self._visibility(step, state))
+            if "visibility" in needs
+            else state
+        )
 
     def outlooks(self, step: Step, some: NDArray[np.bool_]) -> list[Any]:
         """What can be foreseen after a step in some of its episodes, None where that is nothing."""
@@ -226,40 +303,56 @@ class Episodes:
         """The next step, as if no episode ended and none moved on. Nothing is changed yet."""
         now = self.running
         if len(evidence.logits) != len(now):
-            raise UsageError(f"evidence of {len(evidence.logits)} views for {len(now)} running episodes")
+            raise UsageError(
+                f"evidence of {len(evidence.logits)} views for {len(now)} running episodes"
+            )
         evidence, seen = _without_unseen(evidence)
-        visited, earlier = np.zeros((len(now), len(self.sphere)), bool), []
-        before, counted = np.zeros((len(now), 1)), np.zeros(len(now))
+        visited = np.zeros((len(now), len(self.sphere)), bool)
+        earlier = []
+        before = np.zeros((len(now), 1))
+        counted = np.zeros(len(now))
         if self._last is not None:
-            last, going = self._last, ~self.steps[-1].stopped
-            visited, before, counted = last.visited[going], last.step.total[going], last.step.seen[going]
+            last = self._last
+            going = ~self.steps[-1].stopped
+            visited = last.visited[going]
+            before = last.step.total[going]
+            counted = last.step.seen[going]
             earlier = [] if last.places is None else [last.places[going]]
             if (directions is None) != (last.places is None):
                 raise UsageError("where the cameras stood is told of all views or of none")
-        views, azimuth, places = self.current[now], self.sphere.azimuth[self.current[now]], None
+        views = self.current[now]
+        azimuth = self.sphere.azimuth[self.current[now]]
+        places = None
         if directions is not None:
             arc = angle_between(directions[:, None], self.sphere.directions[None])
-            views, there = arc.argmin(1), arc.min(1) < SNAP
+            views = arc.argmin(1)
+            there = arc.min(1) < SNAP
             azimuth = np.where(there, self.sphere.azimuth[views], azimuth_of(directions))
             place = np.where(there[:, None], self.sphere.directions[views], directions)[:, None]
             places = np.concatenate([*earlier, place], 1)
             visited |= arc <= VISITED
         visited[np.arange(len(now)), views] = True
-        said = np.asarray(log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), np.float64)
-        total, counted = before + seen[:, None] * said, counted + seen
+        said = np.asarray(
+            log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), np.float64
+        )
+        total = before + seen[:, None] * said
+        counted = counted + seen
         # Before anything is seen the total is zero, whatever it is divided by.
         belief = self.calibration.belief(total, np.maximum(counted, 1), evidence.logits.shape[1])
-        no, nowhere = np.zeros(len(now), bool), np.full(len(now), -1)
+        no = np.zeros(len(now), bool)
+        nowhere = np.full(len(now), -1)
         step = Step(now, views, evidence, belief, no, no, nowhere, total, counted)
         if self.together is not None:
             step = self._judged(step, seen, joint or (None,) * len(now))
         return Taken(step, seen, visited, azimuth, places)
 
-    def _judged(self, step: Step, seen: NDArray[np.bool_], known: tuple[JointBelief | None, ...]) -> Step:
+    def _judged(
+        self, step: Step, seen: NDArray[np.bool_], known: tuple[JointBelief | None, ...]
+    ) -> Step:
         """The step with what all views so far say together, and the belief that follows.
 
-        ``seen`` says in which episodes anything is seen in this view, (A,), and ``known`` what is known already. Before
-        anything is seen the belief stays as it is.
+        ``seen`` says in which episodes anything is seen in this view, (A,), and ``known`` what is
+        known already. Before anything is seen the belief stays as it is.
         """
         assert self.together is not None
         before: dict[int, JointBelief | None] = {}
@@ -267,7 +360,8 @@ class Episodes:
             before = dict(zip(self.steps[-1].episodes.tolist(), self.steps[-1].joint, strict=True))
         taken = self._observations(step, step.episodes, counted=True) if seen.any() else []
 
-        joint, belief = list(known), step.belief.copy()
+        joint = list(known)
+        belief = step.belief.copy()
         for row, episode in enumerate(step.episodes.tolist()):
             if joint[row] is None and seen[row]:
                 joint[row] = self.together(taken[row], step.total[row], int(step.seen[row]))
@@ -284,24 +378,34 @@ class Episodes:
             return self.visibility(state)
         if any(step.evidence.observations is None for step in (*self.steps, last)):
             return np.ones(state.visited.shape)
-        positions, found = self.sphere.poses[:, :3, 3], []
-        for episode, views in zip(state.episodes, self._observations(last, state.episodes), strict=True):
+        positions = self.sphere.poses[:, :3, 3]
+        found = []
+        for episode, views in zip(
+            state.episodes, self._observations(last, state.episodes), strict=True
+        ):
             scenes = [seen.scene for seen in views if seen.scene is not None]
-            found.append(expected_visibility(self._seen_scene(int(episode), scenes), positions).expected)
+            found.append(
+                expected_visibility(self._seen_scene(int(episode), scenes), positions).expected
+            )
         return np.stack(found)
 
     def _seen_scene(self, episode: int, scenes: list[SceneView]) -> SeenScene:
         """What the frames of an episode say together; what all but the new ones say is kept."""
         known, seen = self._scenes.get(episode, ([], SeenScene.unseen()))
         if any(old is not new for old, new in zip(known, scenes, strict=False)):
-            known, seen = [], SeenScene.unseen()
+            known = []
+            seen = SeenScene.unseen()
         for scene in scenes[len(known) :]:
             seen = seen.seen(scene)
         self._scenes[episode] = scenes, seen
         return seen
 
-    def _observations(self, last: Step, episodes: NDArray[np.int64], counted: bool = False) -> list[list[Observation]]:
-        """All views so far of some episodes, the last step included; ``counted``: those that are evidence."""
+    def _observations(
+        self, last: Step, episodes: NDArray[np.int64], counted: bool = False
+    ) -> list[list[Observation]]:
+        """All views so far of some episodes, the last step included; ``counted``: those that are
+        evidence.
+        """
         found: dict[int, list[Observation]] = {int(episode): [] for episode in episodes}
         for step in (*self.steps, last):
             evidence = step.evidence
@@ -311,15 +415,20 @@ class Episodes:
             counts = np.ones(len(step.episodes), bool)
             if counted and evidence.seen is not None:
                 counts = evidence.seen
-            for episode, view, is_evidence in zip(step.episodes, evidence.observations, counts, strict=True):
+            for episode, view, is_evidence in zip(
+                step.episodes, evidence.observations, counts, strict=True
+            ):
                 if is_evidence and int(episode) in found:
                     found[int(episode)].append(view)
         return list(found.values())
 
-    def _move(self, state: EpisodeState, constrain: Constrain) -> tuple[EpisodeState, NDArray[np.int64]]:
+    def _move(
+        self, state: EpisodeState, constrain: Constrain
+    ) -> tuple[EpisodeState, NDArray[np.int64]]:
         """What the policy is shown, and where it goes, -1 where no view is free."""
         state = constrain(replace(state, reachable=None, travel=self._travel(state)))
-        chosen, free = np.full(len(state.current), -1), state.free.any(1)
+        chosen = np.full(len(state.current), -1)
+        free = state.free.any(1)
         if free.all():
             chosen = self._choose(state)
         elif free.any():
@@ -338,8 +447,13 @@ class Episodes:
         return np.where(there[:, None], self.sphere.travel[state.current], cells)
 
     def _choose(self, state: EpisodeState) -> NDArray[np.int64]:
-        """What the policy chooses, checked. If a view is out of reach it is asked again, as if it had been there."""
-        name, free, rows = self._name, state.free, np.arange(len(state.current))
+        """What the policy chooses, checked.
+
+        If a view is out of reach it is asked again, as if it had been there.
+        """
+        name = self._name
+        free = state.free
+        rows = np.arange(len(state.current))
         chosen = self._ask(state)
         barred = ~free[rows, chosen] & ~state.visited[rows, chosen]
         if barred.any():
@@ -348,7 +462,8 @@ class Episodes:
             chosen[barred] = self._ask(replace(some, visited=~some.free))
         wrong = ~free[rows, chosen]
         if wrong.any():
-            view, where = int(chosen[wrong][0]), int(state.episodes[wrong][0])
+            view = int(chosen[wrong][0])
+            where = int(state.episodes[wrong][0])
             why = "was visited before" if state.visited[wrong][0, view] else "cannot be reached"
             raise PolicyError(f"policy {name} chose view {view}, which {why}", where)
         return chosen
@@ -356,18 +471,26 @@ class Episodes:
     def _ask(self, state: EpisodeState) -> NDArray[np.int64]:
         """What the policy answers: views of the sphere, whichever."""
         name = self._name
-        with plugin_errors(lambda said: PolicyError(f"policy {name} raised {said}", self._first_to_fail(state))):
+        with plugin_errors(
+            lambda said: PolicyError(f"policy {name} raised {said}", self._first_to_fail(state))
+        ):
             chosen = np.asarray(self.policy.next_views(state, self.rng))
         if chosen.shape != state.current.shape or not np.issubdtype(chosen.dtype, np.integer):
-            raise PolicyError(f"policy {name} has to return {len(state.current)} integers, one for each episode")
+            raise PolicyError(
+                f"policy {name} has to return {len(state.current)} integers, one for each episode"
+            )
         if (off := (chosen < 0) | (chosen >= len(self.sphere))).any():
             where = int(state.episodes[off][0])
-            raise PolicyError(f"policy {name} chose view {chosen[off][0]}, which is not on the sphere", where)
+            raise PolicyError(
+                f"policy {name} chose view {chosen[off][0]}, which is not on the sphere", where
+            )
         return chosen
 
     @property
     def _name(self) -> str:
-        return type(self.policy.policy if isinstance(self.policy, OffGrid) else self.policy).__name__
+        return type(
+            self.policy.policy if isinstance(self.policy, OffGrid) else self.policy
+        ).__name__
 
     def _first_to_fail(self, state: EpisodeState) -> int | None:
         """The first episode for which the policy raises even if asked for it alone."""
@@ -385,16 +508,22 @@ class Episodes:
         if len(self.running):
             raise SessionError("the episodes are still running")
         b = len(self.current)
-        views, confident = np.full((b, len(self.steps)), -1), np.zeros(b, bool)
-        answer, n_views, confidence = np.zeros(b, np.int64), np.zeros(b, np.int64), np.zeros(b)
+        views = np.full((b, len(self.steps)), -1)
+        confident = np.zeros(b, bool)
+        answer = np.zeros(b, np.int64)
+        n_views = np.zeros(b, np.int64)
+        confidence = np.zeros(b)
         for k, step in enumerate(self.steps):
             views[step.episodes, k] = step.views
             answer[step.episodes] = step.belief.argmax(1)
             confidence[step.episodes] = step.belief.max(1)
             n_views[step.episodes] = k + 1
             confident[step.episodes] = step.enough
-        moved, legs = views[:, 1:] >= 0, (views[:, :-1], views[:, 1:])
-        travel, arc = ((ways[legs] * moved).sum(1) for ways in (self.sphere.travel, self.sphere.arc))
+        moved = views[:, 1:] >= 0
+        legs = (views[:, :-1], views[:, 1:])
+        travel, arc = (
+            (ways[legs] * moved).sum(1) for ways in (self.sphere.travel, self.sphere.arc)
+        )
         return Outcome(answer, confidence, n_views, confident, travel, arc, views)
 
 
@@ -427,5 +556,7 @@ def run_episodes(
     """Run episodes to their end."""
     episodes = Episodes(sphere, policy, starts, stopping, rng, calibration, visibility)
     while len(episodes.running):
-        episodes.update(observe(episodes.running, episodes.current[episodes.running]), constrain=constrain)
+        episodes.update(
+            observe(episodes.running, episodes.current[episodes.running]), constrain=constrain
+        )
     return episodes

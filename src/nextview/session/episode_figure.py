@@ -1,4 +1,6 @@
-"""A picture of one episode: what was seen, what was believed, what the policy decided by, and the path."""
+"""A picture of one episode: what was seen, what was believed, what the policy decided by, and
+the path.
+"""
 
 import itertools
 from collections.abc import Sequence
@@ -24,17 +26,30 @@ from nextview.session.soft_light import SoftLight
 from nextview.session.style import ACCENT, BLUE, FAINT, GREY, INK, PAPER, STYLE, PlainFigure
 from nextview.session.view import View
 
-WIDE, GAP, LARGE = 2.2, 0.3, 6.0  # inches: of a column, between two, and of the large picture at most
+# inches: of a column, between two, and of the large picture at most
+WIDE = 2.2
+GAP = 0.3
+LARGE = 6.0
 SHOWN = 4  # classes
 FIGURE_FORMATS = (".png", ".pdf", ".svg")
-RING, RIM = "#cdbfa6", "#a8977a"  # of the dome: its lines, its candidate views
+# of the dome: its lines, its candidate views
+RING = "#cdbfa6"
+RIM = "#a8977a"
 VALUES = LinearSegmentedColormap.from_list("value", ["#f1e9da", "#9cc3dc", BLUE])
-DOME, AWAY = 1.35, 10.0  # how far from the object its candidate views are drawn, and the eye is, object radii
-NUMBER: dict[str, Any] = {"ha": "center", "va": "center_baseline", "color": "white", "weight": "bold"}
+# how far from the object its candidate views are drawn, and the eye is, object radii
+DOME = 1.35
+AWAY = 10.0
+NUMBER: dict[str, Any] = {
+    "ha": "center",
+    "va": "center_baseline",
+    "color": "white",
+    "weight": "bold",
+}
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure into a PNG, PDF or SVG file, whole or not at all; one of that name is replaced.
+    """Write a figure into a PNG, PDF or SVG file, whole or not at all; one of that name is
+    replaced.
 
     Raises:
         UsageError: it is another format.
@@ -49,7 +64,9 @@ def save_figure(figure: Figure, path: Path) -> None:
             raise UsageError(f"{path}: the figure cannot be written ({error})") from None
 
 
-@matplotlib.rc_context(STYLE | {"axes.grid": False, "figure.facecolor": PAPER, "axes.facecolor": PAPER})
+@matplotlib.rc_context(
+    STYLE | {"axes.grid": False, "figure.facecolor": PAPER, "axes.facecolor": PAPER}
+)
 def draw_episode(
     views: Sequence[View],
     classes: Sequence[str],
@@ -58,23 +75,29 @@ def draw_episode(
     heading: str,
     posed: Triangles | None = None,
 ) -> Figure:
-    """A column for each view (image, belief, what the policy valued the views at); beside them object and path.
+    """A column for each view (image, belief, what the policy valued the views at); beside them
+    object and path.
 
-    ``posed`` is a surface in the object frame and object radii whose outline is drawn over the images.
+    ``posed`` is a surface in the object frame and object radii whose outline is drawn over the
+    images.
     """
     valued = any(view.values is not None for view in views)
-    light, path = SoftLight([view.observation for view in views]), np.array([view.direction for view in views])
+    light = SoftLight([view.observation for view in views])
+    path = np.array([view.direction for view in views])
     seen_from = _best_side(path)
     rows = [("", WIDE), ("what it believes", 1.5), ("values of views", WIDE)]
     rows = rows if valued else rows[:2]
     large = LARGE if valued else LARGE - 1
     width = GAP + len(views) * (WIDE + GAP) + large + GAP
     said, _, more = heading.rpartition(" (") if heading.endswith(")") else (heading, "", "")
-    said, more = fill(said, int(7.6 * width)), fill(more[:-1], int(11 * width))
+    said = fill(said, int(7.6 * width))
+    more = fill(more[:-1], int(11 * width))
     top = 0.42 + 0.27 * said.count("\n") + 0.24 * (more.count("\n") + 1)
     height = top + sum(0.42 + high for _, high in rows) + 0.2
     figure = PlainFigure(figsize=(width, height))
-    figure.text(GAP / width, 1 - 0.2 / height, said, fontsize=16, weight="bold", color=BLUE, va="top")
+    figure.text(
+        GAP / width, 1 - 0.2 / height, said, fontsize=16, weight="bold", color=BLUE, va="top"
+    )
     figure.text(GAP / width, 1 - (top - 0.08) / height, more, fontsize=10, color=GREY, va="bottom")
     shown = np.argsort(-np.max([view.belief for view in views], axis=0), kind="stable")[:SHOWN]
 
@@ -100,17 +123,22 @@ def draw_episode(
             else:
                 _draw_values(axis, views[: k + 1], sphere, seen_from)
     x = GAP + len(views) * (WIDE + GAP)
-    figure.text(x / width, (height - top - 0.32) / height, "where it looked from", fontsize=10, color=GREY)
+    figure.text(
+        x / width, (height - top - 0.32) / height, "where it looked from", fontsize=10, color=GREY
+    )
     _draw_path(axes(x, y, large, height - top - 0.42 - y), path, sphere, light, seen_from)
     return figure
 
 
 def _best_side(path: NDArray[np.float64]) -> float:
-    """The azimuth, radians, from which the way is seen best: before the eye, its places apart, and not straight on."""
+    """The azimuth, radians, from which the way is seen best: before the eye, its places apart,
+    and not straight on.
+    """
     found = []
     for azimuth in np.radians(np.arange(20, 380, 45)):
         pose = look_at_origin(np.radians(25), azimuth, AWAY)
-        facing, flat = path @ pose[:3, 3] / AWAY, path @ pose[:3, :2]
+        facing = path @ pose[:3, 3] / AWAY
+        flat = path @ pose[:3, :2]
         apart = [float(np.linalg.norm(a - b)) for a, b in itertools.combinations(flat, 2)]
         found.append((min([*apart, 0.6]) - ((facing - 0.8) ** 2).mean(), azimuth))
     return float(max(found)[1])
@@ -119,16 +147,29 @@ def _best_side(path: NDArray[np.float64]) -> float:
 def _draw_image(axis: Axes, view: View, step: int, light: SoftLight) -> None:
     """The object as this view shows it: by its picture if a camera took one, else by its depth."""
     seen, (elevation, azimuth) = view.observation, view.angles
-    times = 1 if seen.image is not None and not seen.exact else max(1, round(400 / max(seen.depth.shape)))
+    times = (
+        1
+        if seen.image is not None and not seen.exact
+        else max(1, round(400 / max(seen.depth.shape)))
+    )
     height, width = seen.depth.shape
     larger = seen.intrinsics * [[times], [times], [1]]
-    pixels, _ = light.picture([light.surfaces[step - 1]], seen.pose, larger, (times * height, times * width))
+    pixels, _ = light.picture(
+        [light.surfaces[step - 1]], seen.pose, larger, (times * height, times * width)
+    )
     if times == 1 and seen.image is not None:
         taken = seen.image[..., None] / 255 * (255, 250, 240)
         pixels = np.where(seen.depth[..., None] > 0, taken, pixels).astype(np.uint8)
     axis.imshow(pixels, interpolation="antialiased")
     inside: dict[str, Any] = {"transform": axis.transAxes, "fontsize": 9}
-    axis.text(0.05, 1.08, str(step), **inside, **NUMBER, bbox={"boxstyle": "circle,pad=0.25", "color": BLUE})
+    axis.text(
+        0.05,
+        1.08,
+        str(step),
+        **inside,
+        **NUMBER,
+        bbox={"boxstyle": "circle,pad=0.25", "color": BLUE},
+    )
     where = f"view {view.index}: {elevation:.0f}° up, {round(azimuth) % 360}° around"
     axis.text(0.13, 1.08, where, va="center_baseline", color=INK, **inside)
     said = [] if seen.seen else ["nothing is seen"]
@@ -151,16 +192,28 @@ def _draw_outline(axis: Axes, view: View, posed: Triangles) -> None:
         axis.contour(shows, levels=[0.5], colors=[ACCENT], linewidths=1.3)
 
 
-def _draw_belief(axis: Axes, view: View, threshold: float, classes: Sequence[str], shown: NDArray[np.int64]) -> None:
+def _draw_belief(
+    axis: Axes, view: View, threshold: float, classes: Sequence[str], shown: NDArray[np.int64]
+) -> None:
     """Bars of the classes shown, with a mark where belief is enough."""
-    best, at = int(view.belief.argmax()), 0.015 + 0.97 * threshold
+    best = int(view.belief.argmax())
+    at = 0.015 + 0.97 * threshold
     for row, c in enumerate([*shown, *[best][: best not in shown]]):
-        share, colour = float(view.belief[c]), BLUE if c == best else GREY
-        axis.text(0, row - 0.22, shorten(classes[c].replace("_", " "), 26, placeholder="…"), fontsize=10)
+        share = float(view.belief[c])
+        colour = BLUE if c == best else GREY
+        axis.text(
+            0, row - 0.22, shorten(classes[c].replace("_", " "), 26, placeholder="…"), fontsize=10
+        )
         axis.text(1, row - 0.22, f"{100 * share:.0f} %", fontsize=10, ha="right")
         axis.plot([0.015, 0.985], [row, row], color=FAINT, linewidth=5, solid_capstyle="round")
         if share >= 0.005:
-            axis.plot([0.015, 0.015 + 0.97 * share], [row, row], color=colour, linewidth=5, solid_capstyle="round")
+            axis.plot(
+                [0.015, 0.015 + 0.97 * share],
+                [row, row],
+                color=colour,
+                linewidth=5,
+                solid_capstyle="round",
+            )
         if np.isfinite(threshold):
             axis.plot([at, at], [row - 0.14, row + 0.14], color=INK, linewidth=1.6)
     if np.isfinite(threshold):  # a rule of your own need not stop at a belief
@@ -170,40 +223,74 @@ def _draw_belief(axis: Axes, view: View, threshold: float, classes: Sequence[str
 
 
 def _draw_values(axis: Axes, views: Sequence[View], sphere: Viewpoints, seen_from: float) -> None:
-    """The dome of candidate views from above, by what the policy valued each at; the eye of the large picture below."""
-    view, turned = views[-1], sphere.azimuth - seen_from - np.pi / 2
+    """The dome of candidate views from above, by what the policy valued each at; the eye of the
+    large picture below.
+    """
+    view = views[-1]
+    turned = sphere.azimuth - seen_from - np.pi / 2
     out = 90 - np.degrees(sphere.elevation)
     values = np.full(len(sphere), np.nan) if view.values is None else view.values
     known = np.isfinite(values)
     low, high = (values[known].min(), values[known].max()) if known.any() else (0.0, 1.0)
-    colours = np.where(known[:, None], VALUES((values - low) / (high - low or 1)), to_rgba("#ece9e3"))
+    colours = np.where(
+        known[:, None], VALUES((values - low) / (high - low or 1)), to_rgba("#ece9e3")
+    )
     flat = np.stack([out * np.cos(turned), out * np.sin(turned)], 1)
     limit = max(97.0, float(out.max()) + 10)
     if isinstance(sphere, ViewSphere):
         rings = np.sort(90 - np.asarray(sphere.elevations, float))
         between = (rings[1:] + rings[:-1]) / 2
-        first, last = (between[0] - rings[0], rings[-1] - between[-1]) if len(rings) > 1 else (9.0, 9.0)
+        first, last = (
+            (between[0] - rings[0], rings[-1] - between[-1]) if len(rings) > 1 else (9.0, 9.0)
+        )
         edges = np.array([max(rings[0] - first, 0), *between, rings[-1] + last])
-        half, limit = 180 / sphere.azimuths, max(limit, edges[-1] + 2)
+        half = 180 / sphere.azimuths
+        limit = max(limit, edges[-1] + 2)
         for radius, angle, colour in zip(out, np.degrees(turned), colours, strict=True):
             inner, outer = edges[np.searchsorted(edges, radius) - 1 :][:2]
-            shape: dict[str, Any] = {"width": outer - inner, "facecolor": colour, "edgecolor": PAPER, "linewidth": 1.2}
+            shape: dict[str, Any] = {
+                "width": outer - inner,
+                "facecolor": colour,
+                "edgecolor": PAPER,
+                "linewidth": 1.2,
+            }
             axis.add_patch(Wedge((0, 0), outer, angle - half, angle + half, **shape))
     else:
-        axis.scatter(flat[:, 0], flat[:, 1], c=colours, s=float(np.clip(7000 / len(sphere), 6, 130)), edgecolor=PAPER)
+        axis.scatter(
+            flat[:, 0],
+            flat[:, 1],
+            c=colours,
+            s=float(np.clip(7000 / len(sphere), 6, 130)),
+            edgecolor=PAPER,
+        )
     for step, past in enumerate(views, 1):
-        axis.add_patch(Circle(flat[past.index], 8, facecolor=BLUE if past is view else GREY, edgecolor=PAPER))
+        axis.add_patch(
+            Circle(flat[past.index], 8, facecolor=BLUE if past is view else GREY, edgecolor=PAPER)
+        )
         axis.text(flat[past.index, 0], flat[past.index, 1], str(step), fontsize=8, **NUMBER)
     axis.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
     if view.next_view is None:
         axis.text(0, 1.05, "the last view", fontsize=10, color=GREY, transform=axis.transAxes)
         return
-    here, there = flat[view.index], flat[view.next_view]
+    here = flat[view.index]
+    there = flat[view.next_view]
     axis.add_patch(Circle(there, 8, facecolor=PAPER, edgecolor=ACCENT, linewidth=2.2))
     side = 1 if there[1] >= here[1] else -1
-    for name, at, colour, off in (("here", here, BLUE, -17 * side), ("next", there, ACCENT, 17 * side)):
-        axis.text(at[0], at[1] + off, name, fontsize=9, weight="bold", color=colour, ha="center", va="center",
-                  path_effects=[withStroke(linewidth=3, foreground=PAPER)])  # fmt: skip
+    for name, at, colour, off in (
+        ("here", here, BLUE, -17 * side),
+        ("next", there, ACCENT, 17 * side),
+    ):
+        axis.text(
+            at[0],
+            at[1] + off,
+            name,
+            fontsize=9,
+            weight="bold",
+            color=colour,
+            ha="center",
+            va="center",
+            path_effects=[withStroke(linewidth=3, foreground=PAPER)],
+        )
 
 
 def _draw_scale(axis: Axes) -> None:
@@ -214,23 +301,33 @@ def _draw_scale(axis: Axes) -> None:
     axis.text(0.75, 0.5, "high", fontsize=9, color=GREY, ha="left", va="center_baseline")
 
 
-def _draw_path(axis: Axes, path: NDArray[np.float64], sphere: Viewpoints, light: SoftLight, seen_from: float) -> None:
-    """The object, as far as it was seen, in the dome of candidate views, and the way over the dome."""
+def _draw_path(
+    axis: Axes, path: NDArray[np.float64], sphere: Viewpoints, light: SoftLight, seen_from: float
+) -> None:
+    """The object, as far as it was seen, in the dome of candidate views, and the way over the
+    dome.
+    """
     figure = axis.figure
     assert isinstance(figure, Figure)
-    wide, high = axis.get_position().width * figure.get_figwidth(), axis.get_position().height * figure.get_figheight()
+    wide = axis.get_position().width * figure.get_figwidth()
+    high = axis.get_position().height * figure.get_figheight()
     shape = round(130 * high), round(130 * wide)
-    pose, focal = look_at_origin(np.radians(25), seen_from, AWAY), 0.5 * AWAY / 1.5 * min(shape)
+    pose = look_at_origin(np.radians(25), seen_from, AWAY)
+    focal = 0.5 * AWAY / 1.5 * min(shape)
     intrinsics = np.array([[focal, 0, shape[1] / 2], [0, focal, 0.56 * shape[0]], [0, 0, 1.0]])
     pixels, far = light.picture(light.surfaces, pose, intrinsics, shape)
     axis.imshow(pixels, interpolation="antialiased", aspect="auto")
 
     def place(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pixels of points of the dome, and how plainly they are drawn there: behind the object or at the back less."""
+        """Pixels of points of the dome, and how plainly they are drawn there: behind the object
+        or at the back less.
+        """
         inside = (DOME * points - pose[:3, 3]) @ pose[:3, :3]
         flat = inside[:, :2] / inside[:, 2:] * focal + intrinsics[:2, 2]
         row, column = np.clip(flat[:, ::-1].astype(int), 0, np.array(shape) - 1).T
-        return flat, np.where(far[row, column] < inside[:, 2], 0.15, np.where(points @ pose[:3, 3] < 0, 0.45, 1.0))
+        return flat, np.where(
+            far[row, column] < inside[:, 2], 0.15, np.where(points @ pose[:3, 3] < 0, 0.45, 1.0)
+        )
 
     def line(points: NDArray[np.float64], colour: str, width: float) -> None:
         flat, plain = place(points)
@@ -244,7 +341,11 @@ def _draw_path(axis: Axes, path: NDArray[np.float64], sphere: Viewpoints, light:
         ring = [np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), 0 * around + np.sin(up)]
         line(np.stack(ring, 1), RING, 0.9)
     for turn in np.arange(8) * np.pi / 4:  # meridians
-        line(great_circle(np.array([np.cos(turn), np.sin(turn), 0]), np.array([0.0, 0, 1]), 61), RING, 0.5)
+        line(
+            great_circle(np.array([np.cos(turn), np.sin(turn), 0]), np.array([0.0, 0, 1]), 61),
+            RING,
+            0.5,
+        )
     flat, plain = place(sphere.directions)
     rims = [to_rgba(RIM, share) for share in plain]
     axis.scatter(flat[:, 0], flat[:, 1], s=22, color=PAPER, edgecolor=rims, linewidth=1.2, zorder=3)

@@ -1,4 +1,6 @@
-"""Fonts for names in any script: a figure takes those of this machine that have the characters of its texts."""
+"""Fonts for names in any script: a figure takes those of this machine that have the characters
+of its texts.
+"""
 
 import logging
 from collections.abc import Iterable
@@ -10,14 +12,16 @@ from matplotlib.text import Text
 
 log = logging.getLogger(__name__)
 NO_SCRIPT = ("Last Resort", "STIX", "cm")  # fonts of boxes, and of formulas
-INSTALL = "fonts-noto on Debian and Ubuntu, fonts-noto-cjk for Chinese, Japanese and Korean, has them"
+INSTALL = (
+    "fonts-noto on Debian and Ubuntu, fonts-noto-cjk for Chinese, Japanese and Korean, has them"
+)
 
 
 def fit_fonts(texts: Iterable[Text]) -> None:
     """Give each text the fonts that its characters need beside its own.
 
-    A character that no installed font has is written as its code, as in a terminal, and one line of the log says which
-    font to install.
+    A character that no installed font has is written as its code, as in a terminal, and one line of
+    the log says which font to install.
     """
     lacking: set[str] = set()
     for text in texts:
@@ -29,7 +33,9 @@ def fit_fonts(texts: Iterable[Text]) -> None:
         text.set_text("".join(_code(c) if c in without else c for c in text.get_text()))
         lacking |= without
     if lacking:
-        log.warning("no font of this machine has %s, drawn as codes: %s", "".join(sorted(lacking)), INSTALL)
+        log.warning(
+            "no font of this machine has %s, drawn as codes: %s", "".join(sorted(lacking)), INSTALL
+        )
 
 
 def _missing(written: str, path: str) -> set[str]:
@@ -56,7 +62,8 @@ def _fonts_for(missing: frozenset[str]) -> tuple[tuple[str, ...], frozenset[str]
     fonts = [font for font in fontManager.ttflist if not font.name.startswith(NO_SCRIPT)]
     fonts.sort(key=_plainness)
     while without:
-        best = max(fonts, key=lambda font: len(_held(font, without)), default=None)  # the plainest of equal ones
+        # the plainest of equal ones
+        best = max(fonts, key=lambda font: len(_held(font, without)), default=None)
         held = set() if best is None else _held(best, without)
         if best is None or not held:
             break

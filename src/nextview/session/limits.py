@@ -16,9 +16,13 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 LOWEST = 0.08
-"""Metres above the support plane: a camera on a wrist, its mount and the fingers beside it do not touch it."""
+"""Metres above the support plane: a camera on a wrist, its mount and the fingers beside it do
+not touch it.
+"""
 GRAZING = 0.1
-"""Height over the support plane in parts of the distance to the object, 6 degrees: from lower the plane is a line."""
+"""Height over the support plane in parts of the distance to the object, 6 degrees: from lower
+the plane is a line.
+"""
 HIGHEST = 2.0
 """Metres above the support plane that no camera of a robot reaches."""
 MOST_METRES = 10.0
@@ -35,18 +39,19 @@ BEHIND_WALL = "behind a wall"
 class Limits:
     """Where a camera may be sent. What is not given has a default that fits most robots.
 
-    The heights count from the support plane, where one is known. What the frames show as occupied is left out where
-    the object stands on a support plane; in a gripper or on a turntable (``ObservedObject(support=False)``) the room
-    moves against the object, so only a clearance that is given counts.
+    The heights count from the support plane, where one is known. What the frames show as occupied
+    is left out where the object stands on a support plane; in a gripper or on a turntable
+    (``ObservedObject(support=False)``) the room moves against the object, so only a clearance that
+    is given counts.
 
     Attributes:
-        min_height: of the camera above the support plane, metres, at least. By default 0.08, and a tenth of the
-            camera's distance from the object.
-        max_height: of the camera above the support plane, metres, at most; infinity for none. By default 2, or as
-            high as the camera has stood.
-        clearance: metres between the camera and any surface that the frames show, but for the object and the support
-            plane; views behind walls and behind other things are left out too. 0 leaves none of these out. By default
-            0.1.
+        min_height: of the camera above the support plane, metres, at least. By default 0.08, and a
+            tenth of the camera's distance from the object.
+        max_height: of the camera above the support plane, metres, at most; infinity for none. By
+            default 2, or as high as the camera has stood.
+        clearance: metres between the camera and any surface that the frames show, but for the
+            object and the support plane; views behind walls and behind other things are left out
+            too. 0 leaves none of these out. By default 0.1.
     """
 
     min_height: float | None = None
@@ -67,7 +72,9 @@ class Limits:
         """A camera may be sent everywhere."""
         return cls(min_height=-1e6, max_height=np.inf, clearance=0.0)
 
-    def reasons(self, poses: Float, object: "ObservedObject", surroundings: Sequence[Surroundings]) -> NDArray[np.str_]:
+    def reasons(
+        self, poses: Float, object: "ObservedObject", surroundings: Sequence[Surroundings]
+    ) -> NDArray[np.str_]:
         """Why each candidate is left out.
 
         Args:
@@ -76,7 +83,8 @@ class Limits:
             surroundings: what each frame of it shows.
 
         Returns:
-            (V,) of ``TOO_LOW``, ``TOO_HIGH``, ``TOO_NEAR``, ``HIDDEN``, ``BEHIND_WALL``, or "" where none applies.
+            (V,) of ``TOO_LOW``, ``TOO_HIGH``, ``TOO_NEAR``, ``HIDDEN``, ``BEHIND_WALL``, or ""
+            where none applies.
         """
         places = poses[:, :3, 3]
         found = np.full(len(poses), "", f"<U{len(TOO_NEAR)}")
@@ -101,7 +109,9 @@ class Limits:
     def _occupied(
         self, places: Float, object: "ObservedObject", surroundings: Sequence[Surroundings]
     ) -> list[tuple[str, NDArray[np.bool_]]]:
-        """Reasons by what the frames show, each with the places that it holds for; the last one counts most."""
+        """Reasons by what the frames show, each with the places that it holds for; the last one
+        counts most.
+        """
         clearance = self.clearance
         if clearance is None:
             clearance = CLEARANCE if object.support else 0.0
@@ -110,7 +120,10 @@ class Limits:
 
         nothing = np.zeros(len(places), bool)
         around = object.object_frame
-        walls, near, free, hidden = nothing, nothing, nothing, nothing
+        walls = nothing
+        near = nothing
+        free = nothing
+        hidden = nothing
         for shown in surroundings:
             for wall in shown.walls:
                 if not any(other.shows_behind(wall) for other in surroundings):

@@ -14,13 +14,14 @@ from nextview.policies.base import EpisodeState, travel_from
 
 Float = NDArray[np.float64]
 Reachable = NDArray[np.bool_] | Callable[[Float], bool]
-"""Which candidate views the camera can be brought to: (V,) bool; or a function of a pose of ``Session.poses``. What a
-masked array hides cannot be reached."""
+"""Which candidate views the camera can be brought to: (V,) bool; or a function of a pose of
+``Session.poses``. What a masked array hides cannot be reached."""
 TravelCost = Float | Callable[[Float, Float], float]
-"""What it costs to go from one view to another, in any unit: (V, V), row from, column to; or a function of two poses in
-the frame of ``Session.poses``, the first that where the camera stands. Infinity, or masked out, where there is no
-way."""
-Poses = Callable[[], Float]  # gives the candidate poses, (V, 4, 4); called only where a function has to be asked
+"""What it costs to go from one view to another, in any unit: (V, V), row from, column to; or a
+function of two poses in the frame of ``Session.poses``, the first that where the camera stands.
+Infinity, or masked out, where there is no way."""
+# gives the candidate poses, (V, 4, 4); called only where a function has to be asked
+Poses = Callable[[], Float]
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,12 @@ class Reach:
             there &= self.reachable[views]
         return there
 
-    def constrain(self, state: EpisodeState, sphere: Viewpoints, here: Float, poses: Poses) -> EpisodeState:
-        """The state of one episode with where the camera, which stands at ``here``, can go, and what that costs."""
+    def constrain(
+        self, state: EpisodeState, sphere: Viewpoints, here: Float, poses: Poses
+    ) -> EpisodeState:
+        """The state of one episode with where the camera, which stands at ``here``, can go, and
+        what that costs.
+        """
         views = np.flatnonzero(state.free[0])
         views = views[self.can_reach(views, poses)]
         if self.cost is not None:
@@ -52,7 +57,8 @@ class Reach:
                 cost = np.array(costs, np.float64)
             else:
                 cost = self.cost[state.current[0], views]
-            views, cost = views[cost < np.inf], cost[cost < np.inf]
+            views = views[cost < np.inf]
+            cost = cost[cost < np.inf]
             mean = cost.mean() if len(cost) else 0.0
             unit = travel_from(sphere, state)[0, views].mean() / mean if mean > 0 else 0.0
             cells = np.full(len(sphere), np.nan)
@@ -77,9 +83,14 @@ def _cost(answer: Any) -> float:
 
 
 def _truth(answer: Any) -> bool:
-    """What a function says of a pose. None is no answer: a function that forgets to return gives it."""
+    """What a function says of a pose.
+
+    None is no answer: a function that forgets to return gives it.
+    """
     if not isinstance(answer, bool | np.bool_ | int):
-        raise UsageError(f"whether a view can be reached is true or false, not {one_line(repr(answer))}")
+        raise UsageError(
+            f"whether a view can be reached is true or false, not {one_line(repr(answer))}"
+        )
     return bool(answer)
 
 
@@ -96,13 +107,19 @@ def as_reachable(given: ArrayLike | Callable[[Float], bool] | None, views: int) 
     return mask
 
 
-def as_travel_cost(given: ArrayLike | Callable[[Float, Float], float] | None, views: int) -> TravelCost | None:
+def as_travel_cost(
+    given: ArrayLike | Callable[[Float, Float], float] | None, views: int
+) -> TravelCost | None:
     """What a user hands in as travel cost."""
     if given is None or callable(given):
         return given
     costs = np.asarray(given)
-    if np.ma.isMaskedArray(given) and costs.dtype.kind in "fiu":  # for a way that is masked out no cost is known
+    # for a way that is masked out no cost is known
+    if np.ma.isMaskedArray(given) and costs.dtype.kind in "fiu":
         costs = np.ma.filled(np.ma.asarray(given, np.float64), np.inf)
     if costs.dtype.kind not in "fiu" or costs.shape != (views, views) or not (costs >= 0).all():
-        raise UsageError(f"a travel cost is a matrix, ({views}, {views}) of numbers from 0 on, or a callable on poses")
+        raise UsageError(
+            f"a travel cost is a matrix, ({views}, {views}) of numbers from 0 on, or a callable on"
+            " poses"
+        )
     return costs.astype(np.float64)

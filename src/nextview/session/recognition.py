@@ -11,7 +11,12 @@ from nextview.geometry.ray_caster import Triangles
 from nextview.geometry.viewsphere import Viewpoints
 from nextview.recognition.belief import Stopping
 from nextview.recognition.novelty import Quantiles, values_of
-from nextview.recognition.poses import PoseCandidate, PoseUncertainty, place_in_words, uncertainty_of
+from nextview.recognition.poses import (
+    PoseCandidate,
+    PoseUncertainty,
+    place_in_words,
+    uncertainty_of,
+)
 from nextview.recognition.protocol import JointBelief
 from nextview.session.pose_frame import PoseFrame, PoseFrameName
 from nextview.session.view import View
@@ -19,28 +24,45 @@ from nextview.session.view import View
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SUSPICIOUS = 5.0  # an object as novel as so many times the share that may be called unknown gets no confident answer
+# an object as novel as so many times the share that may be called unknown gets no confident answer
+SUSPICIOUS = 5.0
 
 
 @dataclass(frozen=True)
 class Recognition:
     """The end of an episode, or how it stands; before the first view nothing is seen.
 
-    It is confident where the threshold was reached in a view without warnings, by an object that is not suspiciously
-    novel (see ``SUSPICIOUS``) and may be of the class by its size, and fewer than half of the views contradict others.
+    It is confident where the threshold was reached in a view without warnings, by an object that is
+    not suspiciously novel (see ``SUSPICIOUS``) and may be of the class by its size, and fewer than
+    half of the views contradict others.
+
+    Attributes:
+        views: in order.
+        classes: their names.
+        confident: else the views ran out.
+        sphere: the candidates.
+        stopping: the rule that ended it.
+        stranded: whether it ended because no view that was left could be reached; then it is not
+            confident.
+        why_stranded: what became of the views that were left, as "30 too low, 9 failed"; "" if not
+            stranded.
+        score: gives the novelty of views; None if the recogniser has none.
+        unknown_rate: share of objects of known classes that may be called unknown; 0: none.
+        impossible: classes whose objects have not such a size.
+        poses_in: the frame in which poses are given.
     """
 
-    views: tuple[View, ...]  # in order
-    classes: tuple[str, ...]  # their names
-    confident: bool  # else the views ran out
-    sphere: Viewpoints  # the candidates
-    stopping: Stopping  # the rule that ended it
-    stranded: bool = False  # whether it ended because no view that was left could be reached; then it is not confident
-    why_stranded: str = ""  # what became of the views that were left, as "30 too low, 9 failed"; "" if not stranded
-    score: Quantiles | None = None  # gives the novelty of views; None if the recogniser has none
-    unknown_rate: float = 0.0  # share of objects of known classes that may be called unknown; 0: none
-    impossible: tuple[str, ...] = ()  # classes whose objects have not such a size
-    poses_in: PoseFrame = field(default_factory=PoseFrame, repr=False)  # the frame in which poses are given
+    views: tuple[View, ...]
+    classes: tuple[str, ...]
+    confident: bool
+    sphere: Viewpoints
+    stopping: Stopping
+    stranded: bool = False
+    why_stranded: str = ""
+    score: Quantiles | None = None
+    unknown_rate: float = 0.0
+    impossible: tuple[str, ...] = ()
+    poses_in: PoseFrame = field(default_factory=PoseFrame, repr=False)
 
     @property
     def seen(self) -> bool:
@@ -49,10 +71,12 @@ class Recognition:
 
     @property
     def novelty(self) -> float | None:
-        """Share of known objects that are at least as novel (a p-value); None if the recogniser has no score.
+        """Share of known objects that are at least as novel (a p-value); None if the recogniser has
+        no score.
 
-        It holds for objects seen as the known ones were; what is hidden of one is allowed for, see ``values_of``. Of
-        things that are known by their geometry it says how badly the likeliest one explains the depth.
+        It holds for objects seen as the known ones were; what is hidden of one is allowed for, see
+        ``values_of``. Of things that are known by their geometry it says how badly the likeliest
+        one explains the depth.
         """
         if self._explained is not None:
             return self._explained
@@ -63,7 +87,9 @@ class Recognition:
 
     @property
     def unknown(self) -> bool:
-        """Whether the object is called one of no known class: too novel, or of another size than the class believed."""
+        """Whether the object is called one of no known class: too novel, or of another size than
+        the class believed.
+        """
         if not self.unknown_rate or not self.seen:
             return False
         if self.novelty is not None and self.novelty < self.unknown_rate:
@@ -73,7 +99,9 @@ class Recognition:
 
     @property
     def none_of_them(self) -> str:
-        """The answer for an unknown object: ``none of the 10 classes it knows (most like a toilet)``."""
+        """The answer for an unknown object: ``none of the 10 classes it knows (most like a
+        toilet)``.
+        """
         a = "an" if str(self.most_like)[:1].lower() in "aeiou" else "a"
         return f"none of the {len(self.classes)} classes it knows (most like {a} {self.most_like})"
 
@@ -81,7 +109,10 @@ class Recognition:
     def why_unknown(self) -> str:
         """What an object is called unknown for, in words."""
         if self._explained is not None and self._joint_poses:
-            return f"{100 * self._explained:.2g} % of taught things are explained as badly by their scans"
+            return (
+                f"{100 * self._explained:.2g} % of taught things are explained as badly by their"
+                " scans"
+            )
         if self.most_like in self.impossible:
             return f"a radius of {self.radius:.2g} m is that of no {self.most_like}"
         return f"{100 * (self.novelty or 0):.2g} % of known objects are as novel"
@@ -104,32 +135,43 @@ class Recognition:
     @property
     def beliefs(self) -> dict[str, float]:
         """The belief in each class by its name, over all views; empty if nothing was seen."""
-        return dict(zip(self.classes, self.views[-1].belief.tolist(), strict=True)) if self.seen else {}
+        return (
+            dict(zip(self.classes, self.views[-1].belief.tolist(), strict=True))
+            if self.seen
+            else {}
+        )
 
     @property
     def radius(self) -> float | None:
-        """The object radius, metres, as it is known by now; None if the camera does not know its scale."""
+        """The object radius, metres, as it is known by now; None if the camera does not know its
+        scale.
+        """
         return self.views[-1].observation.radius if self.views else None
 
     @property
     def pose(self) -> NDArray[np.float64] | None:
-        """Where the object is: from the frame of its scan file (origin and axes) into ``pose_frame``, (4, 4), metres.
+        """Where the object is: from the frame of its scan file (origin and axes) into
+        ``pose_frame``, (4, 4), metres.
 
-        A point p of the scan, in metres, is at ``(pose @ [*p, 1])[:3]``. None where there is no answer, or its geometry
-        is not known: see ``why_no_pose``.
+        A point p of the scan, in metres, is at ``(pose @ [*p, 1])[:3]``. None where there is no
+        answer, or its geometry is not known: see ``why_no_pose``.
         """
         found = self._candidates_of_answer
         return found[0].pose if found else None
 
     @property
     def pose_of(self) -> str | None:
-        """Name of the thing whose scan ``pose`` is of: one of the things of the class that is the answer."""
+        """Name of the thing whose scan ``pose`` is of: one of the things of the class that is
+        the answer.
+        """
         found = self._candidates_of_answer
         return found[0].thing if found else None
 
     @property
     def place(self) -> NDArray[np.float64] | None:
-        """Where the centroid of the thing's surface is, in ``pose_frame``, (3,), metres; None without a pose."""
+        """Where the centroid of the thing's surface is, in ``pose_frame``, (3,), metres; None
+        without a pose.
+        """
         found = self._candidates_of_answer
         return found[0].place if found else None
 
@@ -137,27 +179,30 @@ class Recognition:
     def pose_frame(self) -> PoseFrameName:
         """The frame in which poses are given.
 
-        "world" is the robot's: that in which the frames' camera poses are. "camera" is that of the camera (OpenCV
-        axes), of a single frame without a pose. "object" is the object frame in metres, where a camera gives
-        observations, as simulated ones do.
+        "world" is the robot's: that in which the frames' camera poses are. "camera" is that of the
+        camera (OpenCV axes), of a single frame without a pose. "object" is the object frame in
+        metres, where a camera gives observations, as simulated ones do.
         """
         return self.poses_in.name
 
     @property
     def pose_candidates(self) -> tuple[PoseCandidate, ...]:
-        """The poses that the object may have, the likeliest first, in ``pose_frame``; their probabilities sum to 1.
+        """The poses that the object may have, the likeliest first, in ``pose_frame``; their
+        probabilities sum to 1.
 
-        There are several where a thing looks alike from several sides, or two things look alike: each says of which
-        thing it is. None are known where ``pose`` is None because the geometry is not known.
+        There are several where a thing looks alike from several sides, or two things look alike:
+        each says of which thing it is. None are known where ``pose`` is None because the geometry
+        is not known.
         """
         return tuple(candidate.moved(self.poses_in.from_object) for candidate in self._joint_poses)
 
     @property
     def pose_uncertainty(self) -> PoseUncertainty | None:
-        """How far off ``pose`` may be, degrees and millimetres: standard deviations; None where there is none.
+        """How far off ``pose`` may be, degrees and millimetres: standard deviations; None where
+        there is none.
 
-        It comes from how well the depth determines the pose, from how likely the other candidates of the same thing
-        are, and in the world from how far off cameras usually are.
+        It comes from how well the depth determines the pose, from how likely the other candidates
+        of the same thing are, and in the world from how far off cameras usually are.
         """
         found = self._candidates_of_answer
         joint = self._joint
@@ -168,15 +213,19 @@ class Recognition:
 
     @property
     def symmetry(self) -> Any:
-        """Turns after which the thing that was named looks the same; None where they are not known."""
+        """Turns after which the thing that was named looks the same; None where they are not
+        known.
+        """
         found = self._candidates_of_answer
         return found[0].symmetry if found else None
 
     @property
     def posed_surface(self) -> Triangles | None:
-        """The scan of the thing that was named, where it was found; None without a pose or a surface.
+        """The scan of the thing that was named, where it was found; None without a pose or a
+        surface.
 
-        Vertices, (V, 3) float64, in the object frame and object radii as observations are, and faces, (F, 3).
+        Vertices, (V, 3) float64, in the object frame and object radii as observations are, and
+        faces, (F, 3).
         """
         radius = self.radius
         if not self._candidates_of_answer or radius is None:
@@ -190,13 +239,17 @@ class Recognition:
 
     @property
     def why_no_pose(self) -> str:
-        """Why there is no pose though all views were judged together, in words; "" if there is one."""
+        """Why there is no pose though all views were judged together, in words; "" if there is
+        one.
+        """
         joint = self._joint
         return joint.why_no_pose if joint is not None and self.pose is None else ""
 
     @property
     def _joint(self) -> JointBelief | None:
-        """What all views say together; None where views are judged one by one, or nothing is seen."""
+        """What all views say together; None where views are judged one by one, or nothing is
+        seen.
+        """
         return self.views[-1].joint if self.views else None
 
     @property
@@ -207,13 +260,17 @@ class Recognition:
 
     @property
     def _explained(self) -> float | None:
-        """Share of known things that are explained as badly by their geometry; None where that is not known."""
+        """Share of known things that are explained as badly by their geometry; None where that
+        is not known.
+        """
         joint = self._joint
         return None if joint is None else joint.p_value
 
     @property
     def _candidates_of_answer(self) -> list[PoseCandidate]:
-        """Poses of things of the class that is the answer, the likeliest first; none for an unknown object."""
+        """Poses of things of the class that is the answer, the likeliest first; none for an
+        unknown object.
+        """
         if self.answer is None:
             return []
         label = self.classes.index(self.answer)
@@ -226,7 +283,10 @@ class Recognition:
 
     def __repr__(self) -> str:
         """One line: ``chair (belief 0.998, 2 views, 1.41 cells of travel, confident)``."""
-        views = f"{len(self.views)} view{'s' * (len(self.views) != 1)}, {self.travel:.2f} cells of travel"
+        views = (
+            f"{len(self.views)} view{'s' * (len(self.views) != 1)}, {self.travel:.2f} cells of"
+            " travel"
+        )
         if not self.seen:
             return f"nothing is seen ({views})"
         if self.unknown:
@@ -238,26 +298,35 @@ class Recognition:
                 sure += f": {self.why_stranded}"
         names = dict.fromkeys(warning.name for view in self.views for warning in view.warnings)
         warnings = f", warnings: {', '.join(names)}" if names else ""
-        return f"{self.answer} (belief {self.confidence:.3f}, {views}, {sure}{self._place_in_words}{warnings})"
+        return (
+            f"{self.answer} (belief {self.confidence:.3f}, {views},"
+            f" {sure}{self._place_in_words}{warnings})"
+        )
 
     @property
     def _place_in_words(self) -> str:
-        """``, at [0.412, -0.103, 0.050] m in the world, ± 1.2°, 0.8 mm``: the thing's centre; "" without a pose."""
+        """``, at [0.412, -0.103, 0.050] m in the world, ± 1.2°, 0.8 mm``: the thing's centre; ""
+        without a pose.
+        """
         if self.place is None:
             return ""
         return f", at {place_in_words(self.place)} in {self.poses_in}, {self.pose_uncertainty}"
 
     def plot(self, path: str | Path | None = None, title: str = "") -> "Figure":
-        """Draw the episode: images, what the policy valued the views at, beliefs and the path on the sphere.
+        """Draw the episode: images, what the policy valued the views at, beliefs and the path on
+        the sphere.
 
         The outline of the scan of the thing that was named, in its pose, is drawn over the images.
-        With a path it is written to that file too, PNG, PDF or SVG, and replaces one of that name. UsageError: it is
-        another format. ResultsError: the path is a link or a folder, or cannot be written.
+        With a path it is written to that file too, PNG, PDF or SVG, and replaces one of that name.
+        UsageError: it is another format. ResultsError: the path is a link or a folder, or cannot be
+        written.
         """
         from nextview.session.episode_figure import draw_episode, save_figure
 
         heading = f"{title}: {self!r}" if title else repr(self)
-        figure = draw_episode(self.views, self.classes, self.sphere, self.stopping, heading, self.posed_surface)
+        figure = draw_episode(
+            self.views, self.classes, self.sphere, self.stopping, heading, self.posed_surface
+        )
         if path is not None:
             save_figure(figure, Path(path))
         return figure

@@ -15,18 +15,24 @@ from nextview.session.episode import VISITED
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObjectState
 
-ADVICE = "this picture was handed in before, to the last bit, and counts once: does the camera hang?"
+ADVICE = (
+    "this picture was handed in before, to the last bit, and counts once: does the camera hang?"
+)
 REPEATED = ViewWarning("repeated", ADVICE)
-LEVEL = 1e-4  # difference of the third rows of two poses that differ by a turn about the vertical alone
+# difference of the third rows of two poses that differ by a turn about the vertical alone
+LEVEL = 1e-4
 
 
 def is_repeated(seen: Observation, earlier: Sequence[Observation]) -> bool:
     """Whether an observation is the picture of an earlier one."""
-    return any(np.array_equal(one.depth, seen.depth) and _is_one_picture(one, seen) for one in earlier)
+    return any(
+        np.array_equal(one.depth, seen.depth) and _is_one_picture(one, seen) for one in earlier
+    )
 
 
 def after_repeated(state: "ObjectState", frame: Frame, first: int) -> "ObjectState | None":
-    """What is known of an object after a frame that is an earlier one, sightings from ``first`` on; None if not.
+    """What is known of an object after a frame that is an earlier one, sightings from ``first`` on;
+    None if not.
 
     From where it was really taken is not known, so the earlier sighting stands for it.
     """
@@ -36,17 +42,25 @@ def after_repeated(state: "ObjectState", frame: Frame, first: int) -> "ObjectSta
         assert state.frame is not None
         was, now = (state.frame.pose_in_object(f.camera_to_world) for f in (sighting.frame, frame))
         if _is_one_picture(seen, replace(seen, pose=now @ np.linalg.inv(was) @ seen.pose)):
-            sightings, observations = (*state.sightings, sighting), (*state.observations, seen)
-            return replace(state, sightings=sightings, observations=observations, warnings=(REPEATED,))
+            sightings = (*state.sightings, sighting)
+            observations = (*state.observations, seen)
+            return replace(
+                state, sightings=sightings, observations=observations, warnings=(REPEATED,)
+            )
     return None
 
 
 def _is_one_picture(first: Observation, second: Observation) -> bool:
     """Whether two observations of one depth show no two sides of a symmetric object.
 
-    A render of one is the same to the bit after a turn about the vertical. Nothing else is, from another direction.
+    A render of one is the same to the bit after a turn about the vertical. Nothing else is, from
+    another direction.
     """
     if not first.seen:
         return False
     near = angle_between(direction_of(first.pose), direction_of(second.pose)) <= VISITED
-    return bool(near or not np.allclose(first.pose[2], second.pose[2], atol=LEVEL) or check_views(first, second))
+    return bool(
+        near
+        or not np.allclose(first.pose[2], second.pose[2], atol=LEVEL)
+        or check_views(first, second)
+    )

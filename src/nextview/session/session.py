@@ -43,17 +43,21 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 THING_SIZE = 1.3  # times that the size of a taught thing is off, half hidden say, which none has
 FARTHEST_TARGET = 60.0
-"""Object radii: a camera looks at a thing of 0.01 m radius from 0.6 m; in millimetres it would be a thousand times."""
+"""Object radii: a camera looks at a thing of 0.01 m radius from 0.6 m; in millimetres it would
+be a thousand times.
+"""
 CONTRADICTABLE = 3
 """Views before the last with whose geometry it is compared."""
 
 
 @runtime_checkable
 class FrameCamera(Protocol):
-    """A camera in the world, with what it is to look at: it gives frames, and need not be where it was asked to be.
+    """A camera in the world, with what it is to look at: it gives frames, and need not be where it
+    was asked to be.
 
-    Where it has an attribute ``knows_reach`` that is true, it decides alone where it can stand, and is asked for
-    candidates too that ``Session.limits`` would leave out: views that were captured before, for instance.
+    Where it has an attribute ``knows_reach`` that is true, it decides alone where it can stand, and
+    is asked for candidates too that ``Session.limits`` would leave out: views that were captured
+    before, for instance.
     """
 
     @property
@@ -62,25 +66,33 @@ class FrameCamera(Protocol):
         ...
 
     def observe(self, pose: Float) -> Frame:
-        """Look from a pose in the object frame, object radii, or from near it; or raise a ``NoViewLeftError``."""
+        """Look from a pose in the object frame, object radii, or from near it; or raise a
+        ``NoViewLeftError``.
+        """
         ...
 
     def refused(self, error: ObservationError) -> None:
-        """The object is not found in the last frame. Returns if there may be another one; else raises the error."""
+        """The object is not found in the last frame.
+
+        Returns if there may be another one; else raises the error.
+        """
         ...
 
 
 @lru_cache(maxsize=1)
 def _blas() -> ThreadpoolController:
-    """The libraries below NumPy. Their threads wait for more work in a loop, and take the cores from the networks."""
+    """The libraries below NumPy.
+
+    Their threads wait for more work in a loop, and take the cores from the networks.
+    """
     return ThreadpoolController().select(user_api="blas")
 
 
 class Session:
     """One object under way; the caller moves the camera.
 
-    Threads that share one wait for each other. A camera that goes where it is told, in the object frame and object
-    radii:
+    Threads that share one wait for each other. A camera that goes where it is told, in the object
+    frame and object radii:
 
     >>> session = nextview.load().session()                                     # doctest: +SKIP
     >>> while not session.done:                                                 # doctest: +SKIP
@@ -102,10 +114,13 @@ class Session:
         policy: chooses the next view; it may know other viewpoints, see ``policies.off_grid``.
         sphere: the viewpoints.
         start: where to look first; a camera that stands elsewhere is as welcome.
-        stopping: when to stop; by default the rule that goes with the recogniser, see ``Stopping.of``.
+        stopping: when to stop; by default the rule that goes with the recogniser, see
+            ``Stopping.of``.
         rng: for policies that draw; seed 0 by default.
-        object: which object to find in frames; by default the one at which the first camera is aimed.
-        distance: of the camera from the object's centre, metres; ``sphere.distance`` object radii by default.
+        object: which object to find in frames; by default the one at which the first camera is
+            aimed.
+        distance: of the camera from the object's centre, metres; ``sphere.distance`` object radii
+            by default.
         unknown: share of objects of known classes that may be called unknown; 0: none.
 
     Raises:
@@ -130,15 +145,21 @@ class Session:
             raise UsageError(f"{wanted}, not {one_line(repr(object))}")
         if number(unknown, "the share of known objects called unknown", 0) >= 1:
             raise UsageError(f"the share of known objects called unknown is below 1, not {unknown}")
-        self.models, self.policy, self.sphere = models, policy, sphere
+        self.models = models
+        self.policy = policy
+        self.sphere = sphere
         self._distance = _checked_distance(distance)
         self.object = _new_object() if object is None and distance is not None else object
-        self.stopping, self.unknown = stopping or Stopping.of(models.recogniser.calibration), unknown
+        self.stopping = stopping or Stopping.of(models.recogniser.calibration)
+        self.unknown = unknown
         self.views: list[View] = []
         self.observers: list[Callable[[Session], None]] = []
-        """Called, in order, after each view that was taken in, and when another next view was chosen."""
+        """Called, in order, after each view that was taken in, and when another next view was
+        chosen.
+        """
         self._before = 0 if object is None else len(object.sightings)
-        self._chooser, self._rng = anywhere(policy, sphere), rng or np.random.default_rng(0)
+        self._chooser = anywhere(policy, sphere)
+        self._rng = rng or np.random.default_rng(0)
         self._reach = Reach(np.zeros(len(sphere), bool))
         self._limits = Limits()
         self._surroundings: list[Surroundings] = []
@@ -179,15 +200,19 @@ class Session:
 
     @property
     def pose(self) -> Float:
-        """Where to look now, as a camera-to-world pose (4, 4), OpenCV axes, object frame, object radii."""
+        """Where to look now, as a camera-to-world pose (4, 4), OpenCV axes, object frame, object
+        radii.
+        """
         return self.sphere.poses[self.view]
 
     @property
     def poses(self) -> Float:
-        """Where the candidate views are in your world: camera-to-world, (V, 4, 4), OpenCV axes, metres.
+        """Where the candidate views are in your world: camera-to-world, (V, 4, 4), OpenCV axes,
+        metres.
 
-        At ``distance`` from the object, looking at its centre, the horizon level. They move when a frame shows better
-        where the object is. Without frames they are those of ``sphere``, in object radii.
+        At ``distance`` from the object, looking at its centre, the horizon level. They move when a
+        frame shows better where the object is. Without frames they are those of ``sphere``, in
+        object radii.
         """
         return self._poses_around(self.object)
 
@@ -195,7 +220,10 @@ class Session:
         if object is None:
             return self.sphere.poses
         if not object.sightings and object.known is None:
-            raise SessionError("where the object is in the world is not known before the first frame: update with one")
+            raise SessionError(
+                "where the object is in the world is not known before the first frame: update"
+                " with one"
+            )
         return object.object_frame.pose_in_world(self.sphere.poses, self.distance)
 
     @property
@@ -203,20 +231,26 @@ class Session:
         """Where to look now, one of ``poses``, (4, 4); None where the episode has ended."""
         return None if self.done else self.poses[self.view]
 
-    def ranked(self, poses: ArrayLike | None = None, goal: Goal = "thing") -> tuple[RankedView, ...]:
+    def ranked(
+        self, poses: ArrayLike | None = None, goal: Goal = "thing"
+    ) -> tuple[RankedView, ...]:
         """Candidate views, those first that are expected to tell most of which taught thing it is.
 
-        Of the views that are worth nearly the same the nearer ones come first. What stands in the way by the frames so
-        far is allowed for; whether the camera can be brought there is yours to know.
+        Of the views that are worth nearly the same the nearer ones come first. What stands in the
+        way by the frames so far is allowed for; whether the camera can be brought there is yours to
+        know.
 
         Args:
-            poses: of the camera, as your robot can take them, camera-to-world, (V, 4, 4), OpenCV axes, in the world and
-                metres; without frames in the object frame and object radii. By default those of ``poses`` that are
-                left: not visited, within ``limits`` and ``reachable``.
-            goal: "thing" ranks by what is told of which thing it is, "pose" by what is told of its pose too.
+            poses: of the camera, as your robot can take them, camera-to-world, (V, 4, 4), OpenCV
+                axes, in the world and metres; without frames in the object frame and object radii.
+                By default those of ``poses`` that are left: not visited, within ``limits`` and
+                ``reachable``.
+            goal: "thing" ranks by what is told of which thing it is, "pose" by what is told of its
+                pose too.
 
         Raises:
-            SessionError: nothing can be foreseen: no view was taken, or the geometry of what is seen is not known.
+            SessionError: nothing can be foreseen: no view was taken, or the geometry of what is
+                seen is not known.
             UsageError: these are no poses.
         """
         with self._lock:
@@ -228,7 +262,10 @@ class Session:
         step = self._episodes.steps[-1]
         outlook = self._episodes.outlooks(step, np.ones(1, bool))[0]
         if outlook is None:
-            raise SessionError("what views would tell is not known: no taught thing of known geometry explains them")
+            raise SessionError(
+                "what views would tell is not known: no taught thing of known geometry explains"
+                " them"
+            )
 
         if poses is None:
             left = np.flatnonzero(self._left())
@@ -252,7 +289,8 @@ class Session:
 
     @property
     def distance(self) -> float | None:
-        """How far from the object's centre the camera shall stand, metres; None for ``sphere.distance`` object radii.
+        """How far from the object's centre the camera shall stand, metres; None for
+        ``sphere.distance`` object radii.
 
         What is set here counts from the next pose on.
         """
@@ -277,8 +315,9 @@ class Session:
     def reachable(self) -> Reachable | None:
         """Which views the camera can be brought to, see ``session.reach.Reachable``; None for all.
 
-        No policy chooses another one. What is set here counts from now on: if the view that was chosen is not
-        reachable, another one is. A callable is asked anew for each choice, of unvisited views, after the first view.
+        No policy chooses another one. What is set here counts from now on: if the view that was
+        chosen is not reachable, another one is. A callable is asked anew for each choice, of
+        unvisited views, after the first view.
         """
         return self._reach.reachable
 
@@ -289,10 +328,12 @@ class Session:
 
     @property
     def travel_cost(self) -> TravelCost | None:
-        """What it costs to go from view to view, see ``session.reach.TravelCost``; None for the travel in grid cells.
+        """What it costs to go from view to view, see ``session.reach.TravelCost``; None for the
+        travel in grid cells.
 
-        Policies that weigh travel weigh this instead from the next choice on: seconds of your planner for instance. Its
-        unit does not matter: its mean over the free views counts as much as their mean travel in cells.
+        Policies that weigh travel weigh this instead from the next choice on: seconds of your
+        planner for instance. Its unit does not matter: its mean over the free views counts as much
+        as their mean travel in cells.
         """
         return self._reach.cost
 
@@ -303,16 +344,20 @@ class Session:
 
     @property
     def limits(self) -> Limits:
-        """To which candidates no camera is sent, by what the frames show, see ``session.limits.Limits``.
+        """To which candidates no camera is sent, by what the frames show, see
+        ``session.limits.Limits``.
 
-        What is set here counts from now on, as for ``reachable``. Sessions without frames know no place to keep off.
+        What is set here counts from now on, as for ``reachable``. Sessions without frames know no
+        place to keep off.
         """
         return self._limits
 
     @limits.setter
     def limits(self, given: Limits) -> None:
         if not isinstance(given, Limits):
-            raise UsageError(f"limits are a nextview.session.limits.Limits, not {one_line(repr(given))}")
+            raise UsageError(
+                f"limits are a nextview.session.limits.Limits, not {one_line(repr(given))}"
+            )
         with self._lock:
             before = self._limits
             self._limits = given
@@ -324,10 +369,15 @@ class Session:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Why each candidate is left out by ``limits`` or has failed, (V,); "" where neither is so."""
+        """Why each candidate is left out by ``limits`` or has failed, (V,); "" where neither is
+        so.
+        """
         with self._lock:
             reasons = self._reasons(self.object)
-            return tuple("failed" if gone else str(why) for gone, why in zip(self._reach.failed, reasons, strict=True))
+            return tuple(
+                "failed" if gone else str(why)
+                for gone, why in zip(self._reach.failed, reasons, strict=True)
+            )
 
     def _reasons(self, object: ObservedObject | None) -> NDArray[np.str_]:
         """See ``Limits.reasons``; all "" before the first frame, and without frames."""
@@ -341,7 +391,8 @@ class Session:
         return self._limits.reasons(self._poses_around(object), object, self._surroundings)
 
     def failed(self, view: int | None = None) -> None:
-        """The camera could not be brought to a view, by default the one that was asked for: it is offered no more.
+        """The camera could not be brought to a view, by default the one that was asked for: it is
+        offered no more.
 
         Where no reachable view is left the session ends, not confident: ``Recognition.stranded``.
         """
@@ -353,14 +404,20 @@ class Session:
                 what = "no view was asked for yet, so none has failed"
                 raise SessionError(f"{what}: the first frame comes from wherever the camera stands")
             view = self.view if view is None else whole(view, "a view", 0, len(self.sphere) - 1)
-            self._set_reach(replace(self._reach, failed=self._reach.failed | (np.arange(len(self.sphere)) == view)))
+            self._set_reach(
+                replace(
+                    self._reach, failed=self._reach.failed | (np.arange(len(self.sphere)) == view)
+                )
+            )
 
     def _set_reach(self, reach: Reach) -> None:
         """Choose another view if the one that was chosen can no longer be reached."""
         if self.done or (self.views and self._can_go(self.view, reach)):
             self._reach = reach
         elif self.views:
-            step = self._episodes.next_choice(lambda state: self._constrained(state, reach, self.object))
+            step = self._episodes.next_choice(
+                lambda state: self._constrained(state, reach, self.object)
+            )
             view = replace(self.views[-1], next_view=_next_of(step), values=self._values(step))
             self._episodes.keep_choice(step)
             self._reach, self.views[-1] = reach, view
@@ -368,7 +425,8 @@ class Session:
                 observer(self)
         else:  # with frames it begins where the camera is
             episodes = self._begin_nearest(reach) if self.object is None else self._episodes
-            self._reach, self._episodes = reach, episodes
+            self._reach = reach
+            self._episodes = episodes
 
     def _can_go(self, view: int, reach: Reach) -> bool:
         """Whether the camera may be sent to a view, and can be brought there."""
@@ -377,18 +435,33 @@ class Session:
         return bool(reach.can_reach(np.array([view]), lambda: self.poses)[0])
 
     def _begin_nearest(self, reach: Reach) -> Episodes:
-        """Before the first view: begin at the nearest view that can be reached. A callable is not asked yet."""
-        there = ~reach.failed & (reach.reachable if isinstance(reach.reachable, np.ndarray) else True)
+        """Before the first view: begin at the nearest view that can be reached.
+
+        A callable is not asked yet.
+        """
+        there = ~reach.failed & (
+            reach.reachable if isinstance(reach.reachable, np.ndarray) else True
+        )
         if not there.any():
             raise SessionError("none of the candidate views can be reached")
         return self._begin(int(np.where(there, self.sphere.arc[self.view], np.inf).argmin()))
 
     def _constrained(
-        self, state: EpisodeState, reach: Reach, object: ObservedObject | None, here: Float | None = None
+        self,
+        state: EpisodeState,
+        reach: Reach,
+        object: ObservedObject | None,
+        here: Float | None = None,
     ) -> EpisodeState:
-        """The state with where the camera can go from here, by default from where the last view was taken."""
+        """The state with where the camera can go from here, by default from where the last view
+        was taken.
+        """
         if here is None:
-            here = self.views[-1].observation.pose if object is None else object.sightings[-1].frame.camera_to_world
+            here = (
+                self.views[-1].observation.pose
+                if object is None
+                else object.sightings[-1].frame.camera_to_world
+            )
         barred = self._reasons(object) != ""
         reach = replace(reach, failed=reach.failed | barred)
         return reach.constrain(state, self.sphere, here, lambda: self._poses_around(object))
@@ -396,33 +469,44 @@ class Session:
     # What is seen
 
     def update(self, seen: Observation | Frame) -> View:
-        """Take in what was seen, from ``pose``, from ``target`` or from anywhere else: its own pose counts.
+        """Take in what was seen, from ``pose``, from ``target`` or from anywhere else: its own pose
+        counts.
 
-        Where this raises, nothing is taken in: the session is as it was, and goes on with the next view.
+        Where this raises, nothing is taken in: the session is as it was, and goes on with the next
+        view.
 
         Args:
-            seen: an observation in the object frame; or a frame of a depth camera in the world. If a frame shows better
-                where the object is, the earlier ones are expressed anew, and ``views`` with them: all but what was
-                chosen after them, and what they were warned of.
+            seen: an observation in the object frame; or a frame of a depth camera in the world. If
+                a frame shows better where the object is, the earlier ones are expressed anew, and
+                ``views`` with them: all but what was chosen after them, and what they were warned
+                of.
 
         Raises:
             SessionError: the episode has ended, or a session mixes frames and observations.
-            ObservationError: the object is not found in the frame, or the image does not suit the networks.
-            UsageError: the session's ``distance`` is inside the object, or more than 60 object radii.
+            ObservationError: the object is not found in the frame, or the image does not suit the
+                networks.
+            UsageError: the session's ``distance`` is inside the object, or more than 60 object
+                radii.
             PolicyError: the policy failed.
         """
         with self._lock:
             if self.done:
                 raise SessionError("this session has ended; begin another one")
             with _blas().limit(limits=1):
-                view = self._add_frame(seen) if isinstance(seen, Frame) else self._add_observation(seen)
+                view = (
+                    self._add_frame(seen)
+                    if isinstance(seen, Frame)
+                    else self._add_observation(seen)
+                )
             for observer in self.observers:
                 observer(self)
         return view
 
     def _add_observation(self, seen: Observation) -> View:
         if not isinstance(seen, Observation):
-            raise ObservationError(f"what a camera gave is an Observation, or a Frame, not {one_line(repr(seen))}")
+            raise ObservationError(
+                f"what a camera gave is an Observation, or a Frame, not {one_line(repr(seen))}"
+            )
         if self.object is not None:
             raise SessionError("this session takes frames: it has an observed object")
         warnings = check_observation(seen)
@@ -437,7 +521,9 @@ class Session:
             raise SessionError("this session has taken observations; begin another one for frames")
         object = self.object or _new_object()
         if len(object.sightings) != self._before + len(self.views):
-            raise SessionError("frames were added to this object outside of the session; begin another one")
+            raise SessionError(
+                "frames were added to this object outside of the session; begin another one"
+            )
         before = object.state
         try:
             if (repeated := after_repeated(before, frame, self._before)) is not None:
@@ -446,7 +532,9 @@ class Session:
                 object.add(frame)
                 self._reconsider(object)
             self._check_distance(object.object_frame.radius)
-            return self._take(object.observations[self._before :], object.warnings, frame.camera_to_world, object)
+            return self._take(
+                object.observations[self._before :], object.warnings, frame.camera_to_world, object
+            )
         except BaseException:
             object.state = before
             raise
@@ -455,7 +543,11 @@ class Session:
         """See ``ObservedObject.reconsider``: where the last view is suspiciously novel."""
         recogniser = self.models.recogniser
         score = recogniser.novelty
-        if not self.unknown or not isinstance(score, Novelty) or not isinstance(recogniser, NetworkRecogniser):
+        if (
+            not self.unknown
+            or not isinstance(score, Novelty)
+            or not isinstance(recogniser, NetworkRecogniser)
+        ):
             return
         if not object.other_joins():
             return
@@ -475,7 +567,8 @@ class Session:
         if self.distance > radius:
             why = f"within {FARTHEST_TARGET:g} radii: is it in millimetres?"
         raise UsageError(
-            f"the distance of {self.distance:g} m from the centre of an object of {radius:.2g} m radius has to be {why}"
+            f"the distance of {self.distance:g} m from the centre of an object of {radius:.2g} m"
+            f" radius has to be {why}"
         )
 
     def _take(
@@ -487,32 +580,50 @@ class Session:
     ) -> View:
         """Take in the last of some observations, and whichever of the others has changed."""
         last = len(observations) - 1
-        changed = [k for k, seen in enumerate(observations) if k == last or seen is not self.views[k].observation]
+        changed = [
+            k
+            for k, seen in enumerate(observations)
+            if k == last or seen is not self.views[k].observation
+        ]
         found = self.models.evidence([observations[k] for k in changed])
-        once = np.array([REPEATED not in (warnings if k == last else self.views[k].warnings) for k in changed])
+        once = np.array(
+            [REPEATED not in (warnings if k == last else self.views[k].warnings) for k in changed]
+        )
         found = replace(found, seen=once if found.seen is None else found.seen & once)
         evidence = {k: found.select([row]) for row, k in enumerate(changed)}
-        at = [(towards, *self.sphere.nearest(towards)) for towards in (direction_of(o.pose) for o in observations)]
-        directions = [self.sphere.directions[view] if there else towards for towards, view, there in at]
+        at = [
+            (towards, *self.sphere.nearest(towards))
+            for towards in (direction_of(o.pose) for o in observations)
+        ]
+        directions = [
+            self.sphere.directions[view] if there else towards for towards, view, there in at
+        ]
         episodes = self._episodes
         if changed != [last]:
             episodes = self._begin(self.view)
             for k, step in enumerate(self._episodes.steps):
                 # What all views said together then is not asked again: it takes time.
                 episodes.take(evidence.get(k, step.evidence), directions[k][None], step.joint)
-        reach, doubtful = self._reach, bool(warnings) or self._contradicted(last + 1)
+        reach = self._reach
+        doubtful = bool(warnings) or self._contradicted(last + 1)
         taken = episodes.next_step(
             evidence[last],
             directions[last][None],
             lambda state: self._constrained(state, reach, object, here),
             hold=lambda step: doubtful or self._suspicious([*episodes.steps, step], observations),
         )
-        steps, views = [*episodes.steps, taken.step], list(self.views)
+        steps = [*episodes.steps, taken.step]
+        views = list(self.views)
         travel = self._travelled([int(step.views[0]) for step in steps], directions)
         for k in changed[:-1]:
-            was, seen = views[k], self._view(steps[k], observations[k], directions[k], travel[k])
+            was = views[k]
+            seen = self._view(steps[k], observations[k], directions[k], travel[k])
             views[k] = replace(
-                seen, next_view=was.next_view, values=was.values, warnings=was.warnings, degrees_off=was.degrees_off
+                seen,
+                next_view=was.next_view,
+                values=was.values,
+                warnings=was.warnings,
+                degrees_off=was.degrees_off,
             )
         off = angle_between(self.sphere.directions[self.view], directions[last])
         asked = bool(self.views) or object is None or object.known is not None
@@ -524,19 +635,26 @@ class Session:
             degrees_off=float(np.degrees(off)) if asked else 0.0,
         )
         episodes.keep(taken)
-        self._episodes, self.views, self.object = episodes, [*views, view], object
+        self._episodes = episodes
+        self.views = [*views, view]
+        self.object = object
         return view
 
-    def _view(self, step: Step, observation: Observation, direction: Float, travel: tuple[float, float]) -> View:
+    def _view(
+        self, step: Step, observation: Observation, direction: Float, travel: tuple[float, float]
+    ) -> View:
         """What a step says of its view, but for what was chosen after it."""
         calibration, (nearest, there) = self._episodes.calibration, self.sphere.nearest(direction)
         azimuth = self.sphere.azimuth[[nearest]] if there else azimuth_of(direction[None])
-        classes, evidence = len(self.models.classes), step.evidence
+        classes = len(self.models.classes)
+        evidence = step.evidence
         bins = calibration.azimuth_bins(step.total, np.maximum(step.seen, 1), classes, azimuth)
         return View(
             int(step.views[0]),
             observation,
-            alone=calibration.belief(log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), 1, classes)[0],
+            alone=calibration.belief(
+                log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), 1, classes
+            )[0],
             belief=step.belief[0],
             maps={name: values[0] for name, values in step.evidence.maps.items()},
             next_view=None,
@@ -549,23 +667,37 @@ class Session:
         )
 
     def _score(self, step: Step, observation: Observation) -> ViewScore | None:
-        """The novelty score of a view; None where nothing is seen, or the recogniser has no score."""
-        score, evidence = self.models.recogniser.novelty, step.evidence
+        """The novelty score of a view; None where nothing is seen, or the recogniser has no
+        score.
+        """
+        score = self.models.recogniser.novelty
+        evidence = step.evidence
         if not observation.seen or (evidence.seen is not None and not evidence.seen[0]):
             return None
         if score is not None and score.joint:  # how badly all views are explained by what is known
-            calibration, classes = self.models.recogniser.calibration, len(self.models.classes)
+            calibration = self.models.recogniser.calibration
+            classes = len(self.models.classes)
             seen = np.maximum(step.seen, 1)
-            value = score.of_belief(calibration.log_belief(step.total, seen, classes)[0], int(seen[0]))
+            value = score.of_belief(
+                calibration.log_belief(step.total, seen, classes)[0], int(seen[0])
+            )
             return ViewScore(observation, None, value)
         return None if evidence.novelty is None else evidence.novelty[0]
 
     def _contradicted(self, n_views: int) -> bool:
-        """Whether half of so many views or more contradict others: the object moved, or is another one by now."""
-        return 2 * sum(any(w.name == "contradiction" for w in view.warnings) for view in self.views) >= n_views > 0
+        """Whether half of so many views or more contradict others: the object moved, or is
+        another one by now.
+        """
+        return (
+            2 * sum(any(w.name == "contradiction" for w in view.warnings) for view in self.views)
+            >= n_views
+            > 0
+        )
 
     def _suspicious(self, steps: Sequence[Step], observations: Sequence[Observation]) -> bool:
-        """Whether an object is too novel for a confident answer by some steps, as their views are seen by now."""
+        """Whether an object is too novel for a confident answer by some steps, as their views
+        are seen by now.
+        """
         if not self.unknown:
             return False
         joint = steps[-1].joint[0] if steps[-1].joint else None
@@ -575,17 +707,29 @@ class Session:
         if score is None:
             return False
         found = [self._score(step, seen) for step, seen in zip(steps, observations, strict=True)]
-        return score.of_views(values_of([s for s in found if s is not None])) < SUSPICIOUS * self.unknown
+        return (
+            score.of_views(values_of([s for s in found if s is not None]))
+            < SUSPICIOUS * self.unknown
+        )
 
-    def _travelled(self, views: Sequence[int], directions: Sequence[Float]) -> list[tuple[float, float]]:
+    def _travelled(
+        self, views: Sequence[int], directions: Sequence[Float]
+    ) -> list[tuple[float, float]]:
         """Cells and radians on the way to each view, from the places where the camera stood."""
-        sphere, found = self.sphere, [(0.0, 0.0)]
-        at = [np.array_equal(d, sphere.directions[view]) for view, d in zip(views, directions, strict=True)]
+        sphere = self.sphere
+        found = [(0.0, 0.0)]
+        at = [
+            np.array_equal(d, sphere.directions[view])
+            for view, d in zip(views, directions, strict=True)
+        ]
         for a, b in pairwise(range(len(views))):
             if at[a] and at[b]:
                 leg = sphere.travel[views[a], views[b]], sphere.arc[views[a], views[b]]
             else:
-                leg = sphere.travel_between(directions[a], directions[b]), angle_between(directions[a], directions[b])
+                leg = (
+                    sphere.travel_between(directions[a], directions[b]),
+                    angle_between(directions[a], directions[b]),
+                )
             found.append((found[-1][0] + float(leg[0]), found[-1][1] + float(leg[1])))
         return found
 
@@ -595,14 +739,20 @@ class Session:
             return None
         assert isinstance(chooser, ValuesViews)
         name = type(self.policy).__name__
-        with plugin_errors(lambda said: PolicyError(f"policy {name}, asked what it values views at, raised {said}")):
+        with plugin_errors(
+            lambda said: PolicyError(f"policy {name}, asked what it values views at, raised {said}")
+        ):
             values = np.asarray(chooser.view_values(step.state), np.float64)
         if values.shape != (1, len(self.sphere)):
-            raise PolicyError(f"policy {name} values views by (B, V) numbers, here (1, {len(self.sphere)})")
+            raise PolicyError(
+                f"policy {name} values views by (B, V) numbers, here (1, {len(self.sphere)})"
+            )
         return values[0]
 
     def run(self, camera: Camera | FrameCamera) -> Recognition:
-        """Go on to the end with a camera that goes where it is told, or until it has no view left to offer."""
+        """Go on to the end with a camera that goes where it is told, or until it has no view
+        left to offer.
+        """
         while not self.done:
             try:
                 seen = camera.observe(self.pose)
@@ -649,10 +799,12 @@ class Session:
     def _impossible(self) -> tuple[str, ...]:
         """Classes whose objects have not the size of this one; none where it is not known."""
         card = getattr(self.models.recogniser, "card", None)  # a recogniser of your own has none
-        sizes, radius = card and card.size, self.views[-1].observation.radius if self.views else None
+        sizes = card and card.size
+        radius = self.views[-1].observation.radius if self.views else None
         if sizes is None or radius is None:
             return ()
-        things = bool(self.models.recogniser.calibration.hypotheses)  # a thing has one size, a class has many
+        # a thing has one size, a class has many
+        things = bool(self.models.recogniser.calibration.hypotheses)
         wrong = sizes.impossible(radius, THING_SIZE if things else MUCH)
         return tuple(name for name, off in zip(self.models.classes, wrong, strict=True) if off)
 
@@ -674,11 +826,17 @@ def _new_object() -> ObservedObject:
 
 def _check_needs(policy: Policy, models: Models) -> None:
     if not (hasattr(policy, "needs") and hasattr(policy, "next_views")):
-        raise UsageError(f"a policy has needs and next_views, see nextview.Policy, not {one_line(repr(policy))}")
+        raise UsageError(
+            f"a policy has needs and next_views, see nextview.Policy, not {one_line(repr(policy))}"
+        )
     if "azimuth_bins" in policy.needs and not models.recogniser.azimuth_bins:
-        raise SessionError("this policy needs the azimuth bin that is seen, and the recogniser was not taught it")
+        raise SessionError(
+            "this policy needs the azimuth bin that is seen, and the recogniser was not taught it"
+        )
     if "outlook" in policy.needs and not isinstance(models.recogniser, LooksAhead):
-        raise SessionError("this policy needs things of known geometry: a memory that was taught from scans")
+        raise SessionError(
+            "this policy needs things of known geometry: a memory that was taught from scans"
+        )
     missing = [name for name in maps_among(policy.needs) if name not in models.map_names]
     if missing:
         raise SessionError(f"this policy needs the map {missing[0]!r}; load it with the models")

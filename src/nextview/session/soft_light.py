@@ -13,10 +13,13 @@ from nextview.session.style import GROUND, WOOD, rgb
 Float = NDArray[np.floating]
 
 TORN = 0.08  # a surface ends where depth jumps by more from pixel to pixel, object radii
-REACH, GRID = 2.6, 72  # half a side of the ground that may lie in shadow, object radii, and its points along it
+# half a side of the ground that may lie in shadow, object radii, and its points along it
+REACH = 2.6
+GRID = 72
 SKY = np.random.default_rng(0).normal(size=(150, 3))  # directions of a ball, of any length
 SHADE = np.array([0.52, 0.57, 0.64])  # how much darker the ground is in full shadow: warm
-LAMP = np.array([-0.45, -0.75, -0.8])  # towards the lamp, camera frame: from above, left, behind the camera
+# towards the lamp, camera frame: from above, left, behind the camera
+LAMP = np.array([-0.45, -0.75, -0.8])
 
 
 def surface(seen: Observation) -> Triangles:
@@ -29,11 +32,19 @@ def surface(seen: Observation) -> Triangles:
     corners = depth.ravel()[faces]
     faces = faces[(corners.min(1) > 0) & (np.ptp(corners, axis=1) < TORN)]
     points = points @ seen.pose[:3, :3].T + seen.pose[:3, 3]
-    edges, times = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)), axis=0, return_counts=True)
+    edges, times = np.unique(
+        np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)), axis=0, return_counts=True
+    )
     rim = edges[times == 1]  # has steps as large as pixels: they are smoothed away
     count = np.maximum(np.bincount(rim.ravel(), minlength=len(points)), 1)[:, None]
     for _ in range(5):
-        beside = np.stack([np.bincount(rim.ravel(), points[rim[:, ::-1].ravel(), k], len(points)) for k in range(3)], 1)
+        beside = np.stack(
+            [
+                np.bincount(rim.ravel(), points[rim[:, ::-1].ravel(), k], len(points))
+                for k in range(3)
+            ],
+            1,
+        )
         points = np.where(count > 1, 0.5 * points + 0.5 * beside / count, points)
     return points, faces.astype(np.int32)
 
@@ -45,24 +56,31 @@ class SoftLight:
         seen: list[Float] = [np.zeros((1, 3)), *(o.points for o in observations if o.seen)]
         self.surfaces = [surface(o) for o in observations]
         self._caster = RayCaster(self.surfaces)
-        self._off = 0.02 if all(o.exact for o in observations) else 0.15  # sensors see one surface at several places
+        # sensors see one surface at several places
+        self._off = 0.02 if all(o.exact for o in observations) else 0.15
         self.floor = float(np.percentile(np.concatenate(seen)[:, 2], 0.5)) - 0.01
         x, y = np.meshgrid(*[np.linspace(-REACH, REACH, GRID)] * 2)
         ground = np.stack([x, y, np.full_like(x, self.floor)], -1).reshape(-1, 3)
-        light = self._sky(ground, np.tile([0.0, 0.0, 1.0], (len(ground), 1)), SKY).reshape(GRID, GRID)
+        light = self._sky(ground, np.tile([0.0, 0.0, 1.0], (len(ground), 1)), SKY).reshape(
+            GRID, GRID
+        )
         self._ground = gaussian_filter(light, 1.2, mode="nearest")
 
     def _sky(self, points: Float, normals: Float, balls: Float) -> Float:
         """The share of the sky that each point sees."""
         free = np.zeros(len(points))
         for ball in balls / np.linalg.norm(balls, axis=1, keepdims=True):
-            free += np.isinf(self._caster.cast(points + self._off * normals, normals + 0.97 * ball)[0])
+            free += np.isinf(
+                self._caster.cast(points + self._off * normals, normals + 0.97 * ball)[0]
+            )
         return free / len(balls)
 
     def picture(
         self, surfaces: Sequence[Triangles], pose: Float, intrinsics: Float, shape: tuple[int, int]
     ) -> tuple[NDArray[np.uint8], Float]:
-        """Surfaces on the ground from a pose, (H, W, 3), and how far each pixel's ray goes to one, (H, W)."""
+        """Surfaces on the ground from a pose, (H, W, 3), and how far each pixel's ray goes to
+        one, (H, W).
+        """
         rays = pixel_rays(np.asarray(intrinsics, np.float64), shape).reshape(-1, 3) @ pose[:3, :3].T
         origins = np.tile(pose[:3, 3], (len(rays), 1)).astype(np.float32)
         hits = embree_scene(surfaces).run(origins, rays.astype(np.float32), output=1)
@@ -74,7 +92,9 @@ class SoftLight:
         at = (below[:, 1::-1] / REACH + 1) * (GRID - 1) / 2
         light = map_coordinates(self._ground, at.T, order=1, cval=1.0)
         colours *= 1 - np.outer((down > 0) * np.clip(0.97 - light, 0, 1), SHADE)
-        normals = hits["Ng"][hit] / np.maximum(np.linalg.norm(hits["Ng"][hit], axis=1, keepdims=True), 1e-12)
+        normals = hits["Ng"][hit] / np.maximum(
+            np.linalg.norm(hits["Ng"][hit], axis=1, keepdims=True), 1e-12
+        )
         normals *= -np.sign((normals * rays[hit]).sum(1, keepdims=True))
         facing = 0.5 + 0.5 * normals @ (pose[:3, :3] @ LAMP) / np.linalg.norm(LAMP)
         points = origins[hit] + hits["tfar"][hit, None] * rays[hit]

@@ -16,10 +16,19 @@ from numpy.typing import NDArray
 
 from nextview.session.fonts import fit_fonts
 
-INK, GREY, FAINT = "#1f2933", "#8a949e", "#d5dbe1"
-BLUE, LIGHT_BLUE, ACCENT = "#0b5fa5", "#38a0d9", "#d1495b"  # of all figures; policies: ``figures.COLOURS``
-PAPER, GROUND, WOOD = "#fafaf8", "#f5efe4", "#e0ab6c"  # of pictures: the page, what things stand on, the things
-SERIES = ("#0b6e99", "#c4532d", "#4b8b3b", "#7a5195", "#b8860b", "#555555")  # of several things of one kind, in turn
+INK = "#1f2933"
+GREY = "#8a949e"
+FAINT = "#d5dbe1"
+# of all figures; policies: ``figures.COLOURS``
+BLUE = "#0b5fa5"
+LIGHT_BLUE = "#38a0d9"
+ACCENT = "#d1495b"
+# of pictures: the page, what things stand on, the things
+PAPER = "#fafaf8"
+GROUND = "#f5efe4"
+WOOD = "#e0ab6c"
+# of several things of one kind, in turn
+SERIES = ("#0b6e99", "#c4532d", "#4b8b3b", "#7a5195", "#b8860b", "#555555")
 UNKNOWN = 201, 210, 218  # the colour of what has no value
 STYLE = {
     "font.family": "sans-serif",
@@ -44,7 +53,9 @@ STYLE = {
 
 
 class PlainFigure(Figure):
-    """A figure that shows names as they are: a dollar begins no formula, and every script has its font."""
+    """A figure that shows names as they are: a dollar begins no formula, and every script has
+    its font.
+    """
 
     def draw(self, renderer: Any) -> None:
         """Draw, after all texts are known."""
@@ -73,7 +84,13 @@ def percent_axis(axis: Axis) -> None:
 def legend(axes: Axes, title: str | None = None) -> None:
     """A legend in two columns below the axes."""
     with matplotlib.rc_context(STYLE):
-        axes.legend(loc="upper center", bbox_to_anchor=(0.45, -0.17), ncols=2, title=title, title_fontsize=8.5)
+        axes.legend(
+            loc="upper center",
+            bbox_to_anchor=(0.45, -0.17),
+            ncols=2,
+            title=title,
+            title_fontsize=8.5,
+        )
 
 
 def rgb(colour: str) -> tuple[int, int, int]:
@@ -95,8 +112,11 @@ def to_svg(figure: Figure) -> str:
     """A figure as SVG text, the same every time."""
     text = StringIO()
     with matplotlib.rc_context(STYLE):
-        figure.savefig(text, format="svg", bbox_inches="tight", pad_inches=0.05, metadata={"Date": None})
-    return re.sub(r"[\x00-\x08\x0b\x0c\x0e-\x1f]", "\ufffd", text.getvalue())  # XML has none of these
+        figure.savefig(
+            text, format="svg", bbox_inches="tight", pad_inches=0.05, metadata={"Date": None}
+        )
+    # XML has none of these
+    return re.sub(r"[\x00-\x08\x0b\x0c\x0e-\x1f]", "\ufffd", text.getvalue())
 
 
 def to_png(figure: Figure, path: Path) -> None:

@@ -1,4 +1,6 @@
-"""What one frame shows beside the object: surfaces that a camera must not touch, and the walls of the room."""
+"""What one frame shows beside the object: surfaces that a camera must not touch, and the walls
+of the room.
+"""
 
 from dataclasses import dataclass
 
@@ -15,8 +17,10 @@ Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 MOST_POINTS = 6000  # of a frame that are looked at
-JUMP = 0.03  # parts of the depth between neighbouring pixels, at an edge, where a sensor makes up points
-NEAR_PLANE = 0.02  # metres above the support plane, beside the noise, up to which a point lies on it
+# parts of the depth between neighbouring pixels, at an edge, where a sensor makes up points
+JUMP = 0.03
+# metres above the support plane, beside the noise, up to which a point lies on it
+NEAR_PLANE = 0.02
 AROUND = 1.1  # object radii around the centre within which a surface counts as the object's own
 FEWEST_POINTS = 3  # that are measured near a place before it counts as occupied
 WINDOW = 2  # pixels to each side that tell what lies on the line of sight to a place
@@ -28,7 +32,8 @@ WALL_WIDTH = 0.5  # metres that a frame shows of a wall, at least
 WALL_HEIGHT = 0.1  # metres; a camera that looks down on a table sees a strip of the wall behind it
 WALL_TOLERANCE = 0.02  # metres, beside the noise
 BEHIND = 0.15  # metres behind a wall from which on a point does not belong to it
-MOST_BEHIND = 0.03  # share of a frame's points that may lie behind a wall: reflections, a door that stands open
+# share of a frame's points that may lie behind a wall: reflections, a door that stands open
+MOST_BEHIND = 0.03
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,8 @@ class Surroundings:
         plane: the support plane, if it is known.
         points: some of what the frame shows, world, metres, (N, 3), edges left out.
         tolerance: how far each point may be off, metres, (N,).
-        walls: upright planes behind which the frame shows next to nothing; their normals point to the camera.
+        walls: upright planes behind which the frame shows next to nothing; their normals point to
+            the camera.
     """
 
     frame: Frame
@@ -69,7 +75,8 @@ class Surroundings:
         return cls(frame, sighting.noise, sighting.plane, points, tolerance, walls)
 
     def is_near(self, places: Float, around: ObjectFrame, clearance: float) -> Mask:
-        """Whether a surface was measured near places, neither the object's own nor the support plane.
+        """Whether a surface was measured near places, neither the object's own nor the support
+        plane.
 
         Args:
             places: (V, 3), world, metres.
@@ -90,17 +97,21 @@ class Surroundings:
         return (apart < clearance).sum(1) >= FEWEST_POINTS
 
     def shows_behind(self, wall: Plane) -> bool:
-        """Whether the camera stood behind what another frame took for a wall, or sees something there."""
+        """Whether the camera stood behind what another frame took for a wall, or sees something
+        there.
+        """
         if wall.height(self.frame.camera_to_world[:3, 3]) < 0:
             return True
         return _share_behind(wall.height(self.points), self.tolerance) > MOST_BEHIND
 
     def look_at(self, places: Float, around: ObjectFrame, margin: float) -> tuple[Mask, Mask]:
-        """Which places the frame looks through, and which ones something else than the object hides from it.
+        """Which places the frame looks through, and which ones something else than the object hides
+        from it.
 
         Args:
             places: (V, 3), world, metres.
-            around: the object: what is behind it is not taken for hidden, as it has to be looked at from there.
+            around: the object: what is behind it is not taken for hidden, as it has to be looked at
+                from there.
             margin: metres in front of a place or behind it, within which a surface says neither.
 
         Returns:
@@ -124,7 +135,9 @@ class Surroundings:
         return free, blocked & ~own & ~on_plane
 
     def _depth_towards(self, seen_at: Float) -> Float:
-        """Median depth around the pixels that points, (V, 3), camera frame, fall on; NaN where there is none."""
+        """Median depth around the pixels that points, (V, 3), camera frame, fall on; NaN where
+        there is none.
+        """
         height, width = self.frame.shape
         k = self.frame.intrinsics
         ahead = seen_at[:, 2] > 1e-6
@@ -139,7 +152,8 @@ class Surroundings:
         windows = self.frame.depth[rows, columns].astype(np.float64)
         depth = windows.reshape(len(windows), len(around) ** 2)
 
-        # The middle of what is measured in each window: zeros, which mean nothing, are sorted to the front.
+        # The middle of what is measured in each window: zeros, which mean nothing, are sorted to
+        # the front.
         depth = np.sort(depth, axis=1)
         measured = (depth > 0).sum(1)
         middle = depth.shape[1] - (measured + 1) // 2
@@ -170,12 +184,16 @@ def _smooth_pixels(frame: Frame) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     depth = frame.depth[rows, columns]
     smooth = np.ones(len(rows), bool)
     for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        beside = frame.depth[np.clip(rows + down, 0, height - 1), np.clip(columns + right, 0, width - 1)]
+        beside = frame.depth[
+            np.clip(rows + down, 0, height - 1), np.clip(columns + right, 0, width - 1)
+        ]
         smooth &= (beside > 0) & (np.abs(beside - depth) < JUMP * depth)
     return rows[smooth], columns[smooth]
 
 
-def _find_walls(points: Float, tolerance: Float, high: Mask, camera: Float, around: ObjectFrame) -> tuple[Plane, ...]:
+def _find_walls(
+    points: Float, tolerance: Float, high: Mask, camera: Float, around: ObjectFrame
+) -> tuple[Plane, ...]:
     """Upright planes that end the room, as lines in the view from above, by RANSAC.
 
     Args:
@@ -197,7 +215,8 @@ def _find_walls(points: Float, tolerance: Float, high: Mask, camera: Float, arou
         if line is None:
             break
         normal, offset = line
-        away = upright[:, :2] @ normal + offset  # the camera is at 0, on the side where this is positive
+        # the camera is at 0, on the side where this is positive
+        away = upright[:, :2] @ normal + offset
         on = others & (np.abs(away) < slack)
         behind = _share_behind(away, tolerance)
         if on.mean() >= LEAST_OF_FRAME and behind <= MOST_BEHIND and _is_large(upright[on], normal):
@@ -210,7 +229,9 @@ def _find_walls(points: Float, tolerance: Float, high: Mask, camera: Float, arou
 
 
 def _best_line(ground: Float, slack: Float, rng: np.random.Generator) -> tuple[Float, float] | None:
-    """The line near most points, (N, 2): a normal that points to the origin, and an offset; or None."""
+    """The line near most points, (N, 2): a normal that points to the origin, and an offset; or
+    None.
+    """
     first, second = ground[rng.integers(len(ground), size=(2, TRIALS))]
     along = second - first
     length = np.linalg.norm(along, axis=1)
@@ -223,7 +244,8 @@ def _best_line(ground: Float, slack: Float, rng: np.random.Generator) -> tuple[F
     count = (np.abs(ground @ normals.T + offsets) < slack[:, None]).sum(0)
     best = int(count.argmax())
 
-    normal, offset = normals[best], float(offsets[best])
+    normal = normals[best]
+    offset = float(offsets[best])
     on = np.abs(ground @ normal + offset) < slack
     middle = ground[on].mean(0)
     spread = ground[on] - middle

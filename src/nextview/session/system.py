@@ -1,4 +1,6 @@
-"""The front door: a recogniser, maps, a policy, candidate viewpoints and a stopping rule that belong together."""
+"""The front door: a recogniser, maps, a policy, candidate viewpoints and a stopping rule that
+belong together.
+"""
 
 import os
 import warnings
@@ -39,20 +41,30 @@ if TYPE_CHECKING:
     from nextview.simulation.sensor import Sensor
 
 MOST_THREADS = 1024
-DEFAULT, UNKNOWN = "modelnet10", 0.02  # the models that ship with the package, and their share of false alarms
+# the models that ship with the package, and their share of false alarms
+DEFAULT = "modelnet10"
+UNKNOWN = 0.02
 
 
 @dataclass(frozen=True, repr=False)
 class System:
-    """All that is needed to recognise an object. ``load`` makes one. It is pickled as how it was loaded."""
+    """All that is needed to recognise an object.
+
+    ``load`` makes one. It is pickled as how it was loaded.
+
+    Attributes:
+        sphere: the candidates.
+        unknown: share of objects of known classes that may be called unknown.
+        loaded: the arguments of ``load`` that make it.
+    """
 
     models: Models
     policy: Policy
     policy_name: str
-    sphere: Viewpoints  # the candidates
+    sphere: Viewpoints
     stopping: Stopping
-    unknown: float  # share of objects of known classes that may be called unknown
-    loaded: dict[str, Any] = field(repr=False)  # the arguments of ``load`` that make it
+    unknown: float
+    loaded: dict[str, Any] = field(repr=False)
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -69,22 +81,26 @@ class System:
         max_height: float | None = None,
         clearance: float | None = None,
     ) -> Session:
-        """One object under way, for whoever moves the camera. Those for a robot need no more than a distance.
+        """One object under way, for whoever moves the camera. Those for a robot need no more than a
+        distance.
 
-        Candidate views that touch the table, or what else the frames show, are left out: the last three say more of
-        it, see ``session.limits.Limits``.
+        Candidate views that touch the table, or what else the frames show, are left out: the last
+        three say more of it, see ``session.limits.Limits``.
 
         Args:
             start: where to look first, an index of ``sphere``; drawn by the seed if not given.
             seed: decides the first view and whatever the policy draws.
-            object: which object to find in the frames of a depth camera; by default the one at which the first camera
-                is aimed.
-            distance: how far from the object the camera shall stand, metres; 3 object radii by default. With an object
-                or a distance the session takes frames, else what it is given first.
-            min_height: of the camera above the support plane, metres, at least; by default 0.08, and a tenth of the
-                camera's distance from the object.
-            max_height: of the camera above the support plane, metres, at most; by default 2, or as high as it stood.
-            clearance: metres between the camera and what the frames show; 0.1 by default, 0 for any.
+            object: which object to find in the frames of a depth camera; by default the one at
+                which the first camera is aimed.
+            distance: how far from the object the camera shall stand, metres; 3 object radii by
+                default. With an object or a distance the session takes frames, else what it is
+                given first.
+            min_height: of the camera above the support plane, metres, at least; by default 0.08,
+                and a tenth of the camera's distance from the object.
+            max_height: of the camera above the support plane, metres, at most; by default 2, or as
+                high as it stood.
+            clearance: metres between the camera and what the frames show; 0.1 by default, 0 for
+                any.
         """
         rng = np.random.default_rng(whole(seed, "the seed", 0, 2**63 - 1))
         drawn = int(rng.integers(len(self.sphere)))
@@ -94,7 +110,9 @@ class System:
         session.limits = Limits(min_height, max_height, clearance)
         return session
 
-    def session_with(self, camera: Camera | FrameCamera, start: int | None = None, seed: int = 0) -> Session:
+    def session_with(
+        self, camera: Camera | FrameCamera, start: int | None = None, seed: int = 0
+    ) -> Session:
         """A session for a camera: where it gives frames, for its object."""
         if not isinstance(camera, FrameCamera):
             return self.session(start, seed)
@@ -116,17 +134,19 @@ class System:
         """Look at an object until it is clear what it is, or the views run out.
 
         Args:
-            what: a mesh file (OFF, OBJ, PLY, STL or GLB), a mesh, a folder of captured views, or a camera: anything
-                with ``observe(pose)``.
+            what: a mesh file (OFF, OBJ, PLY, STL or GLB), a mesh, a folder of captured views, or a
+                camera: anything with ``observe(pose)``.
             start: the first view, an index of ``sphere``; drawn by the seed if not given.
             seed: decides the first view and whatever the policy draws.
-            up: the up axis of a mesh file, "y" or "z"; z if not given, but y for GLB. Of a folder, the direction
-                against gravity in its world, (3,); by default as its layout has it.
-            unit: the unit of length of a file, one of ``mesh.UNITS``, if it is known: size says something of the class.
-            sensor: look at a mesh through this one, or through NAME or NAME:STRENGTH of ``known_sensors.SENSORS``; its
-                errors are drawn by the seed. None for clean renders.
-            largest_part: of a mesh file, leave out all that is not connected to its largest part, see ``load_mesh``.
-                What is likely to be wrong with a file's mesh is a Python warning.
+            up: the up axis of a mesh file, "y" or "z"; z if not given, but y for GLB. Of a folder,
+                the direction against gravity in its world, (3,); by default as its layout has it.
+            unit: the unit of length of a file, one of ``mesh.UNITS``, if it is known: size says
+                something of the class.
+            sensor: look at a mesh through this one, or through NAME or NAME:STRENGTH of
+                ``known_sensors.SENSORS``; its errors are drawn by the seed. None for clean renders.
+            largest_part: of a mesh file, leave out all that is not connected to its largest part,
+                see ``load_mesh``. What is likely to be wrong with a file's mesh is a Python
+                warning.
 
         Raises:
             MeshError, DatasetError: the file or the folder cannot be used.
@@ -136,7 +156,9 @@ class System:
         if largest_part and not (isinstance(what, str | Path) and not os.path.isdir(what)):
             raise UsageError("the largest part is taken of a mesh file while it is read")
         if isinstance(what, str) and not what.strip():
-            raise UsageError("what is looked at has an empty name; give a mesh file or a folder of views")
+            raise UsageError(
+                "what is looked at has an empty name; give a mesh file or a folder of views"
+            )
         if isinstance(what, str | Path):
             if os.path.isdir(what):  # not Path.is_dir, which raises where a name is too long
                 what = _camera_of(Path(what), up)
@@ -156,7 +178,8 @@ class System:
         return self.session_with(what, start, seed).run(what)
 
     def __repr__(self) -> str:
-        name, views = self.models.recogniser.name, len(self.sphere)
+        name = self.models.recogniser.name
+        views = len(self.sphere)
         return f"System({name}, policy {self.policy_name}, {views} viewpoints, {self.stopping})"
 
     def __reduce__(self) -> "tuple[Callable[[], System], tuple[()]]":
@@ -189,28 +212,34 @@ def load(
     """Open models, and what belongs to them.
 
     Args:
-        models: the name of bundled models, or a folder with the card of a recogniser, and of maps and policies of its
-            own if there are any. Maps that it lacks are the bundled ones, which know no classes. Or several of these:
-            memories of things with their geometry, and at most one network. A thing is named if its geometry explains
-            what is seen; else a class.
-        policy: how the next view is chosen; "gain" by default, where one was learned for these classes, else "spread".
-            Names are those of ``nextview.policies.registry``, of policy cards in the folder, or "MODULE:CLASS".
-        threshold: stop when the belief in one class reaches this after one view, and less after several.
-        risk: instead, stop at the lowest threshold at which at most this share of those who stop early is wrong.
+        models: the name of bundled models, or a folder with the card of a recogniser, and of maps
+            and policies of its own if there are any. Maps that it lacks are the bundled ones, which
+            know no classes. Or several of these: memories of things with their geometry, and at
+            most one network. A thing is named if its geometry explains what is seen; else a class.
+        policy: how the next view is chosen; "gain" by default, where one was learned for these
+            classes, else "spread". Names are those of ``nextview.policies.registry``, of policy
+            cards in the folder, or "MODULE:CLASS".
+        threshold: stop when the belief in one class reaches this after one view, and less after
+            several.
+        risk: instead, stop at the lowest threshold at which at most this share of those who stop
+            early is wrong.
         max_views: stop after so many views.
-        viewpoints: the candidates: "40", "12", "rings:0,30,60x12", "fibonacci:60", or directions or poses of your own,
-            see ``viewsphere.viewpoints_of``.
+        viewpoints: the candidates: "40", "12", "rings:0,30,60x12", "fibonacci:60", or directions or
+            poses of your own, see ``viewsphere.viewpoints_of``.
         threads: of ONNX Runtime, 0 for one on each core.
-        unknown: answer None where an object is as novel as at most this share of the objects of known classes: so
-            often one of these is called unknown; or where no object of the class has its size. 0 always names a class.
-            By default 0.02, where the recogniser has a novelty score.
-        stopping: a rule of your own: "MODULE:NAME" or a function, which is asked with what is believed and the
-            threshold, see ``recognition.own_stopping``; or a ``Stopping``, instead of threshold, risk and views.
+        unknown: answer None where an object is as novel as at most this share of the objects of
+            known classes: so often one of these is called unknown; or where no object of the class
+            has its size. 0 always names a class. By default 0.02, where the recogniser has a
+            novelty score.
+        stopping: a rule of your own: "MODULE:NAME" or a function, which is asked with what is
+            believed and the threshold, see ``recognition.own_stopping``; or a ``Stopping``, instead
+            of threshold, risk and views.
         recogniser: one of your own instead of that of the models: an object or "MODULE:NAME", see
             ``recognition.own_recogniser``. It is pickled with the system.
 
     Raises:
-        ModelError: there are no such models, one cannot be used, or the recogniser has no novelty score.
+        ModelError: there are no such models, one cannot be used, or the recogniser has no novelty
+            score.
         PolicyError: there is no such policy, or it cannot be made.
         RiskError: the error rate cannot be promised.
         UsageError: a threshold, a rate or a number of views makes no sense.
@@ -226,23 +255,33 @@ def load(
     sphere = viewpoints_of(viewpoints)
     knows = _opened(collections, threads) if recogniser is None else own_recogniser(recogniser)
     policies = found.policies
-    if recogniser is not None or len(names) > 1:  # the policy of a memory belongs to its things alone
+    # the policy of a memory belongs to its things alone
+    if recogniser is not None or len(names) > 1:
         policies = {name: card for name, card in policies.items() if name != DISCRIMINATE}
 
-    share = _unknown_share(unknown, knows, str(found.recogniser) if recogniser is None else knows.name)
+    share = _unknown_share(
+        unknown, knows, str(found.recogniser) if recogniser is None else knows.name
+    )
     if not share:
         knows.novelty = None  # it takes time
     if policy is None:
         name, made = _default_policy(policies, sphere, knows)
     else:
         name = str(policy)
-        made = make_policy_anywhere(with_cards(name, policies), sphere, (), knows.classes, found.maps)
+        made = make_policy_anywhere(
+            with_cards(name, policies), sphere, (), knows.classes, found.maps
+        )
 
     opened = Models(knows, open_maps(found.maps, made.needs, threads))
-    if name in opened.maps:  # a map's own policy goes to the valley for some classes, which the map's card names
-        made = make_policy_anywhere(name, sphere, opened.valley_classes(name), knows.classes, found.maps)
+    # a map's own policy goes to the valley for some classes, which the map's card names
+    if name in opened.maps:
+        made = make_policy_anywhere(
+            name, sphere, opened.valley_classes(name), knows.classes, found.maps
+        )
     if isinstance(made, MapPeak | SpherePeak):
-        made = replace(made, sphere=_grid_of(opened.maps[made.map_name.removesuffix(SPHERE)], made.sphere))
+        made = replace(
+            made, sphere=_grid_of(opened.maps[made.map_name.removesuffix(SPHERE)], made.sphere)
+        )
     rule = _rule(stopping, Stopping.of(knows.calibration, threshold, risk, max_views), risk)
     return System(opened, made, name, sphere, rule, share, given)
 
@@ -259,7 +298,9 @@ def _check_options(policy: Any, threads: int, risk: float | None, unknown: float
 
 
 def _names_of(models: Any) -> list[str]:
-    """Names or paths of collections, one or several; UsageError if they are none, or one is there twice."""
+    """Names or paths of collections, one or several; UsageError if they are none, or one is
+    there twice.
+    """
     given = list(models) if isinstance(models, list | tuple) else [models]
     for name in given or [models]:
         if not isinstance(name, str | Path):
@@ -272,14 +313,18 @@ def _names_of(models: Any) -> list[str]:
 
 def _opened(collections: dict[str, Collection], threads: int) -> Recogniser:
     """The recogniser of one collection, or that of several together."""
-    opened = {name: open_recogniser(found.recogniser, threads) for name, found in collections.items()}
+    opened = {
+        name: open_recogniser(found.recogniser, threads) for name, found in collections.items()
+    }
     if len(opened) > 1:
         return SeveralRecognisers(opened)
     return next(iter(opened.values()))
 
 
 def _unknown_share(asked: float | None, recogniser: Recogniser, called: str) -> float:
-    """Share of known objects that may be called unknown; ModelError where the recogniser cannot tell."""
+    """Share of known objects that may be called unknown; ModelError where the recogniser cannot
+    tell.
+    """
     can_tell = tells_unknown(recogniser)
     if asked and not can_tell:
         raise ModelError(f"{called}: cannot tell unknown objects; nextview fit unknown teaches it")
@@ -292,12 +337,16 @@ def _rule(given: Stopping | Rule | str | None, usual: Stopping, risk: float | No
     if given is None or isinstance(given, Stopping):
         return given or usual
     if risk is not None:
-        raise UsageError("error rates are promised for the package's own stopping rule, not for yours")
+        raise UsageError(
+            "error rates are promised for the package's own stopping rule, not for yours"
+        )
     return own_stopping(given, usual.threshold, usual.max_views)
 
 
 def _grid_of(network: MapNetwork, sphere: ViewSphere) -> ViewSphere:
-    """The grid whose local maps a network predicts: that of the views if it has as many rings, else the 40 views."""
+    """The grid whose local maps a network predicts: that of the views if it has as many rings,
+    else the 40 views.
+    """
     for grid in (sphere, *LAYOUTS.values()):
         if network.rings in (None, grid.rings):
             return grid
@@ -310,12 +359,18 @@ def _camera_of(folder: Path, up: str | tuple[float, float, float] | None) -> "Ca
     from nextview.simulation.captured_camera import UP, CapturedCamera
 
     if isinstance(up, str) and up not in UP:
-        raise UsageError(f"{folder}: up is {', '.join(UP)} or a direction, three numbers, not {up!r}")
+        raise UsageError(
+            f"{folder}: up is {', '.join(UP)} or a direction, three numbers, not {up!r}"
+        )
     return CapturedCamera(read_capture(folder), UP[up] if isinstance(up, str) else up)
 
 
-def _default_policy(own: dict[str, Path], sphere: Viewpoints, recogniser: Recogniser) -> tuple[str, Policy]:
-    """For taught things "discriminate"; "gain", where one fits, else "spread", which asks for nothing."""
+def _default_policy(
+    own: dict[str, Path], sphere: Viewpoints, recogniser: Recogniser
+) -> tuple[str, Policy]:
+    """For taught things "discriminate"; "gain", where one fits, else "spread", which asks for
+    nothing.
+    """
     if isinstance(recogniser, SeveralRecognisers):
         return DISCRIMINATE, DiscriminateGeometry(sphere)
     if (memory := own.get(DISCRIMINATE)) is not None:
@@ -323,7 +378,9 @@ def _default_policy(own: dict[str, Path], sphere: Viewpoints, recogniser: Recogn
     try:
         gain = make_policy_anywhere(str(own.get("gain", "gain")), sphere, (), recogniser.classes)
         grid = getattr(gain, "sphere", None)
-        if "azimuth_bins" not in gain.needs or recogniser.azimuth_bins == getattr(grid, "azimuths", None):
+        if "azimuth_bins" not in gain.needs or recogniser.azimuth_bins == getattr(
+            grid, "azimuths", None
+        ):
             return "gain", gain
     except OtherUseError:
         pass

@@ -14,39 +14,58 @@ from nextview.sensing.plausibility import ViewWarning
 
 @dataclass(frozen=True)
 class View:
-    """One view and what followed from it."""
+    """One view and what followed from it.
 
-    index: int  # candidate viewpoint that it was taken from, or the nearest one to where the camera stood
+    Attributes:
+        index: candidate viewpoint that it was taken from, or the nearest one to where the camera
+            stood.
+        alone: belief by this view alone, (classes,), by features where the geometry of all views is
+            judged together; even if nothing is seen in it.
+        belief: fused over all views so far, (classes,).
+        maps: predicted local maps by name, each (rings, 3).
+        next_view: where to look next; None where the episode ends.
+        travel: so far, grid cells.
+        arc: so far, radians.
+        direction: unit vector from the object to where the camera stood, (3,).
+        azimuth_bins: Belief, over all views, in the azimuth from which the object is seen here, for
+            each class, in even steps, (classes, azimuth bins); None if the recogniser does not
+            tell.
+        values: What the policy valued each candidate view at, (V,), NaN if not considered; None at
+            the end, and for policies that value nothing.
+        score: how novel it is; None if nothing is seen in it, or the recogniser has no score.
+        warnings: what is likely to be wrong with the view; usually nothing.
+        degrees_off: between the view that was asked for and where the camera stood; 0 for a first
+            frame.
+        joint: What all views up to this one say together, its poses in the object frame as it was
+            known then; None where the recogniser judges views one by one, or nothing was seen.
+    """
+
+    index: int
     observation: Observation = field(repr=False)
-    # belief by this view alone, (classes,), by features where the geometry of all views is judged together; even if
-    # nothing is seen in it
     alone: NDArray[np.float64] = field(repr=False)
-    belief: NDArray[np.float64] = field(repr=False)  # fused over all views so far, (classes,)
-    maps: dict[str, NDArray[np.floating]] = field(repr=False)  # predicted local maps by name, each (rings, 3)
-    next_view: int | None  # where to look next; None where the episode ends
-    travel: float  # so far, grid cells
-    arc: float  # so far, radians
-    direction: NDArray[np.float64]  # unit vector from the object to where the camera stood, (3,)
-    # Belief, over all views, in the azimuth from which the object is seen here, for each class, in even steps,
-    # (classes, azimuth bins); None if the recogniser does not tell.
+    belief: NDArray[np.float64] = field(repr=False)
+    maps: dict[str, NDArray[np.floating]] = field(repr=False)
+    next_view: int | None
+    travel: float
+    arc: float
+    direction: NDArray[np.float64]
     azimuth_bins: NDArray[np.float64] | None = field(default=None, repr=False)
-    # What the policy valued each candidate view at, (V,), NaN if not considered; None at the end, and for policies that
-    # value nothing.
     values: NDArray[np.float64] | None = field(default=None, repr=False)
-    # how novel it is; None if nothing is seen in it, or the recogniser has no score
     score: ViewScore | None = field(default=None, repr=False)
-    warnings: tuple[ViewWarning, ...] = ()  # what is likely to be wrong with the view; usually nothing
-    degrees_off: float = 0.0  # between the view that was asked for and where the camera stood; 0 for a first frame
-    # What all views up to this one say together, its poses in the object frame as it was known then; None where the
-    # recogniser judges views one by one, or nothing was seen.
+    warnings: tuple[ViewWarning, ...] = ()
+    degrees_off: float = 0.0
     joint: JointBelief | None = field(default=None, repr=False)
 
     @property
     def novelty(self) -> float | None:
-        """The novelty score of this view, made when it is first asked for; None if there is none."""
+        """The novelty score of this view, made when it is first asked for; None if there is
+        none.
+        """
         return None if self.score is None else values_of([self.score])[0]
 
     @property
     def angles(self) -> tuple[float, float]:
         """(elevation, azimuth) of where the camera stood, degrees."""
-        return float(np.degrees(elevation_of(self.direction))), float(np.degrees(azimuth_of(self.direction)))
+        return float(np.degrees(elevation_of(self.direction))), float(
+            np.degrees(azimuth_of(self.direction))
+        )

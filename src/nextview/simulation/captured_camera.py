@@ -14,14 +14,17 @@ from nextview.sensing.observed_object import ObservedObject
 from nextview.simulation.captured import Capture, CapturedFrame, Float
 from nextview.simulation.captured_check import check_capture, refuse_many
 
-UP = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}  # the axes of a world that may be called up by name
+# the axes of a world that may be called up by name
+UP = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 AROUND = 3  # pixels around the object's centre that tell whether it is hidden
 HIDDEN = 1.5  # object radii before its centre from which something else hides it
 
 
 @dataclass(frozen=True)
 class Taken:
-    """A captured view that answered a request, and how far off the direction asked for it is, from the object."""
+    """A captured view that answered a request, and how far off the direction asked for it is,
+    from the object.
+    """
 
     frame: CapturedFrame
     degrees_off: float
@@ -56,7 +59,8 @@ class CapturedCamera:
         ObservationError: the object is found in none of the views.
     """
 
-    knows_reach = True  # the camera stood there when the frames were captured; see ``session.FrameCamera``
+    # the camera stood there when the frames were captured; see ``session.FrameCamera``
+    knows_reach = True
 
     def __init__(
         self,
@@ -174,8 +178,12 @@ class CapturedCamera:
             found = thing.object_frame
             if point is None:
                 return found
-            return ObjectFrame(np.asarray(point, np.float64), found.radius, upright_axes(found.axes[2]))
-        raise ObservationError(f"{self.capture.folder}: the object is found in none of the views ({reason})")
+            return ObjectFrame(
+                np.asarray(point, np.float64), found.radius, upright_axes(found.axes[2])
+            )
+        raise ObservationError(
+            f"{self.capture.folder}: the object is found in none of the views ({reason})"
+        )
 
 
 def _degrees_off(frame: CapturedFrame, asked: Float, found: ObjectFrame) -> float:

@@ -1,7 +1,8 @@
-"""Mistakes of a camera that are the same in all frames of a capture, and which of them makes the frames agree.
+"""Mistakes of a camera that are the same in all frames of a capture, and which of them makes the
+frames agree.
 
-Pictures that are flipped, a wrong focal length, and poses of a place beside the camera: each moves all that is seen
-with the camera, so that frames from different sides contradict each other.
+Pictures that are flipped, a wrong focal length, and poses of a place beside the camera: each moves
+all that is seen with the camera, so that frames from different sides contradict each other.
 """
 
 from collections.abc import Sequence
@@ -14,8 +15,10 @@ from nextview.sensing.agreement import SHARP, Agreement, SurfaceView, compare
 
 Float = NDArray[np.float64]
 
-LEAST_SHARE = 0.05  # share of the points that is contradicted from which a mistake of the camera is searched for
-FEWER_CONTRADICTIONS = 0.5  # a mistake is named if at most this part of the contradicted share is left without it
+# share of the points that is contradicted from which a mistake of the camera is searched for
+LEAST_SHARE = 0.05
+# a mistake is named if at most this part of the contradicted share is left without it
+FEWER_CONTRADICTIONS = 0.5
 LEAST_OVERLAP = 0.5  # and if at least this part of the points can still be judged
 FLIPS = {
     "flipped left to right": (-1.0, 1.0, 1.0),
@@ -23,7 +26,8 @@ FLIPS = {
     "upside down, turned by half a turn": (-1.0, -1.0, 1.0),
 }
 """What becomes of the axes of a camera whose pictures are flipped."""
-FOCAL_STEPS = 0.05 * np.arange(-14, 15)  # logarithms of the factors that are tried first, from a half to twice
+# logarithms of the factors that are tried first, from a half to twice
+FOCAL_STEPS = 0.05 * np.arange(-14, 15)
 FINER_STEPS = 0.0125 * np.arange(-3, 4)  # around the best of them
 LEAST_FOCAL_CHANGE = 0.05  # part of the focal length; less is a matter of calibration
 LEAST_OFFSET = 0.02  # metres; less is a matter of calibration
@@ -31,11 +35,13 @@ FIRST_STEP = 0.03  # metres of the search for an offset
 MOST_TRIALS = 120  # offsets that are tried
 MOST_FITTED = 20  # frames by which an offset is fitted, evenly spread
 FEWEST_STANDING = 10  # points of a frame whose middle tells where its object is
-NOT_OBSERVED = 1e-2  # part of the largest singular value below which an offset has no effect in that direction
+# part of the largest singular value below which an offset has no effect in that direction
+NOT_OBSERVED = 1e-2
 
 
 def find_camera_mistake(views: Sequence[SurfaceView], poses: Float, intrinsics: Float) -> str:
-    """What is wrong with the camera of some frames, the end of a sentence; "" if nothing that would explain them.
+    """What is wrong with the camera of some frames, the end of a sentence; "" if nothing that would
+    explain them.
 
     Args:
         views: N frames.
@@ -45,7 +51,9 @@ def find_camera_mistake(views: Sequence[SurfaceView], poses: Float, intrinsics: 
     as_read = compare(views, poses, sharpness=SHARP)
     if 1 - as_read.share < LEAST_SHARE:
         return ""
-    return _flip(views, poses, as_read) or _focal_length(views, poses, as_read, float(intrinsics[0, 0]))
+    return _flip(views, poses, as_read) or _focal_length(
+        views, poses, as_read, float(intrinsics[0, 0])
+    )
 
 
 def find_offset(views: Sequence[SurfaceView], poses: Float) -> str:
@@ -61,12 +69,15 @@ def find_offset(views: Sequence[SurfaceView], poses: Float) -> str:
 
     offset = _fitted_offset(views, poses)
     distance = float(np.linalg.norm(offset))
-    if distance < LEAST_OFFSET or not _explains(compare(views, _moved(poses, offset), sharpness=SHARP), as_read):
+    if distance < LEAST_OFFSET or not _explains(
+        compare(views, _moved(poses, offset), sharpness=SHARP), as_read
+    ):
         return ""
     where = ", ".join(f"{value:+.2f}" for value in offset)
     return (
-        f"the camera stands some {100 * distance:.0f} cm beside its poses, the same way in all frames ({where} m along "
-        "its axes x right, y down, z forward): is the hand-eye calibration missing or wrong?"
+        f"the camera stands some {100 * distance:.0f} cm beside its poses, the same way in all"
+        f" frames ({where} m along its axes x right, y down, z forward): is the hand-eye"
+        " calibration missing or wrong?"
     )
 
 
@@ -88,7 +99,9 @@ def _flip(views: Sequence[SurfaceView], poses: Float, as_read: Agreement) -> str
     return best
 
 
-def _focal_length(views: Sequence[SurfaceView], poses: Float, as_read: Agreement, given: float) -> str:
+def _focal_length(
+    views: Sequence[SurfaceView], poses: Float, as_read: Agreement, given: float
+) -> str:
     """By how much the focal length, pixels, is wrong, in words; "" if it is not."""
     times = 1.0
     for steps in (FOCAL_STEPS, FINER_STEPS):
@@ -97,7 +110,9 @@ def _focal_length(views: Sequence[SurfaceView], poses: Float, as_read: Agreement
         times = float(factors[int(np.argmax([each.share for each in found]))])
 
     wrong = 1 / times - 1
-    if abs(wrong) < LEAST_FOCAL_CHANGE or not _explains(_with_focal_length(views, poses, times), as_read):
+    if abs(wrong) < LEAST_FOCAL_CHANGE or not _explains(
+        _with_focal_length(views, poses, times), as_read
+    ):
         return ""
     what = "long" if wrong > 0 else "short"
     percent = f"the focal length is some {100 * abs(wrong):.0f} % too {what}"
@@ -118,7 +133,9 @@ def _moved(poses: Float, offset: Float) -> Float:
 
 
 def _fitted_offset(views: Sequence[SurfaceView], poses: Float) -> Float:
-    """The offset along the cameras' axes, (3,), metres, with which the frames contradict each other least."""
+    """The offset along the cameras' axes, (3,), metres, with which the frames contradict each
+    other least.
+    """
     few = np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_FITTED)).astype(int))
     some = [views[i] for i in few]
 
@@ -129,16 +146,21 @@ def _fitted_offset(views: Sequence[SurfaceView], poses: Float) -> Float:
     start = min((_offset_of_middles(views, poses), np.zeros(3)), key=contradicted)
     simplex = start + np.vstack([np.zeros(3), FIRST_STEP * np.eye(3)])
     found = minimize(
-        contradicted, start, method="Nelder-Mead", options={"maxfev": MOST_TRIALS, "initial_simplex": simplex}
+        contradicted,
+        start,
+        method="Nelder-Mead",
+        options={"maxfev": MOST_TRIALS, "initial_simplex": simplex},
     )
     return np.asarray(found.x, np.float64)
 
 
 def _offset_of_middles(views: Sequence[SurfaceView], poses: Float) -> Float:
-    """The offset, (3,), metres, with which the middles of what stands on the plane are nearest to each other.
+    """The offset, (3,), metres, with which the middles of what stands on the plane are nearest to
+    each other.
 
-    Least squares in the place w of the object and the offset d, with w - R d = R c + t for the middle c that a camera
-    of the pose (R, t) sees. Cameras see the near side of the object: that is an error along their axes.
+    Least squares in the place w of the object and the offset d, with w - R d = R c + t for the
+    middle c that a camera of the pose (R, t) sees. Cameras see the near side of the object: that is
+    an error along their axes.
     """
     matrix = []
     middles = []

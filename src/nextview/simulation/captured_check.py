@@ -1,4 +1,6 @@
-"""Check captured frames: leave out and count what cannot be used, and refuse poses that cannot be right."""
+"""Check captured frames: leave out and count what cannot be used, and refuse poses that cannot
+be right.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +26,8 @@ MOST_REFUSED = 0.1  # share of the frames that may be left out; a single one alw
 CONTRADICTED_SHARE = 0.5  # a frame of which less is confirmed contradicts the others
 CONTRADICTED_SHARPLY = 0.3  # the same, looked at sharply, if it is also so many times what is usual
 TIMES_USUAL = 4.0
-CONTRADICTED_IN_ALL = 0.3  # share of what stands on the plane that is contradicted where frames disagree altogether
+# share of what stands on the plane that is contradicted where frames disagree altogether
+CONTRADICTED_IN_ALL = 0.3
 FEWEST_TO_BLAME = 5  # frames of which one may be blamed if they disagree
 PLAUSIBLE_DEPTH = (0.05, 15.0)  # metres that a capture of an object may have as its median depth
 NEVER_A_DEPTH = 25  # times by which a depth scale is hardly ever wrong, and a unit of length often
@@ -85,11 +88,14 @@ def summary(refused: Mapping[str, str]) -> str:
     return f"{listed}: {commonest}" + (f"; {others} for other reasons" if others else "")
 
 
-def _read_some(capture: Capture, masked: bool, refused: dict[str, str]) -> tuple[np.ndarray, list[Frame]]:
+def _read_some(
+    capture: Capture, masked: bool, refused: dict[str, str]
+) -> tuple[np.ndarray, list[Frame]]:
     """Read frames that are spread evenly; those that cannot be read are added to ``refused``."""
     count = len(capture.frames)
     spread = np.unique(np.linspace(0, count - 1, min(count, MOST_COMPARED)).astype(int))
-    indices, frames = [], []
+    indices = []
+    frames = []
     for i in spread:
         captured = capture.frames[i]
         try:
@@ -136,7 +142,9 @@ def _contradicting(capture: Capture, compared: np.ndarray, frames: list[Frame]) 
     for shift in shifts:
         late[shift.first : shift.end] = True
     if late.sum() > most:
-        raise _disagree(capture, " and ".join(_shift_in_words(capture, compared, shift) for shift in shifts))
+        raise _disagree(
+            capture, " and ".join(_shift_in_words(capture, compared, shift) for shift in shifts)
+        )
     refused = _late_frames(capture, compared, shifts)
 
     kept = np.flatnonzero(~late)
@@ -147,10 +155,15 @@ def _contradicting(capture: Capture, compared: np.ndarray, frames: list[Frame]) 
     too_many = len(blamed) > most_blamed
     if too_many or (len(left) > 1 and _disagreeing(evidence, left)):
         looks = find_offset(views, posed.as_read())
-        raise _disagree(capture, looks) if looks else _unexplained(capture, compared[kept], evidence)
+        raise (
+            _disagree(capture, looks) if looks else _unexplained(capture, compared[kept], evidence)
+        )
 
     for i, share in blamed.items():
-        what = f"it contradicts the other frames ({1 - share:.0%} of what it shows with them): was its pose lost?"
+        what = (
+            f"it contradicts the other frames ({1 - share:.0%} of what it shows with them): was its"
+            " pose lost?"
+        )
         refused[capture.frames[compared[kept[i]]].name] = what
     return refused
 
@@ -179,14 +192,19 @@ class Evidence:
     def of(cls, views: Sequence[SurfaceView], poses: np.ndarray) -> "Evidence":
         """That of frames with some poses, camera-to-world, (N, 4, 4)."""
         standing = [view.some(view.standing) for view in views]
-        return cls(compare(views, poses), compare(standing, poses), compare(standing, poses, sharpness=SHARP))
+        return cls(
+            compare(views, poses),
+            compare(standing, poses),
+            compare(standing, poses, sharpness=SHARP),
+        )
 
 
 def _to_blame(evidence: Evidence) -> dict[int, float]:
-    """Frames that contradict the others much more than these each other, the worst first, with the confirmed share.
+    """Frames that contradict the others much more than these each other, the worst first, with the
+    confirmed share.
 
-    A frame is blamed where most of its points are contradicted, or most of those that stand out of the largest plane;
-    or, looked at sharply, many times as many of them as in the other frames.
+    A frame is blamed where most of its points are contradicted, or most of those that stand out of
+    the largest plane; or, looked at sharply, many times as many of them as in the other frames.
     """
     kept = np.ones(len(evidence.all.confirmed), bool)
     blamed: dict[int, float] = {}
@@ -215,7 +233,8 @@ def _enough_judged(agreement: Agreement) -> np.ndarray:
 
 
 def _disagreeing(evidence: Evidence, left: np.ndarray) -> bool:
-    """Whether frames, without those that are blamed, contradict each other about what stands on the plane.
+    """Whether frames, without those that are blamed, contradict each other about what stands on the
+    plane.
 
     All of them do, or those from one frame on contradict those before.
     """
@@ -235,12 +254,17 @@ def _unexplained(capture: Capture, compared: np.ndarray, evidence: Evidence) -> 
     first = _break(evidence.standing)
     if first:
         name = capture.frames[compared[first]].name
-        hint = f"the frames from {name} on contradict those before: did the object or the camera's base move there?"
+        hint = (
+            f"the frames from {name} on contradict those before: did the object or the camera's"
+            " base move there?"
+        )
     return DatasetError(f"{capture.folder}: {problem}: {hint}")
 
 
 def _break(agreement: Agreement) -> int:
-    """The first of the frames that agree with each other, but not with those before; 0 if there is none."""
+    """The first of the frames that agree with each other, but not with those before; 0 if there
+    is none.
+    """
     count = len(agreement.confirmed)
     best = 0
     largest = 0.0
@@ -265,7 +289,9 @@ def _across(agreement: Agreement, first: int) -> Agreement:
 
 
 def _late_frames(capture: Capture, compared: np.ndarray, shifts: Sequence[Shift]) -> dict[str, str]:
-    """Frames with the poses of others and why they are left out; also those between them that were not compared."""
+    """Frames with the poses of others and why they are left out; also those between them that
+    were not compared.
+    """
     refused = {}
     for shift in shifts:
         reason = f"its pose is {_frames_late(shift)}"
@@ -288,7 +314,9 @@ def _shift_in_words(capture: Capture, compared: np.ndarray, shift: Shift) -> str
 
 
 def _frames_late(shift: Shift) -> str:
-    """By how many frames poses are late: one frame late: each frame has the pose of an earlier one."""
+    """By how many frames poses are late: one frame late: each frame has the pose of an earlier
+    one.
+    """
     many = "one frame" if abs(shift.frames) == 1 else f"{abs(shift.frames)} frames"
     if shift.frames > 0:
         return f"{many} late: each frame has the pose of an earlier one"
@@ -296,7 +324,9 @@ def _frames_late(shift: Shift) -> str:
 
 
 def _in_words(capture: Capture, mistake: PoseMistake, depth: float, unit: float) -> str:
-    """What a mistake looks like; of a scale whether it is that of the translations or of the depth."""
+    """What a mistake looks like; of a scale whether it is that of the translations or of the
+    depth.
+    """
     if mistake.scale == 1:
         return mistake.sentence
     said = [mistake.sentence] if mistake.sentence else []
@@ -313,8 +343,13 @@ def _scale_in_words(capture: Capture, scale: float, depth: float, unit: float) -
 
     times = scale if scale > 1 else 1 / scale
     step = 1000 * capture.frames[0].scale
-    depths = f"the depth is {times:g} times too {'large' if scale > 1 else 'small'}: its steps are of "
-    depths += f"{step / scale:.3g} mm, not of {step:.3g} mm ({DEPTH_SOURCES.get(capture.layout, 'in its files')})"
+    depths = (
+        f"the depth is {times:g} times too {'large' if scale > 1 else 'small'}: its steps are of "
+    )
+    depths += (
+        f"{step / scale:.3g} mm, not of {step:.3g} mm"
+        f" ({DEPTH_SOURCES.get(capture.layout, 'in its files')})"
+    )
 
     plausible = PLAUSIBLE_DEPTH[0] <= depth <= PLAUSIBLE_DEPTH[1]
     if translations and plausible and times >= NEVER_A_DEPTH:

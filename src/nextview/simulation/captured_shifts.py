@@ -1,8 +1,9 @@
 """Find the frames of a capture whose poses are those of frames before or after them.
 
-A camera that drops an image, or a recorder that drops a pose, leaves all later frames with the pose of a neighbour.
-Within each part the frames still fit together, and between the parts they do not. A turn about the normal of the
-table leaves the table where it is, so only what stands on it is judged.
+A camera that drops an image, or a recorder that drops a pose, leaves all later frames with the pose
+of a neighbour. Within each part the frames still fit together, and between the parts they do not. A
+turn about the normal of the table leaves the table where it is, so only what stands on it is
+judged.
 """
 
 from collections.abc import Sequence
@@ -20,13 +21,16 @@ Index = NDArray[np.int64]
 FRAME_SHIFTS = (1, -1, 2, -2)  # frames by which the poses of a part may be late
 MOST_SHIFTED = 4  # frames by which poses may be late after several parts
 MOST_PARTS = 3  # parts that are searched for, one inside the other or one after the other
-FEWER_CONTRADICTIONS = 0.5  # the shift is named if at most this part of the contradictions is left without it
+# the shift is named if at most this part of the contradictions is left without it
+FEWER_CONTRADICTIONS = 0.5
 LEAST_EXPLAINED = 100  # contradictions that a shift has to explain
 LEAST_OF_ALL = 0.1  # part of all contradictions that each further part has to explain
 LEAST_SHARE = 0.01  # ... and the share of the points that it concerns
 LEAST_OVERLAP = 0.5  # part of these points that can still be judged without it
 SAME_EXPLAINED = 1e-3  # contradictions that one more frame in a part has to explain
-AS_GOOD = 0.5  # part of what parts explain that the same parts explain where the first frames are taken to be right
+# part of what parts explain that the same parts explain where the first frames are taken to be
+# right
+AS_GOOD = 0.5
 SAME_POSE = 1e-3  # metres, and parts of a rotation, up to which two poses are the same
 
 
@@ -61,7 +65,9 @@ class Shifted:
     _known: dict[tuple[int, int], Agreement] = field(default_factory=dict)
 
     def agreement(self, late: Index, late_there: Index) -> Agreement:
-        """Of frames, by row, whose poses are late by so many frames, with pictures, by column, that are, (N,) each."""
+        """Of frames, by row, whose poses are late by so many frames, with pictures, by column,
+        that are, (N,) each.
+        """
         count = len(self.views)
         confirmed = np.zeros((count, count))
         contradicted = np.zeros((count, count))
@@ -74,7 +80,9 @@ class Shifted:
         return Agreement(confirmed, contradicted)
 
     def poses_of(self, late: Index) -> Float:
-        """The right poses of the frames if those in the capture are late by so many frames, (N, 4, 4)."""
+        """The right poses of the frames if those in the capture are late by so many frames, (N,
+        4, 4).
+        """
         return self.poses[np.clip(self.indices + late, 0, len(self.poses) - 1)]
 
     def has_pose(self, late: Index) -> NDArray[np.bool_]:
@@ -88,14 +96,17 @@ class Shifted:
             late = np.full(len(self.views), here)
             late_there = np.full(len(self.views), there)
             looked_up_with = self.poses_of(late_there)
-            found = compare(self.views, self.poses_of(late), sharpness=SHARP, looked_up_with=looked_up_with)
+            found = compare(
+                self.views, self.poses_of(late), sharpness=SHARP, looked_up_with=looked_up_with
+            )
             usable = self.has_pose(late)[:, None] & self.has_pose(late_there)
             self._known[here, there] = found.among(usable)
         return self._known[here, there]
 
 
 def find_shifts(views: Sequence[SurfaceView], indices: Index, poses: Float) -> list[Shift]:
-    """Parts of a capture whose poses are late or early; none if no such parts explain what the frames contradict.
+    """Parts of a capture whose poses are late or early; none if no such parts explain what the
+    frames contradict.
 
     Parts are added one by one, each where it explains most contradictions.
 
@@ -123,7 +134,8 @@ def find_shifts(views: Sequence[SurfaceView], indices: Index, poses: Float) -> l
         late = late.copy()
         late[found.first : found.end] += found.frames
 
-    # On a steady way around a thing only differences between shifts show. Then the first frames are taken to be right.
+    # On a steady way around a thing only differences between shifts show. Then the first frames are
+    # taken to be right.
     others = late - late[1]
     others[0] = min(others[0], 0, key=abs)
     if _explained(shifted, as_read, others) >= AS_GOOD * _explained(shifted, as_read, late):
@@ -132,7 +144,9 @@ def find_shifts(views: Sequence[SurfaceView], indices: Index, poses: Float) -> l
 
 
 def _best_part(shifted: Shifted, late: Index, least: float) -> Shift | None:
-    """The part that explains most contradictions if its poses are later than is known; None if fewer than ``least``."""
+    """The part that explains most contradictions if its poses are later than is known; None if
+    fewer than ``least``.
+    """
     best = None
     most_explained = least
     for frames in FRAME_SHIFTS:
@@ -150,7 +164,8 @@ def _best_part(shifted: Shifted, late: Index, least: float) -> Shift | None:
 
 
 def _explained_by_parts(shifted: Shifted, late: Index, later: Index) -> Float:
-    """How many contradictions vanish if the frames from one, by row, to another, by column, have later poses.
+    """How many contradictions vanish if the frames from one, by row, to another, by column, have
+    later poses.
 
     Frames that have no later pose explain nothing.
     """
@@ -195,13 +210,17 @@ def _corner_sums(values: Float) -> Float:
 
 def _sum(sums: Float, rows: slice, columns: slice) -> float:
     """Sum over some rows and columns, from what ``_corner_sums`` gives."""
-    low, high = rows.start, rows.stop
-    left, right = columns.start, columns.stop
+    low = rows.start
+    high = rows.stop
+    left = columns.start
+    right = columns.stop
     return float(sums[high, right] - sums[low, right] - sums[high, left] + sums[low, left])
 
 
 def _explained(shifted: Shifted, late: Index, later: Index) -> float:
-    """How many contradictions vanish if the frames have later poses, of those that have such poses."""
+    """How many contradictions vanish if the frames have later poses, of those that have such
+    poses.
+    """
     usable = shifted.has_pose(later)
     pairs = usable[:, None] & usable
     before = shifted.agreement(late, late).contradicted[pairs]
@@ -210,7 +229,9 @@ def _explained(shifted: Shifted, late: Index, later: Index) -> float:
 
 
 def _is_explained(shifted: Shifted, as_read: Index, late: Index) -> bool:
-    """Whether frames whose poses relative to each other change contradict each other much less with the later poses."""
+    """Whether frames whose poses relative to each other change contradict each other much less
+    with the later poses.
+    """
     usable = shifted.has_pose(late)
     changed = _relative_change(shifted.poses_of(as_read), shifted.poses_of(late))
     changed &= usable[:, None] & usable

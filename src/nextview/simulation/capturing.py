@@ -1,4 +1,6 @@
-"""Write captured views of a mesh in BOP's layout, from a camera that casts rays: what ``captured`` reads."""
+"""Write captured views of a mesh in BOP's layout, from a camera that casts rays: what
+``captured`` reads.
+"""
 
 import json
 from collections.abc import Iterator
@@ -16,7 +18,8 @@ from nextview.geometry.viewsphere import DISTANCE, ViewSphere, look_at_origin
 from nextview.simulation.captured import NOTHING, pinhole_of
 from nextview.simulation.scene import square
 
-PINHOLE = pinhole_of(525.0, 525.0, 319.5, 239.5)  # a Kinect's as ROS has it by default; first pixel's centre at 0
+# a Kinect's as ROS has it by default; first pixel's centre at 0
+PINHOLE = pinhole_of(525.0, 525.0, 319.5, 239.5)
 SHAPE = 480, 640
 TABLE = 2.0  # half the side of the table, object radii
 STEP = 0.0001  # metres that one step of the depth images stands for
@@ -31,42 +34,64 @@ def write_capture(
     masks: bool = True,
     overwrite: bool = False,
 ) -> Iterator[int]:
-    """Write a folder of captured views, and box.json, the object's upright box, whole; yields how many are done.
+    """Write a folder of captured views, and box.json, the object's upright box, whole; yields how
+    many are done.
 
-    The world, metres, is z up and has the axes of the mesh, whose object radius is ``radius``; its origin is below the
-    object's centre, at its lowest point. The object may stand on a ``table`` that is seen too, and have ``masks``.
+    The world, metres, is z up and has the axes of the mesh, whose object radius is ``radius``; its
+    origin is below the object's centre, at its lowest point. The object may stand on a ``table``
+    that is seen too, and have ``masks``.
     """
     number(radius, "the object radius, in metres,", above=0)
     _check_others(folder, len(sphere), masks)
     if (farthest := radius * (DISTANCE + max(1.0, 1.5 * TABLE * table))) > STEP * NOTHING:
-        raise UsageError(f"the camera sees {farthest:.3g} m far, the depth images end at {STEP * NOTHING:.3g} m")
+        raise UsageError(
+            f"the camera sees {farthest:.3g} m far, the depth images end at {STEP * NOTHING:.3g} m"
+        )
     height = -radius * float(mesh.vertices[:, 2].min())
     vertices = radius * mesh.vertices + np.array([0, 0, height])
     things = [(vertices, mesh.faces)] + [square(TABLE * radius, 0.0)] * table
-    caster, rays = RayCaster(things), pixel_rays(pinhole_of(525.0, 525.0, 320.0, 240.0), SHAPE).reshape(-1, 3)
+    caster = RayCaster(things)
+    rays = pixel_rays(pinhole_of(525.0, 525.0, 320.0, 240.0), SHAPE).reshape(-1, 3)
     # The box has an inside, even that of a flat mesh.
-    low, high = vertices.min(0) - 1e-6 * radius, vertices.max(0) + 1e-6 * radius
+    low = vertices.min(0) - 1e-6 * radius
+    high = vertices.max(0) + 1e-6 * radius
     # The object is number 1, its model the mesh as in its file but in mm.
     model = [0, 0, height] - radius / mesh.radius * mesh.centre
     x, y, z = sphere.directions.T
-    elevation = np.clip(np.arcsin(np.clip(z, -1, 1)), 0.0 if table else -np.pi / 2, np.pi / 2)  # not below the table
+    # not below the table
+    elevation = np.clip(np.arcsin(np.clip(z, -1, 1)), 0.0 if table else -np.pi / 2, np.pi / 2)
     poses = look_at_origin(elevation, np.arctan2(y, x), DISTANCE * radius)
     poses[:, 2, 3] += height
-    cameras, objects = {}, {}
-    # Without this record the folder is no capture: a run that is stopped leaves no mixture of two objects' views.
+    cameras = {}
+    objects = {}
+    # Without this record the folder is no capture: a run that is stopped leaves no mixture of two
+    # objects' views.
     with new_folder(folder, overwrite, last="scene_camera.json", withdraw=True) as new:
-        (new / "box.json").write_text(json.dumps({"low": low.tolist(), "high": high.tolist()}) + "\n")
+        (new / "box.json").write_text(
+            json.dumps({"low": low.tolist(), "high": high.tolist()}) + "\n"
+        )
         for name in ("depth", "mask_visib")[: 1 + masks]:
             (new / name).mkdir()
         for i, pose in enumerate(poses):
             rotation = pose[:3, :3].T
-            translation, flat = -rotation @ pose[:3, 3], rotation.ravel().tolist()
+            translation = -rotation @ pose[:3, 3]
+            flat = rotation.ravel().tolist()
             there = {"cam_R_w2c": flat, "cam_t_w2c": (1000 * translation).tolist()}
-            cameras[str(i)] = {"cam_K": PINHOLE.ravel().tolist(), "depth_scale": 1000 * STEP, **there}
+            cameras[str(i)] = {
+                "cam_K": PINHOLE.ravel().tolist(),
+                "depth_scale": 1000 * STEP,
+                **there,
+            }
             placed = 1000 * (rotation @ model + translation)
             objects[str(i)] = [{"obj_id": 1, "cam_R_m2c": flat, "cam_t_m2c": placed.tolist()}]
-            depth, which = caster.cast(pose[:3, 3], rays @ np.ascontiguousarray(rotation, np.float32))
-            steps = np.rint(np.where(which < 0, np.float32(0), depth) / STEP).astype(np.uint16).reshape(SHAPE)
+            depth, which = caster.cast(
+                pose[:3, 3], rays @ np.ascontiguousarray(rotation, np.float32)
+            )
+            steps = (
+                np.rint(np.where(which < 0, np.float32(0), depth) / STEP)
+                .astype(np.uint16)
+                .reshape(SHAPE)
+            )
             Image.fromarray(steps).save(new / f"depth/{i:06d}.png")
             if masks:
                 mask = np.where(which == 0, 255, 0).astype(np.uint8).reshape(SHAPE)
@@ -77,10 +102,12 @@ def write_capture(
 
 
 def _check_others(folder: Path, views: int, masks: bool) -> None:
-    """Refuse a folder with images that reading the new views would take for theirs, but that are not replaced.
+    """Refuse a folder with images that reading the new views would take for theirs, but that are
+    not replaced.
 
     Raises:
-        ResultsError: it holds colour or grey images of views of these numbers, or masks where none are written.
+        ResultsError: it holds colour or grey images of views of these numbers, or masks where none
+            are written.
     """
     others = {"rgb": "", "gray": ""} | ({} if masks else {"mask_visib": "_*"})
     for name, end in others.items():
@@ -88,4 +115,6 @@ def _check_others(folder: Path, views: int, masks: bool) -> None:
             found = next(folder.glob(f"{name}/{i:06d}{end}.*"), None)
             if found is not None:
                 what = "an image that would be taken for one of the new views"
-                raise ResultsError(f"{found}: is {what}; remove the folder {name}, or give another one")
+                raise ResultsError(
+                    f"{found}: is {what}; remove the folder {name}, or give another one"
+                )

@@ -15,19 +15,30 @@ Index = NDArray[np.int64]
 
 FEWEST_JUDGED = 100  # points that two frames or more have to share before anything is said
 CERTAIN_SHARE = 0.99  # share of confirmed points from which no mistake is searched for
-GOOD_SHARE = 0.9  # the same, from which only shifted poses are: they leave most pairs of frames right
+# the same, from which only shifted poses are: they leave most pairs of frames right
+GOOD_SHARE = 0.9
 FEWER_CONTRADICTIONS = 0.5  # a mistake is named if without it at most this part of them is left
 LEAST_CONTRADICTED = 0.08  # ... of at least this share of the points that it concerns
 LEAST_OVERLAP = 0.5  # and if at least this part of the points can still be judged without it
-NO_OVERLAP = 0.25  # as read, frames that see less than this part of what they could see in common look past each other
+# as read, frames that see less than this part of what they could see in common look past each other
+NO_OVERLAP = 0.25
 WELL_EXPLAINED = 0.85  # share of the points that are confirmed without the mistake
 ONE_PLACE = 0.1  # cameras within this part of the depth stand in one place: no capture of an object
 SAME_POSE = 1e-3  # metres, and parts of a rotation, up to which two poses are the same
 FRAME_SHIFTS = (1, -1, 2, -2)  # by how many frames poses may be late
-UNIT_NAMES = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres", 0.0254: "inches", 0.3048: "feet"}
+UNIT_NAMES = {
+    1.0: "metres",
+    0.01: "centimetres",
+    0.001: "millimetres",
+    0.0254: "inches",
+    0.3048: "feet",
+}
 DEPTH_SCALES = (1000, 100, 10, 5, 4, 2.5, 2, 0.5, 0.4, 0.25, 0.2, 0.1, 0.01, 0.001)
-"""By which the depth may be too large: the steps of cameras are 1, 0.5, 0.25, 0.2, 0.125 and 0.1 mm."""
-COMMON_SCALES = (1000, 0.001, 10, 0.1, 5, 0.2, 4, 0.25)  # that are tried together with another mistake
+"""By which the depth may be too large: the steps of cameras are 1, 0.5, 0.25, 0.2, 0.125 and 0.1
+mm.
+"""
+# that are tried together with another mistake
+COMMON_SCALES = (1000, 0.001, 10, 0.1, 5, 0.2, 4, 0.25)
 
 
 @dataclass(frozen=True)
@@ -89,13 +100,16 @@ def find_mistake(posed: Posed, as_read: Agreement) -> PoseMistake | None:
 
 
 def _best(posed: Posed, as_read: Agreement, mistakes: Sequence[PoseMistake]) -> PoseMistake | None:
-    """Of the mistakes that explain much better what is seen, the one with the most confirmed points."""
+    """Of the mistakes that explain much better what is seen, the one with the most confirmed
+    points.
+    """
     best = None
     most_confirmed = 0.0
     for mistake in mistakes:
         confirmed = _explained(posed, as_read, mistake)
         if confirmed > most_confirmed:
-            best, most_confirmed = mistake, confirmed
+            best = mistake
+            most_confirmed = confirmed
     return best
 
 
@@ -114,7 +128,9 @@ def _explained(posed: Posed, as_read: Agreement, mistake: PoseMistake) -> float:
         return 0.0
 
     changed = _relative_change(poses, posed.as_read()[kept])
-    with_it = Agreement(as_read.confirmed[np.ix_(kept, kept)], as_read.contradicted[np.ix_(kept, kept)]).among(changed)
+    with_it = Agreement(
+        as_read.confirmed[np.ix_(kept, kept)], as_read.contradicted[np.ix_(kept, kept)]
+    ).among(changed)
     without = compare(views, poses).among(changed)
     if without.judged < FEWEST_JUDGED or without.share < WELL_EXPLAINED:
         return 0.0
@@ -137,7 +153,9 @@ def _judgeable(views: Sequence[SurfaceView]) -> float:
 
 
 def _in_one_place(views: Sequence[SurfaceView], poses: Float) -> bool:
-    """Whether all cameras stand in one place: then a round thing agrees with itself however they are turned."""
+    """Whether all cameras stand in one place: then a round thing agrees with itself however they
+    are turned.
+    """
     depths = [np.median(view.points[:, 2]) for view in views if len(view.points)]
     places = poses[:, :3, 3]
     apart = np.linalg.norm(places - np.median(places, 0), axis=1)
@@ -146,7 +164,9 @@ def _in_one_place(views: Sequence[SurfaceView], poses: Float) -> bool:
 
 def _relative_change(poses: Float, others: Float) -> NDArray[np.bool_]:
     """Of which two cameras the pose relative to each other differs, (N, N)."""
-    relative, other_relative = (np.linalg.inv(each)[:, None] @ each[None] for each in (poses, others))
+    relative, other_relative = (
+        np.linalg.inv(each)[:, None] @ each[None] for each in (poses, others)
+    )
     return np.abs(relative - other_relative).max((2, 3)) > SAME_POSE
 
 
@@ -154,8 +174,11 @@ def _relative_change(poses: Float, others: Float) -> NDArray[np.bool_]:
 
 
 def _single_mistakes(to_world: bool, unit: float) -> list[PoseMistake]:
-    """All but shifts, of poses that a layout stores as camera-to-world or not, in some unit, metres."""
-    stored, other = "camera-to-world", "world-to-camera"
+    """All but shifts, of poses that a layout stores as camera-to-world or not, in some unit,
+    metres.
+    """
+    stored = "camera-to-world"
+    other = "world-to-camera"
     if not to_world:
         stored, other = other, stored
     found = [
@@ -166,12 +189,14 @@ def _single_mistakes(to_world: bool, unit: float) -> list[PoseMistake]:
         ),
         PoseMistake(
             "mixed",
-            f"the rotations are inverse: this layout has {stored} poses, and only the translations are",
+            f"the rotations are inverse: this layout has {stored} poses, and only the"
+            " translations are",
             _in_stored(_rotation_inverted, to_world),
         ),
         PoseMistake(
             "mixed",
-            f"the translations are those of inverse poses: this layout has {stored} poses, and only the rotations are",
+            f"the translations are those of inverse poses: this layout has {stored} poses, and only"
+            " the rotations are",
             _in_stored(_translation_inverted, to_world),
         ),
     ]
@@ -207,7 +232,9 @@ def _pairs(single: Sequence[PoseMistake]) -> list[PoseMistake]:
     return found
 
 
-def _one_after_the_other(first: Callable[[Float], Float], second: Callable[[Float], Float]) -> Callable[[Float], Float]:
+def _one_after_the_other(
+    first: Callable[[Float], Float], second: Callable[[Float], Float]
+) -> Callable[[Float], Float]:
     return lambda poses: second(first(poses))
 
 

@@ -1,4 +1,6 @@
-"""A robot's camera in a scene: frames in metres, through a sensor, of a target that is named as a user would."""
+"""A robot's camera in a scene: frames in metres, through a sensor, of a target that is named as
+a user would.
+"""
 
 from dataclasses import replace
 from typing import Literal, get_args
@@ -8,7 +10,13 @@ from numpy.typing import NDArray
 
 from nextview.checks import one_line
 from nextview.errors import NoViewLeftError, ObservationError, UsageError
-from nextview.geometry.viewsphere import DISTANCE, ViewSphere, angle_between, direction_of, level_pose
+from nextview.geometry.viewsphere import (
+    DISTANCE,
+    ViewSphere,
+    angle_between,
+    direction_of,
+    level_pose,
+)
 from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.object_frame import Box, ObjectFrame
 from nextview.simulation.scene import TABLE, Scene
@@ -20,8 +28,12 @@ Named = Literal["point", "box", "known", "mask"]
 SAME = 1e-6  # radians between directions that are the same
 
 
-def sensed_camera(scene: Scene, sensor: Sensor | SensorMix | str, rng: np.random.Generator) -> SensedCamera:
-    """A ``SensedCamera`` before a scene's target, three radii away; what hides it is told from it exactly."""
+def sensed_camera(
+    scene: Scene, sensor: Sensor | SensorMix | str, rng: np.random.Generator
+) -> SensedCamera:
+    """A ``SensedCamera`` before a scene's target, three radii away; what hides it is told from
+    it exactly.
+    """
     drawn = sensor_named(sensor).draw(rng.spawn(1)[0])
     drawn = replace(drawn, radius=drawn.distance / DISTANCE, boxes=0.0)
     return SensedCamera(scene.target, drawn, rng, around=scene.around, table=TABLE, true_size=False)
@@ -30,21 +42,26 @@ def sensed_camera(scene: Scene, sensor: Sensor | SensorMix | str, rng: np.random
 class RobotCamera:
     """Gives frames of a scene, metres, to a session that runs in it live.
 
-    The scene's frame is the target's object frame, in metres. The target is named to the session by a "point" in its
-    middle, by the upright "box" that it just fits into, by its "known" object frame, with the errors of the sensor's
-    setup, or by a "mask" that tells it from all else.
+    The scene's frame is the target's object frame, in metres. The target is named to the session by
+    a "point" in its middle, by the upright "box" that it just fits into, by its "known" object
+    frame, with the errors of the sensor's setup, or by a "mask" that tells it from all else.
 
-    A pose that cannot be reached, or from which too little of the target is measured, is answered from the nearest
-    other viewpoint where it has not stood yet. Ask only for what ``reachable`` allows to be answered from near.
-    The errors of the sensor are drawn by seed 0.
+    A pose that cannot be reached, or from which too little of the target is measured, is answered
+    from the nearest other viewpoint where it has not stood yet. Ask only for what ``reachable``
+    allows to be answered from near. The errors of the sensor are drawn by seed 0.
     """
 
     knows_reach = True  # the scene says where a camera can stand; see ``session.FrameCamera``
 
-    def __init__(self, scene: Scene, sensor: Sensor | SensorMix | str = "none", named: Named = "point") -> None:
+    def __init__(
+        self, scene: Scene, sensor: Sensor | SensorMix | str = "none", named: Named = "point"
+    ) -> None:
         if named not in get_args(Named):
-            raise UsageError(f"a target is named by {', '.join(get_args(Named))}, not by {one_line(repr(named))}")
-        self.scene, self.named = scene, named
+            raise UsageError(
+                f"a target is named by {', '.join(get_args(Named))}, not by {one_line(repr(named))}"
+            )
+        self.scene = scene
+        self.named = named
         self._directions = ViewSphere.named("40").directions
         self._camera = sensed_camera(scene, sensor, np.random.default_rng(0))
         self._truth = ObjectFrame(np.zeros(3), self._camera.sensor.radius, np.eye(3))
@@ -57,17 +74,26 @@ class RobotCamera:
             "mask": {},
         }[named]
         self.object = ObservedObject(denoise=denoise, life_size=False, **asked)  # type: ignore[arg-type]
-        self._refused, self._taken = list[Float](), list[Float]()
+        self._refused = list[Float]()
+        self._taken = list[Float]()
 
     def reachable(self, pose: Float) -> bool:
-        """Whether the camera can be brought to a pose of the scene, (4, 4), metres: for ``Session.reachable``."""
+        """Whether the camera can be brought to a pose of the scene, (4, 4), metres: for
+        ``Session.reachable``.
+        """
         return bool(self.scene.reachable(self._truth.pose_in_object(pose)[None, :3, 3])[0])
 
     def observe(self, pose: Float) -> Frame:
-        """Look from a pose, (4, 4), in the object frame as it is believed to be; from near it where that cannot be."""
-        believed = self.object.object_frame if self.object.sightings or self.object.known else self._truth
+        """Look from a pose, (4, 4), in the object frame as it is believed to be; from near it
+        where that cannot be.
+        """
+        believed = (
+            self.object.object_frame if self.object.sightings or self.object.known else self._truth
+        )
         asked = direction_of(self._truth.pose_in_object(believed.pose_in_world(pose)))
-        order = np.argsort(angle_between(np.broadcast_to(asked, self._directions.shape), self._directions))
+        order = np.argsort(
+            angle_between(np.broadcast_to(asked, self._directions.shape), self._directions)
+        )
         for direction in (asked, *self._directions[order]):
             there = level_pose(direction)
             tried = self._refused if direction is asked else [*self._refused, *self._taken]
@@ -76,7 +102,11 @@ class RobotCamera:
                 continue
             if (frame := self._camera.frame(there)) is not None:
                 self._taken.append(direction)
-                return frame if self.named in ("known", "mask") else replace(frame, mask=None, pixel_centre=0.5)
+                return (
+                    frame
+                    if self.named in ("known", "mask")
+                    else replace(frame, mask=None, pixel_centre=0.5)
+                )
             self._refused.append(direction)
         raise NoViewLeftError("the target shows from no other place that can be reached")
 

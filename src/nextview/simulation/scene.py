@@ -1,4 +1,6 @@
-"""A scene as geometry: upright things on a table, in the target's object frame, and where a camera can be."""
+"""A scene as geometry: upright things on a table, in the target's object frame, and where a
+camera can be.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -16,18 +18,25 @@ from nextview.geometry.viewsphere import rotation_z
 from nextview.simulation.scene_layout import Block, Placement, SceneLayout
 
 Float = NDArray[np.float64]
-TABLE = 3.4  # half the side of the square table, object radii: what stands around the target stands on it
+# half the side of the square table, object radii: what stands around the target stands on it
+TABLE = 3.4
 CLEARANCE = 0.2  # what a camera needs to each side, object radii
-GAP, FOOTPRINT, HEIGHT = (0.02, 0.3), (0.3, 0.9), (0.6, 2.6)  # of a box: from the object's circle, sides, height
+# of a box: from the object's circle, sides, height
+GAP = (0.02, 0.3)
+FOOTPRINT = (0.3, 0.9)
+HEIGHT = (0.6, 2.6)
 _CORNERS = np.array([[x, y, z] for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
 _FACES = np.reshape([int(i) for i in "021123456576014154263367042246135375"], (-1, 3))
-EDGE = 1e-3  # every footprint is wider by this on each side, object radii: so the thinnest sheet has one too
+# every footprint is wider by this on each side, object radii: so the thinnest sheet has one too
+EDGE = 1e-3
 _AROUND = EDGE * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 
 
 @dataclass(frozen=True)
 class Item:
-    """One thing beside the target, in its object frame: (V, 3), (F, 3) int32, and counter-clockwise (K, 2)."""
+    """One thing beside the target, in its object frame: (V, 3), (F, 3) int32, and
+    counter-clockwise (K, 2).
+    """
 
     vertices: Float
     faces: NDArray[np.int32]
@@ -49,11 +58,15 @@ class Scene:
 
     @cached_property
     def around(self) -> Mesh | None:
-        """All items as one mesh, in the target's frame and radii, not normalised; None if there is none."""
+        """All items as one mesh, in the target's frame and radii, not normalised; None if there
+        is none.
+        """
         if not self.items:
             return None
         first = np.cumsum([0, *(len(item.vertices) for item in self.items)])
-        faces = np.concatenate([item.faces + at for item, at in zip(self.items, first, strict=False)])
+        faces = np.concatenate(
+            [item.faces + at for item, at in zip(self.items, first, strict=False)]
+        )
         vertices = np.concatenate([item.vertices for item in self.items])
         return Mesh(vertices, faces.astype(np.int32), np.zeros(3), 1.0, "items")
 
@@ -63,7 +76,9 @@ class Scene:
         return Mesh(*square(TABLE, self.floor), np.zeros(3), 1.0, "table")
 
     def clearance(self, positions: Float) -> Float:
-        """Distance of cameras, (V, 3), from the nearest item or the table, (V,); 0 inside, negative below."""
+        """Distance of cameras, (V, 3), from the nearest item or the table, (V,); 0 inside,
+        negative below.
+        """
         found = positions[:, 2] - self.floor
         for item in self.items:
             above = np.maximum(positions[:, 2] - item.vertices[:, 2].max(), 0)
@@ -71,9 +86,11 @@ class Scene:
         return found
 
     def reachable(self, positions: Float) -> NDArray[np.bool_]:
-        """Whether a camera can be brought to each position, (V, 3), object frame, object radii; (V,) bool.
+        """Whether a camera can be brought to each position, (V, 3), object frame, object radii;
+        (V,) bool.
 
-        Not nearer than CLEARANCE to an item or the table, nor to where a wall stands before the target from above.
+        Not nearer than CLEARANCE to an item or the table, nor to where a wall stands before the
+        target from above.
         """
         positions = points(positions, "the positions of cameras")
         free = self.clearance(positions) >= CLEARANCE
@@ -83,7 +100,8 @@ class Scene:
 
 
 def build_scene(layout: SceneLayout, meshes: str | Path, max_faces: int = MAX_FACES) -> Scene:
-    """A scene as geometry, of the mesh files below a folder; MeshError if they have more faces together.
+    """A scene as geometry, of the mesh files below a folder; MeshError if they have more faces
+    together.
 
     DatasetError: a file is not the one that the scene was made with.
     """
@@ -111,7 +129,8 @@ def place(mesh: Mesh, at: Placement, floor: float) -> Item:
 
 def block_item(block: Block, floor: float) -> Item:
     """A box on the table."""
-    size, middle = np.array([[block.width, block.depth, block.height]]), np.array([[block.x, block.y]])
+    size = np.array([[block.width, block.depth, block.height]])
+    middle = np.array([[block.x, block.y]])
     mesh = upright_boxes(size, np.array([block.azimuth]), middle, floor)
     return Item(mesh.vertices, mesh.faces, footprint(mesh.vertices), block.wall)
 
@@ -130,9 +149,14 @@ def mesh_hash(path: Path) -> str:
 
 
 def boxes_around(vertices: Float, count: int, rng: np.random.Generator) -> Mesh:
-    """So many upright boxes on the ground of an object, outside of its outline's circle; they may overlap."""
-    floor, reach = vertices[:, 2].min(), np.hypot(vertices[:, 0], vertices[:, 1]).max()
-    size = np.concatenate([rng.uniform(*FOOTPRINT, (count, 2)), rng.uniform(*HEIGHT, (count, 1))], 1)
+    """So many upright boxes on the ground of an object, outside of its outline's circle; they
+    may overlap.
+    """
+    floor = vertices[:, 2].min()
+    reach = np.hypot(vertices[:, 0], vertices[:, 1]).max()
+    size = np.concatenate(
+        [rng.uniform(*FOOTPRINT, (count, 2)), rng.uniform(*HEIGHT, (count, 1))], 1
+    )
     azimuth, towards = rng.uniform(0, 2 * np.pi, (2, count))
     away = reach + np.hypot(size[:, 0], size[:, 1]) / 2 + rng.uniform(*GAP, count)
     at = away[:, None] * np.stack([np.cos(towards), np.sin(towards)], 1)
@@ -141,14 +165,19 @@ def boxes_around(vertices: Float, count: int, rng: np.random.Generator) -> Mesh:
 
 def square(half: float, height: float) -> tuple[Float, NDArray[np.int32]]:
     """Vertices and faces of a level square, half its side and its height given."""
-    corners = np.array([[-half, -half, height], [half, -half, height], [half, half, height], [-half, half, height]])
+    corners = np.array(
+        [[-half, -half, height], [half, -half, height], [half, half, height], [-half, half, height]]
+    )
     return corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 
 
 def upright_boxes(size: Float, azimuth: Float, at: Float, floor: float) -> Mesh:
-    """Boxes of width, depth and height, (N, 3), on the ground at some height, as one mesh, not normalised."""
+    """Boxes of width, depth and height, (N, 3), on the ground at some height, as one mesh, not
+    normalised.
+    """
     corners = _CORNERS * size[:, None]
-    c, s = np.cos(azimuth)[:, None], np.sin(azimuth)[:, None]
+    c = np.cos(azimuth)[:, None]
+    s = np.sin(azimuth)[:, None]
     x = c * corners[..., 0] - s * corners[..., 1] + at[:, :1]
     y = s * corners[..., 0] + c * corners[..., 1] + at[:, 1:]
     places = np.stack([x, y, corners[..., 2] + floor], -1).reshape(-1, 3)
@@ -163,21 +192,28 @@ def footprint(vertices: Float) -> Float:
 
 
 def separation(a: Float, b: Float) -> float:
-    """How far apart two convex polygons are along the edge normal that parts them most; negative if they overlap.
+    """How far apart two convex polygons are along the edge normal that parts them most; negative if
+    they overlap.
 
-    Corner to corner they are farther apart, never nearer. Counter-clockwise, (K, 2) and (L, 2); two points are a line.
+    Corner to corner they are farther apart, never nearer. Counter-clockwise, (K, 2) and (L, 2); two
+    points are a line.
     """
     return max(_gap(a, b), _gap(b, a))
 
 
 def _gap(a: Float, b: Float) -> float:
     edges = np.roll(a, -1, axis=0) - a
-    outward = np.stack([edges[:, 1], -edges[:, 0]], 1) / np.maximum(np.linalg.norm(edges, axis=1), 1e-12)[:, None]
+    outward = (
+        np.stack([edges[:, 1], -edges[:, 0]], 1)
+        / np.maximum(np.linalg.norm(edges, axis=1), 1e-12)[:, None]
+    )
     return float(((b @ outward.T).min(0) - (a * outward).sum(1)).max())
 
 
 def distances(polygon: Float, points: Float) -> Float:
-    """Distance of points, (N, 2), from a convex polygon, counter-clockwise, (K, 2); 0 inside. (N,) float64."""
+    """Distance of points, (N, 2), from a convex polygon, counter-clockwise, (K, 2); 0 inside.
+    (N,) float64.
+    """
     edges = np.roll(polygon, -1, axis=0) - polygon
     towards = points[:, None] - polygon
     along = np.clip((towards * edges).sum(-1) / (edges**2).sum(-1), 0, 1)

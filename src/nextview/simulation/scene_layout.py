@@ -1,4 +1,6 @@
-"""What stands where on the table of a cluttered scene: one small JSON file, of which it is built to the bit."""
+"""What stands where on the table of a cluttered scene: one small JSON file, of which it is built
+to the bit.
+"""
 
 import re
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -13,7 +15,8 @@ LEVELS = {"light": 0.85, "medium": 0.65, "heavy": 0.45}  # mean share of the tar
 NAMED = re.compile(r".*@(\w+)-\d+")  # names of scenes that were drawn: target, level and number
 SUFFIX = ".json"
 VIEWS = 40
-Length = Annotated[float, Meta(ge=-1000, le=1000)]  # or radians: what is computed with more has no precision left
+# or radians: what is computed with more has no precision left
+Length = Annotated[float, Meta(ge=-1000, le=1000)]
 Size = Annotated[float, Meta(gt=0, le=1000)]
 Hash = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
 MOST = Meta(max_length=1000)
@@ -26,9 +29,11 @@ def clutter_level(name: str) -> str:
 
 
 class Placement(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """An object that stands on the table: a mesh file below the folder of meshes, its hash, and where it stands.
+    """An object that stands on the table: a mesh file below the folder of meshes, its hash, and
+    where it stands.
 
-    x and y are those of its bounding box's centre; lengths are in object radii of the target, angles in radians.
+    x and y are those of its bounding box's centre; lengths are in object radii of the target,
+    angles in radians.
     """
 
     mesh: str
@@ -45,7 +50,9 @@ class Placement(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=T
 
 
 class Block(Struct, frozen=True, forbid_unknown_fields=True):
-    """An upright box on the table, target's radii and radians; beyond a ``wall`` the camera cannot be brought."""
+    """An upright box on the table, target's radii and radians; beyond a ``wall`` the camera
+    cannot be brought.
+    """
 
     x: Length
     y: Length
@@ -57,7 +64,9 @@ class Block(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SceneLayout(Struct, frozen=True, forbid_unknown_fields=True):
-    """A target at rest on a table as high as its lowest point, in its object frame, and what stands around it."""
+    """A target at rest on a table as high as its lowest point, in its object frame, and what
+    stands around it.
+    """
 
     name: str  # unique in its folder, "chair_0890@medium-1"
     level: str  # one of LEVELS, or another word for scenes of one's own
@@ -65,9 +74,12 @@ class SceneLayout(Struct, frozen=True, forbid_unknown_fields=True):
     target: Placement  # in the middle, not rotated
     objects: Annotated[tuple[Placement, ...], MOST] = ()  # others
     blocks: Annotated[tuple[Block, ...], MOST] = ()  # boxes and walls
-    # of the 40 views: the share of the target's picture that nothing hides, () if not measured; those out of reach
+    # of the 40 views: the share of the target's picture that nothing hides, () if not measured;
+    # those out of reach
     visible: Annotated[tuple[Annotated[float, Meta(ge=0, le=1)], ...], Meta(max_length=VIEWS)] = ()
-    unreachable: Annotated[tuple[Annotated[int, Meta(ge=0, lt=VIEWS)], ...], Meta(max_length=VIEWS)] = ()
+    unreachable: Annotated[
+        tuple[Annotated[int, Meta(ge=0, lt=VIEWS)], ...], Meta(max_length=VIEWS)
+    ] = ()
 
     def __post_init__(self) -> None:
         if self.target != Placement(self.target.mesh, self.target.sha256):

@@ -1,4 +1,6 @@
-"""A simulated camera behind a sensor: true depth in metres, the sensor's errors, then the product's own way in."""
+"""A simulated camera behind a sensor: true depth in metres, the sensor's errors, then the
+product's own way in.
+"""
 
 from dataclasses import replace
 
@@ -22,22 +24,28 @@ from nextview.simulation.simulated import SimulatedCamera
 Float = NDArray[np.float64]
 Depth = NDArray[np.float32]
 TABLE = 1.5  # radius of the table that the object stands on, if nothing else is said, object radii
-REACH = 1.3  # the object is looked for in a sphere so many radii large: with a wrong pose it sticks out of its own
+# the object is looked for in a sphere so many radii large: with a wrong pose it sticks out of its
+# own
+REACH = 1.3
 LEFTOVER = 4.0  # size of the patches of the table that are taken for the object, pixels
-OBJECT, TABLE_TOP, BOX = 0, 1, 2  # what a pixel shows; where it shows nothing, the first
+# what a pixel shows; where it shows nothing, the first
+OBJECT = 0
+TABLE_TOP = 1
+BOX = 2
 
 
 class SensedCamera:
     """Looks at a normalised mesh through a sensor, as a robot would see the object.
 
-    The object stands on a table, among boxes if the sensor's setup has any. Each frame goes through ``ObservedObject``,
-    which knows the object's frame up to the errors of the setup. The mask is what was measured near the object, without
-    boxes and most of the table. A mix of sensors is drawn from now, as are the errors of the object's frame and the
-    boxes. ``around`` hides parts of the object instead of these boxes, object frame; ``table`` is a radius, object
-    radii.
+    The object stands on a table, among boxes if the sensor's setup has any. Each frame goes through
+    ``ObservedObject``, which knows the object's frame up to the errors of the setup. The mask is
+    what was measured near the object, without boxes and most of the table. A mix of sensors is
+    drawn from now, as are the errors of the object's frame and the boxes. ``around`` hides parts of
+    the object instead of these boxes, object frame; ``table`` is a radius, object radii.
 
-    A mesh of known unit is looked at in its true size, see ``Sensor.before``, unless ``true_size`` is false. Any other
-    is as large as the sensor says, as is what a mix looks at, which networks are trained with.
+    A mesh of known unit is looked at in its true size, see ``Sensor.before``, unless ``true_size``
+    is false. Any other is as large as the sensor says, as is what a mix looks at, which networks
+    are trained with.
     """
 
     def __init__(
@@ -57,15 +65,22 @@ class SensedCamera:
             self.sensor = known.before(mesh.metres)
         else:
             self.sensor = known
-        self.denoise, self._rng, self._reach, self._metres = denoise, rng, table, mesh.metres
-        self._camera, self._floor = self._looking_at(mesh), float(mesh.vertices[:, 2].min())
+        self.denoise = denoise
+        self._rng = rng
+        self._reach = table
+        self._metres = mesh.metres
+        self._camera = self._looking_at(mesh)
+        self._floor = float(mesh.vertices[:, 2].min())
         self._truth = ObjectFrame(np.zeros(3), self.sensor.radius, np.eye(3))
-        self.true_pose: Float | None = None  # of the camera in the last frame, (4, 4), in the true object frame, metres
-        setup, draws = self.sensor, rng.spawn(1)[0]
+        # of the camera in the last frame, (4, 4), in the true object frame, metres
+        self.true_pose: Float | None = None
+        setup = self.sensor
+        draws = rng.spawn(1)[0]
         centre = draws.normal(0, setup.centre * setup.radius, 3)
         radius = setup.radius * np.exp(draws.normal(0, setup.size))
         lean = Rotation.from_rotvec([*draws.normal(0, setup.tilt, 2), 0], degrees=True).as_matrix()
-        self.object_frame = ObjectFrame(centre, float(radius), lean)  # where the robot takes the object to be
+        # where the robot takes the object to be
+        self.object_frame = ObjectFrame(centre, float(radius), lean)
         if around is None and self.sensor.boxes:
             draws = rng.spawn(1)[0]
             if count := int(draws.poisson(self.sensor.boxes)):
@@ -76,23 +91,33 @@ class SensedCamera:
         return SimulatedCamera(mesh, intrinsics=self.sensor.intrinsics, shape=self.sensor.shape)
 
     def observe(self, pose: Float) -> Observation:
-        """Look from the direction of a pose, (4, 4), at the sensor's own distance; too little found is nothing seen."""
+        """Look from the direction of a pose, (4, 4), at the sensor's own distance; too little
+        found is nothing seen.
+        """
         try:
-            thing = ObservedObject(known=self.object_frame, support=False, denoise=self.denoise, life_size=False)
-            # Something of a millimetre is far out of the picture of a camera whose place is known to millimetres.
+            thing = ObservedObject(
+                known=self.object_frame, support=False, denoise=self.denoise, life_size=False
+            )
+            # Something of a millimetre is far out of the picture of a camera whose place is known
+            # to millimetres.
             frame = self.frame(pose)
             if frame is None:
                 raise ObservationError("nothing is seen")
             observation = thing.add(frame)
         except ObservationError:
             asked = virtual_pose(self.object_frame.pose_in_object(self._truth.pose_in_world(pose)))
-            observation = Observation(np.zeros((SIZE, SIZE), np.float32), asked, pinhole(SIZE, DISTANCE))
+            observation = Observation(
+                np.zeros((SIZE, SIZE), np.float32), asked, pinhole(SIZE, DISTANCE)
+            )
         if self._metres is None:
             return observation
-        return replace(observation, radius=self._metres * self.object_frame.radius / self._truth.radius)
+        return replace(
+            observation, radius=self._metres * self.object_frame.radius / self._truth.radius
+        )
 
     def frame(self, pose: Float) -> Frame | None:
-        """What the sensor gives, with the object's mask and the pose that the robot believes in; None for too little.
+        """What the sensor gives, with the object's mask and the pose that the robot believes in;
+        None for too little.
 
         The world is the true object frame, in metres. The pose is as in ``observe``.
         """
@@ -107,7 +132,8 @@ class SensedCamera:
         depth, whose = self._scene(true)
         measured, source = self.sensor.measure(depth, rng)
         part = within(measured)  # nothing is measured beside it
-        shown, mask = whose.ravel()[source[part]], measured > 0
+        shown = whose.ravel()[source[part]]
+        mask = measured > 0
         other = (shown != OBJECT) & (source[part] >= 0)
         if self.sensor.table:
             left_in = uniform_field(rng, depth.shape, LEFTOVER, part) < self.sensor.table
@@ -118,8 +144,14 @@ class SensedCamera:
         if np.count_nonzero(measured) < FEWEST:
             return None
         frame = Frame(measured, self.sensor.intrinsics, believed, pixel_centre=0.5)
-        mask[part] &= inside_sphere(frame, self.object_frame.centre, REACH * self.object_frame.radius, part)
-        return replace(frame, mask=mask, pixel_centre=0.5) if np.count_nonzero(mask) >= FEWEST else None
+        mask[part] &= inside_sphere(
+            frame, self.object_frame.centre, REACH * self.object_frame.radius, part
+        )
+        return (
+            replace(frame, mask=mask, pixel_centre=0.5)
+            if np.count_nonzero(mask) >= FEWEST
+            else None
+        )
 
     def visible_share(self, pose: Float) -> float:
         """Share of the object's picture that no box hides, without the sensor's errors.
@@ -153,17 +185,24 @@ class SensedCamera:
         if self._around is not None:
             boxes = self._around.observe(inside).depth
             nearer = (boxes > 0) & ((depth == 0) | (boxes < depth))
-            depth, whose = np.where(nearer, boxes, depth), np.where(nearer, np.uint8(BOX), whose)
+            depth = np.where(nearer, boxes, depth)
+            whose = np.where(nearer, np.uint8(BOX), whose)
         return depth * np.float32(self.sensor.radius), whose
 
     def _table(self, pose: Float) -> tuple[Part, Float]:
-        """Depth of the table in a part of the picture that holds it, object radii; infinite beside and from below."""
-        height, setup = pose[2, 3] - self._floor, self.sensor
-        corners = [(a * self._reach, b * self._reach, self._floor) for a in (-1, 1) for b in (-1, 1)]
+        """Depth of the table in a part of the picture that holds it, object radii; infinite
+        beside and from below.
+        """
+        height = pose[2, 3] - self._floor
+        setup = self.sensor
+        corners = [
+            (a * self._reach, b * self._reach, self._floor) for a in (-1, 1) for b in (-1, 1)
+        ]
         seen = (np.array(corners) - pose[:3, 3]) @ pose[:3, :3]  # of a square around it
         part = slice(0, setup.height), slice(0, setup.width)
         if seen[:, 2].min() > 0:
-            at = setup.focal * seen[:, 1::-1] / seen[:, 2:] + np.array(setup.shape) / 2  # row and column
+            # row and column
+            at = setup.focal * seen[:, 1::-1] / seen[:, 2:] + np.array(setup.shape) / 2
             part = spans(at.min(0) - 1, at.max(0) + 2, setup.shape)
         x = ((np.arange(setup.width) + 0.5 - setup.width / 2) / setup.focal)[part[1]]
         y = ((np.arange(setup.height) + 0.5 - setup.height / 2) / setup.focal)[part[0], None]
@@ -171,12 +210,17 @@ class SensedCamera:
         down = (falls < 0) & (height > 0)
         along = np.where(down, -height / np.where(down, falls, -1), np.inf)
         with np.errstate(invalid="ignore"):
-            across = [pose[i, 3] + along * (x * pose[i, 0] + y * pose[i, 1] + pose[i, 2]) for i in (0, 1)]
+            across = [
+                pose[i, 3] + along * (x * pose[i, 0] + y * pose[i, 1] + pose[i, 2]) for i in (0, 1)
+            ]
             return part, np.where(across[0] ** 2 + across[1] ** 2 < self._reach**2, along, np.inf)
 
     def _cropped(self, depth: Depth, mask: NDArray[np.bool_], rng: np.random.Generator) -> Depth:
-        """The picture without what lies beyond a line across the object, parallel to one of its borders."""
-        side, share = int(rng.integers(4)), float(rng.uniform(0, self.sensor.crop))
+        """The picture without what lies beyond a line across the object, parallel to one of its
+        borders.
+        """
+        side = int(rng.integers(4))
+        share = float(rng.uniform(0, self.sensor.crop))
         lines = np.flatnonzero(mask.any(axis=1 - side // 2))
         if not len(lines):
             return depth

@@ -1,4 +1,7 @@
-"""Depth sensors as numbers: how strong each of their errors is, and those of the setup. Known ones, and a mix."""
+"""Depth sensors as numbers: how strong each of their errors is, and those of the setup.
+
+Known ones, and a mix.
+"""
 
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
@@ -17,11 +20,19 @@ from nextview.sensing.frame import Part, within
 Index = NDArray[np.int64]
 Image = NDArray[np.float64]
 
-EDGE = 0.02  # two surfaces differ so much from pixel to pixel, as a part of q, beyond the surface's own slope
-STEEPEST = np.radians(80.0)  # the laws of noise are held here: they grow without bound towards 90 degrees
-NO_GRAIN, NARROWEST = 0.1, 1.0  # pixels: a window that holds one pixel; the narrowest shadow
+# two surfaces differ so much from pixel to pixel, as a part of q, beyond the surface's own slope
+EDGE = 0.02
+# the laws of noise are held here: they grow without bound towards 90 degrees
+STEEPEST = np.radians(80.0)
+# pixels: a window that holds one pixel; the narrowest shadow
+NO_GRAIN = 0.1
+NARROWEST = 1.0
 WIDEST = 8  # projector columns that two neighbouring pixels of one surface may lie apart
-LARGEST, SIDE, GRAIN, STRONGEST = 10_000, 4096, 100, 100  # limits of numbers, sides of pictures, grain and strength
+# limits of numbers, sides of pictures, grain and strength
+LARGEST = 10_000
+SIDE = 4096
+GRAIN = 100
+STRONGEST = 100
 MARGIN = 16  # how far beside what there is a pixel may show it, pixels
 CLEARANCE = 0.25  # metres that a camera keeps from an object of known size
 FRAMED = 1.1  # so many times as far as where an object just fits into the picture
@@ -33,58 +44,100 @@ ARM_LENGTH = 0.45  # metres from its centre at which it usually stands at most
 class Sensor:
     """A depth sensor, and the setup that it stands in. Without arguments it has no errors.
 
-    The simulated object is ``radius`` metres large and ``distance`` metres away. ``scaled`` multiplies every strength,
-    that is all but what the sensor is (height to radius). Deviations are standard deviations; those of the setup are
-    drawn for each axis. UsageError: numbers that no sensor has.
+    The simulated object is ``radius`` metres large and ``distance`` metres away. ``scaled``
+    multiplies every strength, that is all but what the sensor is (height to radius). Deviations are
+    standard deviations; those of the setup are drawn for each axis. UsageError: numbers that no
+    sensor has.
+
+    Attributes:
+        height: rows of its pictures.
+        width: columns.
+        focal: pixels, for both axes; the principal point is in the middle.
+        baseline: between the camera and its projector, or its second camera, along x, metres.
+        grain: how far pixels err together: the correlation at a distance k is exp(-k^2 / (4
+            grain^2)).
+        nearest: least depth that it can measure, metres.
+        farthest: greatest one.
+        distance: of the camera from the object's centre, metres.
+        radius: of the object, metres.
+        axial: deviation of depth, in those of a Kinect: see ``kinect_axial``.
+        noise: deviation of depth, metres, the same everywhere.
+        disparity: deviation of disparity, pixels: of depth, z^2 / (focal baseline) times as much.
+        step: of the disparity, which is measured in whole steps, pixels.
+        lateral: deviation of where edges are seen, in those of a Kinect: see ``kinect_lateral``.
+        grazing: cosine of the angle of incidence below which pixels are lost, ever more up to 90
+            degrees.
+        flying: share of the pixels at edges that hang in the air between the two surfaces.
+        shadow: what is hidden from a point so many metres beside the camera, along x, is not
+            measured.
+        holes: share of the pixels without depth.
+        turned: deviation of the camera's rotation, degrees, anew in every view.
+        moved: deviation of its place, metres, anew in every view.
+        centre: deviation of the object's centre, object radii.
+        size: relative deviation of the object's radius.
+        tilt: deviation of the vertical, degrees.
+        table: share of the table around the object that is taken for the object.
+        crop: up to this share of the object's width, or height, lies outside of the picture.
+        boxes: so many boxes stand around the object on average: see ``boxes_around``.
     """
 
     name: str = "none"
-    height: int = 480  # rows of its pictures
-    width: int = 640  # columns
-    focal: float = 585.0  # pixels, for both axes; the principal point is in the middle
-    baseline: float = 0.075  # between the camera and its projector, or its second camera, along x, metres
-    grain: float = 0.0  # how far pixels err together: the correlation at a distance k is exp(-k^2 / (4 grain^2))
-    nearest: float = 0.0  # least depth that it can measure, metres
-    farthest: float = 60.0  # greatest one
-    distance: float = 0.6  # of the camera from the object's centre, metres
-    radius: float = 0.12  # of the object, metres
+    height: int = 480
+    width: int = 640
+    focal: float = 585.0
+    baseline: float = 0.075
+    grain: float = 0.0
+    nearest: float = 0.0
+    farthest: float = 60.0
+    distance: float = 0.6
+    radius: float = 0.12
 
-    axial: float = 0.0  # deviation of depth, in those of a Kinect: see ``kinect_axial``
-    noise: float = 0.0  # deviation of depth, metres, the same everywhere
-    disparity: float = 0.0  # deviation of disparity, pixels: of depth, z^2 / (focal baseline) times as much
-    step: float = 0.0  # of the disparity, which is measured in whole steps, pixels
-    lateral: float = 0.0  # deviation of where edges are seen, in those of a Kinect: see ``kinect_lateral``
-    grazing: float = 0.0  # cosine of the angle of incidence below which pixels are lost, ever more up to 90 degrees
-    flying: float = 0.0  # share of the pixels at edges that hang in the air between the two surfaces
-    shadow: float = 0.0  # what is hidden from a point so many metres beside the camera, along x, is not measured
-    holes: float = 0.0  # share of the pixels without depth
+    axial: float = 0.0
+    noise: float = 0.0
+    disparity: float = 0.0
+    step: float = 0.0
+    lateral: float = 0.0
+    grazing: float = 0.0
+    flying: float = 0.0
+    shadow: float = 0.0
+    holes: float = 0.0
 
-    turned: float = 0.0  # deviation of the camera's rotation, degrees, anew in every view
-    moved: float = 0.0  # deviation of its place, metres, anew in every view
-    centre: float = 0.0  # deviation of the object's centre, object radii
-    size: float = 0.0  # relative deviation of the object's radius
-    tilt: float = 0.0  # deviation of the vertical, degrees
-    table: float = 0.0  # share of the table around the object that is taken for the object
-    crop: float = 0.0  # up to this share of the object's width, or height, lies outside of the picture
-    boxes: float = 0.0  # so many boxes stand around the object on average: see ``boxes_around``
+    turned: float = 0.0
+    moved: float = 0.0
+    centre: float = 0.0
+    size: float = 0.0
+    tilt: float = 0.0
+    table: float = 0.0
+    crop: float = 0.0
+    boxes: float = 0.0
 
     def __post_init__(self) -> None:
         for name in (field.name for field in fields(self) if field.name != "name"):
-            what, value = f"sensor {self.name}: {name}", getattr(self, name)
+            what = f"sensor {self.name}: {name}"
+            value = getattr(self, name)
             if name in ("height", "width"):
                 whole(value, what, 1, SIDE)
             else:
                 number(value, what, 0, GRAIN if name == "grain" else LARGEST)
         if not min(self.focal, self.baseline, self.farthest, self.radius) > 0:
-            raise UsageError(f"sensor {self.name}: focal length, baseline, range and radius are positive")
+            raise UsageError(
+                f"sensor {self.name}: focal length, baseline, range and radius are positive"
+            )
         if not self.distance > self.radius:
-            raise UsageError(f"sensor {self.name}: at {self.distance} m it stands inside an object of {self.radius} m")
+            raise UsageError(
+                f"sensor {self.name}: at {self.distance} m it stands inside an object of"
+                f" {self.radius} m"
+            )
 
     def scaled(self, strength: float) -> "Sensor":
-        """The same sensor with all errors so many times as strong; 0 for none, STRONGEST at most."""
+        """The same sensor with all errors so many times as strong; 0 for none, STRONGEST at
+        most.
+        """
         number(strength, "the strength of a sensor", 0, STRONGEST)
         name = self.name if strength == 1 else f"{self.name}:{strength:g}"
-        return replace(self, name=name, **{error: getattr(self, error) * strength for error in ERRORS})
+        return replace(
+            self, name=name, **{error: getattr(self, error) * strength for error in ERRORS}
+        )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -94,7 +147,9 @@ class Sensor:
     @property
     def intrinsics(self) -> Image:
         """Pinhole matrix, (3, 3) float64, pixels; the first pixel's centre is at 0.5."""
-        return np.array([[self.focal, 0, self.width / 2], [0, self.focal, self.height / 2], [0, 0, 1.0]])
+        return np.array(
+            [[self.focal, 0, self.width / 2], [0, self.focal, self.height / 2], [0, 0, 1.0]]
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Its name and all its numbers, for JSON."""
@@ -103,9 +158,9 @@ class Sensor:
     def before(self, radius: float) -> "Sensor":
         """The same sensor before an object of a known size, as a robot would hold it.
 
-        It stands as many object radii away as otherwise, but ARM_LENGTH at most. Farther only where the object does not
-        fit into its picture, is nearer than what it can measure, or comes closer than CLEARANCE. Of what is smaller
-        than a few millimetres it measures nothing.
+        It stands as many object radii away as otherwise, but ARM_LENGTH at most. Farther only where
+        the object does not fit into its picture, is nearer than what it can measure, or comes
+        closer than CLEARANCE. Of what is smaller than a few millimetres it measures nothing.
 
         Args:
             radius: of the object, metres.
@@ -121,18 +176,25 @@ class Sensor:
         """Itself: what ``SensorMix`` draws anew for every object."""
         return self
 
-    def measure(self, depth: NDArray[np.float32], rng: np.random.Generator) -> tuple[NDArray[np.float32], Index]:
-        """What the sensor makes of a true depth image, (height, width) float32, metres, 0 where there is nothing.
+    def measure(
+        self, depth: NDArray[np.float32], rng: np.random.Generator
+    ) -> tuple[NDArray[np.float32], Index]:
+        """What the sensor makes of a true depth image, (height, width) float32, metres, 0 where
+        there is nothing.
 
-        Errors of strength 0 change nothing, to the bit. Each error draws from a generator of its own.
+        Errors of strength 0 change nothing, to the bit. Each error draws from a generator of its
+        own.
 
         Returns:
-            Depth, (height, width) float32, 0 where none was measured. And whose surface each pixel shows, its own or
-            that of one nearby: row * width + column, int64, or -1 if it hangs in the air.
+            Depth, (height, width) float32, 0 where none was measured. And whose surface each pixel
+            shows, its own or that of one nearby: row * width + column, int64, or -1 if it hangs in
+            the air.
         """
-        measured, sources = depth.copy(), np.arange(depth.size).reshape(depth.shape)
+        measured = depth.copy()
+        sources = np.arange(depth.size).reshape(depth.shape)
         part = within(depth, MARGIN)
-        depth, source = depth[part], sources[part]
+        depth = depth[part]
+        source = sources[part]
         if not depth.size:
             return measured, sources
         intrinsics = self.intrinsics - [[0, 0, part[1].start], [0, 0, part[0].start], [0, 0, 0]]
@@ -147,15 +209,21 @@ class Sensor:
             lost |= np.cos(angle) < self.grazing * uniform_field(grazing, q.shape, self.grain)
         changed = q
         if self.flying:
-            at, to, other = flying.random(q.shape), flying.random(q.shape), across_edges(q, slope)
+            at = flying.random(q.shape)
+            to = flying.random(q.shape)
+            other = across_edges(q, slope)
             flies = (at < self.flying) & (other != q)
             changed = np.where(flies, q + to * (other - q), q)
             source = np.where(flies, -1, source)
         if self.lateral:
             reach = self.lateral * kinect_lateral(angle)
-            right, down = (np.rint(reach * normal_field(lateral, q.shape, self.grain)).astype(int) for _ in "xy")
+            right, down = (
+                np.rint(reach * normal_field(lateral, q.shape, self.grain)).astype(int)
+                for _ in "xy"
+            )
             changed, near = shifted(changed, slope, right, down)
-            source, lost = source[near], lost[near]
+            source = source[near]
+            lost = lost[near]
         if self.axial or self.noise or self.disparity:
             changed = self._noisy(changed, angle, axial)
         if self.step:
@@ -185,32 +253,70 @@ class Sensor:
 ERRORS = tuple(field.name for field in fields(Sensor))[10:]  # the strengths, from axial on
 
 _SETUP: dict[str, Any] = {
-    "turned": 0.3, "moved": 0.003, "centre": 0.05, "size": 0.05, "tilt": 2.0, "table": 0.05, "crop": 0.1,
-}  # fmt: skip
+    "turned": 0.3,
+    "moved": 0.003,
+    "centre": 0.05,
+    "size": 0.05,
+    "tilt": 2.0,
+    "table": 0.05,
+    "crop": 0.1,
+}
 _KINECT = Sensor(
-    "kinect", grain=2.0, nearest=0.4, farthest=8.0,
-    axial=1.0, step=1 / 8, lateral=1.0, grazing=0.25, flying=0.2, shadow=0.075, holes=0.01,
-)  # fmt: skip
+    "kinect",
+    grain=2.0,
+    nearest=0.4,
+    farthest=8.0,
+    axial=1.0,
+    step=1 / 8,
+    lateral=1.0,
+    grazing=0.25,
+    flying=0.2,
+    shadow=0.075,
+    holes=0.01,
+)
 _STEREO = Sensor(
-    "stereo", height=480, width=848, focal=424.0, baseline=0.05, grain=2.5, nearest=0.2, farthest=10.0,
-    disparity=0.08, step=1 / 32, lateral=1.5, grazing=0.3, flying=0.3, shadow=0.05, holes=0.03,
-)  # fmt: skip
-_ALL = (Sensor(), _KINECT, _STEREO, Sensor("setup", **_SETUP), replace(_STEREO, name="wrist", **_SETUP))
+    "stereo",
+    height=480,
+    width=848,
+    focal=424.0,
+    baseline=0.05,
+    grain=2.5,
+    nearest=0.2,
+    farthest=10.0,
+    disparity=0.08,
+    step=1 / 32,
+    lateral=1.5,
+    grazing=0.3,
+    flying=0.3,
+    shadow=0.05,
+    holes=0.03,
+)
+_ALL = (
+    Sensor(),
+    _KINECT,
+    _STEREO,
+    Sensor("setup", **_SETUP),
+    replace(_STEREO, name="wrist", **_SETUP),
+)
 SENSORS = {sensor.name: sensor for sensor in _ALL}
-"""Sensors by name: "none" has no errors; "kinect" is the first Kinect; "stereo" is like a RealSense D435 of 848 x 480;
-"setup" has no errors but those of pose, object frame, table and picture; "wrist" is "stereo" in such a setup."""
+"""Sensors by name: "none" has no errors; "kinect" is the first Kinect; "stereo" is like a RealSense
+D435 of 848 x 480; "setup" has no errors but those of pose, object frame, table and picture; "wrist"
+is "stereo" in such a setup."""
 
-_SIDE, _RADIUS = 224, SENSORS["none"].radius
+_SIDE = 224
+_RADIUS = SENSORS["none"].radius
 _FOCAL = float(pinhole(_SIDE, DISTANCE)[0, 0])
-RENDER = Sensor("render", _SIDE, _SIDE, _FOCAL, distance=DISTANCE * _RADIUS, radius=_RADIUS)  # the networks' own camera
+# the networks' own camera
+RENDER = Sensor("render", _SIDE, _SIDE, _FOCAL, distance=DISTANCE * _RADIUS, radius=_RADIUS)
 
 
 @dataclass(frozen=True)
 class SensorMix:
     """Any sensor, from none to twice the known ones, in any setup, from none wrong to very wrong.
 
-    Half of the draws look as renders do, some with noise up to 0.02 object radii or up to a quarter of the pixels
-    missing; the others are a Kinect or a stereo camera. ``strength`` multiplies every error.
+    Half of the draws look as renders do, some with noise up to 0.02 object radii or up to a quarter
+    of the pixels missing; the others are a Kinect or a stereo camera. ``strength`` multiplies every
+    error.
     """
 
     strength: float = 1.0
@@ -232,9 +338,15 @@ class SensorMix:
         else:
             sensor = SENSORS[str(kind)].scaled(float(rng.uniform(0, 2)))
         setup = {
-            "tilt": (0.5, 12.0), "centre": (0.5, 0.1), "size": (0.5, 0.15), "crop": (0.4, 0.4),
-            "boxes": (0.5, 12.0), "table": (0.2, 0.1), "turned": (0.3, 0.5), "moved": (0.3, 0.005),
-        }  # fmt: skip
+            "tilt": (0.5, 12.0),
+            "centre": (0.5, 0.1),
+            "size": (0.5, 0.15),
+            "crop": (0.4, 0.4),
+            "boxes": (0.5, 12.0),
+            "table": (0.2, 0.1),
+            "turned": (0.3, 0.5),
+            "moved": (0.3, 0.005),
+        }
         return replace(sensor, **_some(rng, setup)).scaled(self.strength)
 
     def to_dict(self) -> dict[str, Any]:
@@ -259,7 +371,9 @@ def sensor_named(text: str | Sensor | SensorMix) -> Sensor | SensorMix:
     try:
         times = float(strength) if given else 1.0
     except ValueError:
-        raise UsageError(f"{text}: a sensor is NAME or NAME:STRENGTH, a number of at least 0") from None
+        raise UsageError(
+            f"{text}: a sensor is NAME or NAME:STRENGTH, a number of at least 0"
+        ) from None
     return SensorMix(times) if name == "mix" else SENSORS[name].scaled(times)
 
 
@@ -267,42 +381,59 @@ def sensor_named(text: str | Sensor | SensorMix) -> Sensor | SensorMix:
 
 
 def slopes(q: Image) -> tuple[Image, Image]:
-    """Change per pixel along x and y, from the side where it is smaller: the same surface. 0 for a pixel alone."""
+    """Change per pixel along x and y, from the side where it is smaller: the same surface. 0 for
+    a pixel alone.
+    """
     return _slope(q), _slope(q.T).T
 
 
 def _slope(q: Image) -> Image:
-    here, nothing = q > 0, np.full((len(q), 1), np.inf)
+    here = q > 0
+    nothing = np.full((len(q), 1), np.inf)
     difference = np.where(here[:, 1:] & here[:, :-1], q[:, 1:] - q[:, :-1], np.inf)
-    forth, back = np.hstack([difference, nothing]), np.hstack([nothing, difference])
+    forth = np.hstack([difference, nothing])
+    back = np.hstack([nothing, difference])
     smaller = np.where(np.abs(back) < np.abs(forth), back, forth)
     return np.where(np.isfinite(smaller), smaller, 0.0)
 
 
-def shifted(q: Image, slope: tuple[Image, Image], right: Index, down: Index) -> tuple[Image, tuple[Index, Index]]:
-    """Each pixel shows the surface of another one nearby where its own ray meets it: edges move and planes stay."""
+def shifted(
+    q: Image, slope: tuple[Image, Image], right: Index, down: Index
+) -> tuple[Image, tuple[Index, Index]]:
+    """Each pixel shows the surface of another one nearby where its own ray meets it: edges move
+    and planes stay.
+    """
     row, column = np.indices(q.shape)
     at = np.clip(row + down, 0, len(q) - 1), np.clip(column + right, 0, q.shape[1] - 1)
     there = q[at]
     moved = there - slope[0][at] * (at[1] - column) - slope[1][at] * (at[0] - row)
-    moved = np.where(np.abs(moved - there) < 0.1 * there, moved, there)  # a slope seen edge-on leads anywhere
+    # a slope seen edge-on leads anywhere
+    moved = np.where(np.abs(moved - there) < 0.1 * there, moved, there)
     return np.where(there > 0, moved, 0), at
 
 
 def incidence(q: Image, slope: tuple[Image, Image], intrinsics: NDArray[np.float64]) -> Image:
-    """Angle between the surface's normal and the ray of each pixel, (H, W), radians, 0 where there is nothing."""
+    """Angle between the surface's normal and the ray of each pixel, (H, W), radians, 0 where
+    there is nothing.
+    """
     (fx, _, cx), (_, fy, cy) = intrinsics[:2]
     x = (np.arange(q.shape[1]) + 0.5 - cx) / fx
     y = ((np.arange(q.shape[0]) + 0.5 - cy) / fy)[:, None]
-    a, b = slope[0] * fx, slope[1] * fy  # n = (a, b, c) with n . (x, y, 1) = q
+    # n = (a, b, c) with n . (x, y, 1) = q
+    a = slope[0] * fx
+    b = slope[1] * fy
     c = q - a * x - b * y
     length = np.sqrt((a * a + b * b + c * c) * (x * x + y * y + 1))
     return np.where(q > 0, np.arccos(np.clip(q / np.where(length > 0, length, 1), 0, 1)), 0.0)
 
 
 def across_edges(q: Image, slope: tuple[Image, Image]) -> Image:
-    """Inverse depth of the neighbour, of the four, on the other side of the highest step; a pixel's own if none."""
-    padded, other, highest = np.pad(q, 1), q.copy(), EDGE * q
+    """Inverse depth of the neighbour, of the four, on the other side of the highest step; a
+    pixel's own if none.
+    """
+    padded = np.pad(q, 1)
+    other = q.copy()
+    highest = EDGE * q
     height, width = q.shape
     for dy, dx in ((0, -1), (0, 1), (-1, 0), (1, 0)):
         beside = padded[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
@@ -313,18 +444,23 @@ def across_edges(q: Image, slope: tuple[Image, Image]) -> Image:
 
 
 def in_shadow(q: Image, focal: float, baseline: float) -> NDArray[np.bool_]:
-    """Which pixels lie in the shadow of something nearer, as seen from a projector ``baseline`` metres along x.
+    """Which pixels lie in the shadow of something nearer, as seen from a projector ``baseline``
+    metres along x.
 
-    The pixel of column u is lit from the projector's column u - focal * baseline * q, which lights the nearest surface.
+    The pixel of column u is lit from the projector's column u - focal * baseline * q, which lights
+    the nearest surface.
     """
     height, width = q.shape
     disparity = focal * baseline * q
     column = np.arange(width) - disparity
     offset = int(np.ceil(abs(disparity).max(initial=0.0))) + 1
-    lit = np.zeros((height, width + 2 * offset + 2))  # the largest disparity in each column of the projector
-    first_in_row, seen = np.arange(height)[:, None] * lit.shape[1] + offset, q > 0
+    # the largest disparity in each column of the projector
+    lit = np.zeros((height, width + 2 * offset + 2))
+    first_in_row = np.arange(height)[:, None] * lit.shape[1] + offset
+    seen = q > 0
     # A surface covers all projector columns from one of its pixels to the next.
-    along, joined = _slope(q), np.zeros(q.shape, bool)
+    along = _slope(q)
+    joined = np.zeros(q.shape, bool)
     bend = np.abs(q[:, 1:] - q[:, :-1] - along[:, :-1])
     joined[:, :-1] = seen[:, :-1] & seen[:, 1:] & (bend <= EDGE * q[:, :-1])
     last = np.where(joined, np.roll(column, -1, 1), column)
@@ -342,11 +478,16 @@ def in_shadow(q: Image, focal: float, baseline: float) -> NDArray[np.bool_]:
 def kinect_axial(depth: NDArray[np.floating], angle: NDArray[np.floating]) -> Image:
     """Standard deviation of the depth (metres) of a Kinect (v1) along its optical axis, metres.
 
-    0.0012 + 0.0019 (z - 0.4)^2 + 0.0001 / sqrt(z) (angle / (pi/2 - angle))^2, from Nguyen, Izadi and Lovell, "Modeling
-    Kinect sensor noise for improved 3D reconstruction and tracking", 3DIMPVT 2012. The angle is that of incidence.
+    0.0012 + 0.0019 (z - 0.4)^2 + 0.0001 / sqrt(z) (angle / (pi/2 - angle))^2, from Nguyen, Izadi
+    and Lovell, "Modeling Kinect sensor noise for improved 3D reconstruction and tracking", 3DIMPVT
+    2012. The angle is that of incidence.
     """
     angle = np.minimum(angle, STEEPEST)
-    return 0.0012 + 0.0019 * (depth - 0.4) ** 2 + 0.0001 / np.sqrt(depth) * (angle / (np.pi / 2 - angle)) ** 2
+    return (
+        0.0012
+        + 0.0019 * (depth - 0.4) ** 2
+        + 0.0001 / np.sqrt(depth) * (angle / (np.pi / 2 - angle)) ** 2
+    )
 
 
 def kinect_lateral(angle: NDArray[np.floating]) -> Image:
@@ -355,7 +496,9 @@ def kinect_lateral(angle: NDArray[np.floating]) -> Image:
     return 0.8 + 0.035 * angle / (np.pi / 2 - angle)
 
 
-def normal_field(rng: np.random.Generator, shape: tuple[int, int], grain: float, part: Part | None = None) -> Image:
+def normal_field(
+    rng: np.random.Generator, shape: tuple[int, int], grain: float, part: Part | None = None
+) -> Image:
     """White noise under a Gaussian window of ``grain`` pixels, of variance 1; or a part of it."""
     white = rng.standard_normal(shape)
     part = part or (slice(0, shape[0]), slice(0, shape[1]))
@@ -365,11 +508,17 @@ def normal_field(rng: np.random.Generator, shape: tuple[int, int], grain: float,
     impulse[len(impulse) // 2] = 1
     power = (gaussian_filter1d(impulse, grain) ** 2).sum()
     far = int(4 * grain + 0.5) + 1  # as far as the window reaches
-    rows, columns = (np.arange(s.start - far, s.stop + far) % side for s, side in zip(part, shape, strict=True))
-    return np.asarray(gaussian_filter(white[np.ix_(rows, columns)], grain))[far:-far, far:-far] / power
+    rows, columns = (
+        np.arange(s.start - far, s.stop + far) % side for s, side in zip(part, shape, strict=True)
+    )
+    return (
+        np.asarray(gaussian_filter(white[np.ix_(rows, columns)], grain))[far:-far, far:-far] / power
+    )
 
 
-def uniform_field(rng: np.random.Generator, shape: tuple[int, int], grain: float, part: Part | None = None) -> Image:
+def uniform_field(
+    rng: np.random.Generator, shape: tuple[int, int], grain: float, part: Part | None = None
+) -> Image:
     """Numbers between 0 and 1, each as likely; neighbours are alike as in ``normal_field``."""
     if grain == 0:
         return rng.random(shape)[part or ...]

@@ -1,4 +1,6 @@
-"""Cameras without errors, by ray casting with Embree: of a mesh alone, of a target in a scene, of a whole scene."""
+"""Cameras without errors, by ray casting with Embree: of a mesh alone, of a target in a scene,
+of a whole scene.
+"""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -16,10 +18,13 @@ from nextview.geometry.viewsphere import DISTANCE
 if TYPE_CHECKING:
     from nextview.simulation.scene import Scene
 
-EDGE_ON, SLIVER, STRAY = 0.01, 1e-6, 1e-3
-"""Rounding may put a hit anywhere on the ray where the cosine between ray and normal is smaller than the first, or the
-triangle's normal, twice its area, shorter than the second. Such a hit counts if it is no farther than the third, object
-radii, from the triangle's bounding box in the camera's axes."""
+EDGE_ON = 0.01
+SLIVER = 1e-6
+STRAY = 1e-3
+"""Rounding may put a hit anywhere on the ray where the cosine between ray and normal is smaller
+than the first, or the triangle's normal, twice its area, shorter than the second. Such a hit counts
+if it is no farther than the third, object radii, from the triangle's bounding box in the camera's
+axes."""
 
 
 def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -28,17 +33,19 @@ def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 NOTHING, TARGET, OTHER, TABLE_TOP = np.arange(4, dtype=np.uint8)  # what a pixel shows
-NEARER = 1e-4  # how much nearer than the target something has to be to hide it, object radii: the table touches it
+# how much nearer than the target something has to be to hide it, object radii: the table touches it
+NEARER = 1e-4
 LARGEST = 16_384  # pixels that an image may be high or wide
 
 
 class SimulatedCamera:
     """Looks at one normalised mesh from any pose.
 
-    The image is lit by a headlight: a pixel's brightness grows with the cosine between the ray and the surface normal.
-    It is a square of ``size`` pixels that the unit sphere just fills from ``distance`` object radii; or of ``shape``,
-    height and width, through ``intrinsics``, (3, 3), pixels, the first pixel's centre at 0.5. UsageError: no size of an
-    image. ObservationError: the camera stands in the object, or a matrix that no pinhole has.
+    The image is lit by a headlight: a pixel's brightness grows with the cosine between the ray and
+    the surface normal. It is a square of ``size`` pixels that the unit sphere just fills from
+    ``distance`` object radii; or of ``shape``, height and width, through ``intrinsics``, (3, 3),
+    pixels, the first pixel's centre at 0.5. UsageError: no size of an image. ObservationError: the
+    camera stands in the object, or a matrix that no pinhole has.
     """
 
     def __init__(
@@ -50,15 +57,24 @@ class SimulatedCamera:
         shape: tuple[int, int] | None = None,
     ) -> None:
         height, width = shape or (size, size)
-        self.shape = whole(height, "the height of the image", 1, LARGEST), whole(width, "its width", 1, LARGEST)
-        self.intrinsics = pinhole(size, distance) if intrinsics is None else checked_intrinsics(intrinsics, self.shape)
+        self.shape = (
+            whole(height, "the height of the image", 1, LARGEST),
+            whole(width, "its width", 1, LARGEST),
+        )
+        self.intrinsics = (
+            pinhole(size, distance)
+            if intrinsics is None
+            else checked_intrinsics(intrinsics, self.shape)
+        )
         self.radius = mesh.metres
         vertices = mesh.vertices.astype(np.float32)
-        self._corners, self._faces = np.ascontiguousarray(vertices.T), mesh.faces
+        self._corners = np.ascontiguousarray(vertices.T)
+        self._faces = mesh.faces
         self._scene = embree_scene([(vertices, mesh.faces)])
         (fx, _, cx), (_, fy, cy) = self.intrinsics[:2]
         y, x = np.indices(self.shape, np.float32, sparse=True)
-        self._rays = np.ones((*self.shape, 3), np.float32)  # z = 1, so that Embree's distance is the depth
+        # z = 1, so that Embree's distance is the depth
+        self._rays = np.ones((*self.shape, 3), np.float32)
         self._rays[..., 0] = (x + np.float32(0.5 - cx)) / np.float32(fx)
         self._rays[..., 1] = (y + np.float32(0.5 - cy)) / np.float32(fy)
         self._ray_length = np.linalg.norm(self._rays, axis=-1)
@@ -66,29 +82,42 @@ class SimulatedCamera:
     def observe(self, pose: NDArray[np.float64]) -> Observation:
         """Look from a camera-to-world pose, (4, 4), OpenCV axes, object radii."""
         pose = checked_pose(pose)
-        rotation, origin = pose[:3, :3].astype(np.float32), pose[:3, 3].astype(np.float32)
-        image, depth = np.zeros(self.shape, np.uint8), np.zeros(self.shape, np.float32)
+        rotation = pose[:3, :3].astype(np.float32)
+        origin = pose[:3, 3].astype(np.float32)
+        image = np.zeros(self.shape, np.uint8)
+        depth = np.zeros(self.shape, np.float32)
         # Only pixels inside the object's projected bound can hit anything: cast no others.
         bound = self._bound(rotation, origin)
         height, width = depth[bound].shape
         if height and width:
             rays = self._rays[bound].reshape(-1, 3) @ np.ascontiguousarray(rotation.T)
-            origins = np.tile(np.tile(origin, width), height).reshape(-1, 3)  # row by row: ten times as fast
+            # row by row: ten times as fast
+            origins = np.tile(np.tile(origin, width), height).reshape(-1, 3)
             hits = self._scene.run(origins, rays, output=1)
-            hit, normals = hits["primID"] >= 0, hits["Ng"]
-            cosine, squared = np.abs(_dot(normals, rays)), _dot(normals, normals)
-            cosine /= np.sqrt(squared) * self._ray_length[bound].ravel() + 1e-18  # not 0 where that square is
+            hit = hits["primID"] >= 0
+            normals = hits["Ng"]
+            cosine = np.abs(_dot(normals, rays))
+            squared = _dot(normals, normals)
+            # not 0 where that square is
+            cosine /= np.sqrt(squared) * self._ray_length[bound].ravel() + 1e-18
             doubtful = np.flatnonzero(hit & ((cosine < EDGE_ON) | (squared < SLIVER**2)))
             where = hits["tfar"][doubtful, None] * self._rays[bound].reshape(-1, 3)[doubtful]
-            corners = (self._corners.T[self._faces[hits["primID"][doubtful]]] - origin) @ rotation  # (n, 3, xyz)
-            hit[doubtful] = ((where > corners.min(1) - STRAY) & (where < corners.max(1) + STRAY)).all(1)
+            # (n, 3, xyz)
+            corners = (self._corners.T[self._faces[hits["primID"][doubtful]]] - origin) @ rotation
+            hit[doubtful] = (
+                (where > corners.min(1) - STRAY) & (where < corners.max(1) + STRAY)
+            ).all(1)
             shade = np.where(hit, 255 * (AMBIENT + (1 - AMBIENT) * cosine) + 0.5, 0)
             image[bound] = shade.reshape(height, width)
             depth[bound] = np.where(hit, hits["tfar"], 0).reshape(height, width)
         return Observation(depth, pose, self.intrinsics, self.radius, image, exact=True)
 
-    def _bound(self, rotation: NDArray[np.float32], origin: NDArray[np.float32]) -> tuple[slice, slice]:
-        """Rows and columns that hold the projection of every vertex; the whole image if one is behind the camera."""
+    def _bound(
+        self, rotation: NDArray[np.float32], origin: NDArray[np.float32]
+    ) -> tuple[slice, slice]:
+        """Rows and columns that hold the projection of every vertex; the whole image if one is
+        behind the camera.
+        """
         x, y, z = rotation.T @ self._corners - (rotation.T @ origin)[:, None]
         height, width = self.shape
         if z.min() <= 1e-6:
@@ -96,18 +125,23 @@ class SimulatedCamera:
         (fx, _, cx), (_, fy, cy) = self.intrinsics[:2]
         spans = []
         for projected, focal, centre, side in ((y / z, fy, cy, height), (x / z, fx, cx, width)):
-            low, high = projected.min() * focal + centre, projected.max() * focal + centre
+            low = projected.min() * focal + centre
+            high = projected.max() * focal + centre
             spans.append(slice(*np.clip([int(np.floor(low)) - 1, int(np.ceil(high)) + 1], 0, side)))
         return spans[0], spans[1]
 
 
 class OccludedCamera:
-    """A ``SimulatedCamera`` before the target of a scene; what hides it is cut out, as if told from it exactly."""
+    """A ``SimulatedCamera`` before the target of a scene; what hides it is cut out, as if told
+    from it exactly.
+    """
 
     def __init__(self, scene: "Scene", size: int = 224, distance: float = DISTANCE) -> None:
         self.scene = scene
         self._target = SimulatedCamera(scene.target, size, distance)
-        self._others = RayCaster([(mesh.vertices, mesh.faces) for mesh in (scene.table, scene.around) if mesh])
+        self._others = RayCaster(
+            [(mesh.vertices, mesh.faces) for mesh in (scene.table, scene.around) if mesh]
+        )
         self._rays = pixel_rays(pinhole(size, distance), (size, size))
 
     def observe(self, pose: NDArray[np.float64]) -> Observation:
@@ -115,10 +149,16 @@ class OccludedCamera:
         seen = self._target.observe(pose)
         hidden = self._hidden(seen)
         assert seen.image is not None
-        return replace(seen, depth=np.where(hidden, 0, seen.depth), image=np.where(hidden, np.uint8(0), seen.image))
+        return replace(
+            seen,
+            depth=np.where(hidden, 0, seen.depth),
+            image=np.where(hidden, np.uint8(0), seen.image),
+        )
 
     def visible_share(self, pose: NDArray[np.float64]) -> float:
-        """Share of the target's picture from a pose, (4, 4), that nothing hides; 0 if it has none."""
+        """Share of the target's picture from a pose, (4, 4), that nothing hides; 0 if it has
+        none.
+        """
         seen = self._target.observe(pose)
         return 1 - np.count_nonzero(self._hidden(seen)) / seen.visible if seen.visible else 0.0
 
@@ -133,27 +173,39 @@ class OccludedCamera:
 
 
 class SceneCamera:
-    """Shows a whole scene, through a pinhole of any matrix, (3, 3), pixels, the first pixel's centre at 0.5."""
+    """Shows a whole scene, through a pinhole of any matrix, (3, 3), pixels, the first pixel's
+    centre at 0.5.
+    """
 
-    def __init__(self, scene: "Scene", intrinsics: NDArray[np.float64], shape: tuple[int, int]) -> None:
+    def __init__(
+        self, scene: "Scene", intrinsics: NDArray[np.float64], shape: tuple[int, int]
+    ) -> None:
         meshes = (scene.target, scene.table, scene.around)
         self._caster = RayCaster([(mesh.vertices, mesh.faces) for mesh in meshes if mesh])
         self._rays = pixel_rays(checked_intrinsics(intrinsics, shape), shape)
         self._owners = np.array([TARGET, TABLE_TOP, OTHER, NOTHING])
 
     def look(self, pose: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """What is there from a camera-to-world pose, (4, 4), OpenCV axes, object frame, object radii.
+        """What is there from a camera-to-world pose, (4, 4), OpenCV axes, object frame, object
+        radii.
 
-        Depth, (H, W) float32, object radii, 0 = nothing; and NOTHING, TARGET, OTHER or TABLE_TOP, (H, W) uint8.
+        Depth, (H, W) float32, object radii, 0 = nothing; and NOTHING, TARGET, OTHER or TABLE_TOP,
+        (H, W) uint8.
         """
         pose = checked_pose(pose)
         rays = self._rays.reshape(-1, 3) @ pose[:3, :3].T.astype(np.float32)
         depth, which = self._caster.cast(pose[:3, 3].astype(np.float32), rays)
         shape = self._rays.shape[:2]
-        return np.where(which < 0, np.float32(0), depth).reshape(shape), self._owners[which].reshape(shape)
+        return np.where(which < 0, np.float32(0), depth).reshape(shape), self._owners[
+            which
+        ].reshape(shape)
 
 
-def visible_shares(scene: "Scene", poses: NDArray[np.float64], size: int, distance: float) -> NDArray[np.float64]:
-    """Share of the target's picture that nothing hides, from each of some poses, (V, 4, 4); (V,) float64."""
+def visible_shares(
+    scene: "Scene", poses: NDArray[np.float64], size: int, distance: float
+) -> NDArray[np.float64]:
+    """Share of the target's picture that nothing hides, from each of some poses, (V, 4, 4); (V,)
+    float64.
+    """
     camera = OccludedCamera(scene, size, distance)
     return np.array([camera.visible_share(pose) for pose in poses])

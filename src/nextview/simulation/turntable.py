@@ -1,4 +1,6 @@
-"""Frames of a thing on a turntable before a camera that stands still: their poses follow from the even steps."""
+"""Frames of a thing on a turntable before a camera that stands still: their poses follow from
+the even steps.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,27 +11,48 @@ from scipy.spatial import cKDTree
 from nextview.errors import DatasetError, ObservationError
 from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.object_frame import smallest_circle, upright_axes
-from nextview.simulation.captured import INTRINSICS, MILLIMETRES, Capture, CapturedFrame, Float, is_capture, read_table
+from nextview.simulation.captured import (
+    INTRINSICS,
+    MILLIMETRES,
+    Capture,
+    CapturedFrame,
+    Float,
+    is_capture,
+    read_table,
+)
 
-ROUNDS, POINTS, CLOSEST = 40, 800, 0.7  # of the fit; points of a frame; share of them that counts, the nearest
+# of the fit; points of a frame; share of them that counts, the nearest
+ROUNDS = 40
+POINTS = 800
+CLOSEST = 0.7
 FAR = 6  # a sixth of a circle, or one step, lies between two frames that are compared
-AGREE, MOST = 0.008, 0.8  # how far apart this share of the frames may lie, parts of the thing's radius, beyond noise
+# how far apart this share of the frames may lie, parts of the thing's radius, beyond noise
+AGREE = 0.008
+MOST = 0.8
 
 
 def is_turntable(folder: Path) -> bool:
     """Whether a folder holds depth images and intrinsics, and no poses."""
-    return (folder / INTRINSICS).exists() and next(folder.glob("*.png"), None) is not None and not is_capture(folder)
+    return (
+        (folder / INTRINSICS).exists()
+        and next(folder.glob("*.png"), None) is not None
+        and not is_capture(folder)
+    )
 
 
 def read_turntable(folder: Path, turn: str) -> Capture:
     """A capture of a thing that turned once around in even steps, "ccw" or "cw" as seen from above.
 
-    Depth images in millimetres, in the order of their names. The axis is the normal of the support plane, where the
-    surfaces that neighbouring frames show agree best; its foot becomes the world's origin. DatasetError: they do not
-    agree, or a frame does not show a thing on a plane.
+    Depth images in millimetres, in the order of their names. The axis is the normal of the support
+    plane, where the surfaces that neighbouring frames show agree best; its foot becomes the world's
+    origin. DatasetError: they do not agree, or a frame does not show a thing on a plane.
     """
-    k, way = read_table(folder / INTRINSICS, "the pinhole matrix", 3), 1 if turn == "ccw" else -1
-    frames = [CapturedFrame(path.stem, path, MILLIMETRES, k, np.eye(4)) for path in sorted(folder.glob("*.png"))]
+    k = read_table(folder / INTRINSICS, "the pinhole matrix", 3)
+    way = 1 if turn == "ccw" else -1
+    frames = [
+        CapturedFrame(path.stem, path, MILLIMETRES, k, np.eye(4))
+        for path in sorted(folder.glob("*.png"))
+    ]
     shown = []
     for frame in frames:
         thing = ObservedObject()
@@ -41,20 +64,29 @@ def read_turntable(folder: Path, turn: str) -> Capture:
     plane = np.median([[*s.plane.normal, s.plane.offset] for s in shown if s.plane is not None], 0)
     axes = upright_axes(plane[:3], np.array([0, 0, -1.0]))
     few = [np.linspace(0, len(s.facets.planes) - 1, POINTS).astype(int) for s in shown]
-    clouds = [(s.facets.points[f] @ axes.T, s.facets.planes[f] @ axes.T) for s, f in zip(shown, few, strict=True)]
+    clouds = [
+        (s.facets.points[f] @ axes.T, s.facets.planes[f] @ axes.T)
+        for s, f in zip(shown, few, strict=True)
+    ]
     (axis, apart), (_, other) = _fit(clouds, way), _fit(clouds, -way)
     if np.median(other) < 0.6 * np.median(apart):
-        raise DatasetError(f"{folder}: its frames agree if the thing turned the other way, not {turn}")
+        raise DatasetError(
+            f"{folder}: its frames agree if the thing turned the other way, not {turn}"
+        )
     radius = np.ptp(np.concatenate([points[:, :2] for points, _ in clouds]), axis=0).max() / 2
     z = float(np.median([np.median(s.facets.points[:, 2]) for s in shown]))
     noise = float(np.median([s.noise.at(z) for s in shown])) * z**2
-    worst = max(np.quantile(apart, MOST), apart[-1] / 3)  # the last and the first, too: a full circle
+    # the last and the first, too: a full circle
+    worst = max(np.quantile(apart, MOST), apart[-1] / 3)
     if worst > AGREE * radius + noise:
         what = f"what a frame and the next show does not agree ({1000 * worst:.1f} mm apart)"
-        raise DatasetError(f"{folder}: {what}: equal steps through a full circle, in the order of the names?")
+        raise DatasetError(
+            f"{folder}: {what}: equal steps through a full circle, in the order of the names?"
+        )
     posed = []
     for i, frame in enumerate(frames):
-        back, pose = _turned(-way * i, len(frames)), np.eye(4)
+        back = _turned(-way * i, len(frames))
+        pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = back @ axes, back @ [*-axis, plane[3]]
         posed.append(replace(frame, pose=pose))
     notes = (f"{len(posed)} even steps {turn}",)
@@ -62,16 +94,24 @@ def read_turntable(folder: Path, turn: str) -> Capture:
 
 
 def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
-    """Where the axis goes through the plane, (2,), and how far apart each frame and the next are, metres, (N,).
+    """Where the axis goes through the plane, (2,), and how far apart each frame and the next are,
+    metres, (N,).
 
-    By points and planes, upright: each point comes to lie on the plane of its nearest neighbour, least squares.
+    By points and planes, upright: each point comes to lie on the plane of its nearest neighbour,
+    least squares.
     """
-    n, axis = len(clouds), smallest_circle(np.concatenate([points[::7, :2] for points, _ in clouds]))[0]
-    turns, apart = [_turned(-way * i, n) for i in range(n)], np.zeros(n)
-    turned = [(p @ r.T, q @ r.T / np.linalg.norm(q, axis=1)[:, None]) for (p, q), r in zip(clouds, turns, strict=True)]
+    n = len(clouds)
+    axis = smallest_circle(np.concatenate([points[::7, :2] for points, _ in clouds]))[0]
+    turns = [_turned(-way * i, n) for i in range(n)]
+    apart = np.zeros(n)
+    turned = [
+        (p @ r.T, q @ r.T / np.linalg.norm(q, axis=1)[:, None])
+        for (p, q), r in zip(clouds, turns, strict=True)
+    ]
     pairs = [(i, (i + gap) % n) for gap in sorted({max(1, n // FAR), 1}) for i in range(n)]
     for _ in range(ROUNDS):
-        rows, wanted = list[Float](), list[Float]()
+        rows = list[Float]()
+        wanted = list[Float]()
         for i, j in pairs:
             (p, _), (q, normals), shift = turned[i], turned[j], (turns[i] - turns[j])[:, :2]
             distance, nearest = cKDTree(q).query(p - shift @ axis)
@@ -81,7 +121,8 @@ def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
             wanted.append((normals[near] * (p[close] - q[near])).sum(1))
             if j == (i + 1) % n:
                 apart[i] = np.median(np.abs(wanted[-1] - rows[-1] @ axis))
-        before, axis = axis, np.linalg.lstsq(np.concatenate(rows), np.concatenate(wanted), rcond=None)[0]
+        before = axis
+        axis = np.linalg.lstsq(np.concatenate(rows), np.concatenate(wanted), rcond=None)[0]
         if np.linalg.norm(axis - before) < 1e-6:
             break
     return axis, apart
@@ -89,5 +130,6 @@ def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
 
 def _turned(steps: int, of: int) -> Float:
     """A turn about z by so many steps of a full circle, (3, 3)."""
-    c, s = np.cos(2 * np.pi * steps / of), np.sin(2 * np.pi * steps / of)
+    c = np.cos(2 * np.pi * steps / of)
+    s = np.sin(2 * np.pi * steps / of)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])

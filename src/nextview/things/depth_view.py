@@ -192,7 +192,8 @@ class MetricImage:
         """
         mask = self.kind == THING
         rows, columns = _window(mask, side, WINDOW_MARGIN)
-        top, left = rows[0], columns[0]
+        top = rows[0]
+        left = columns[0]
         edge, towards = _outline(mask[top : rows[-1] + 1, left : columns[-1] + 1])
         in_window = np.ix_(rows - top, columns - left)
         in_image = np.ix_(rows, columns)

@@ -476,7 +476,8 @@ def _rendered(
     origins = cameras[:, :3, 3]
     x, y, step = _windows(caster, hypotheses, cameras, side)
 
-    views, count = len(cameras), len(things)
+    views = len(cameras)
+    count = len(things)
     in_camera = np.ones((views, side, side, 3))
     in_camera[..., 0] = x[:, None, :]
     in_camera[..., 1] = y[:, :, None]

@@ -37,13 +37,22 @@ STYLE = f"""<style>
 def walk_card(walk: Walk) -> str:
     """The walk so far: image, maps and values, belief before and after, and every view."""
     if not walk.views:
-        return f'{STYLE}<div class="nv"><p>No view was taken yet. The policy begins at view {walk.start}.</p></div>'
-    view, classes = walk.views[-1], walk.session.models.classes
+        return (
+            f'{STYLE}<div class="nv"><p>No view was taken yet. The policy begins at view'
+            f" {walk.start}.</p></div>"
+        )
+    view = walk.views[-1]
+    classes = walk.session.models.classes
     best = int(view.belief.argmax())
     believed = f"{escape(classes[best])} <small>{view.belief[best]:.1%}</small>"
     believed = believed if view.observation.seen else "Nothing is seen"
     goes_on = "It would stop here." if walk.stopped else "Not sure enough yet: it would look again."
-    parts = [f"<h3>{believed}</h3><p>{goes_on}</p>", _pose(walk), _figures(walk, view), _beliefs(walk)]
+    parts = [
+        f"<h3>{believed}</h3><p>{goes_on}</p>",
+        _pose(walk),
+        _figures(walk, view),
+        _beliefs(walk),
+    ]
     parts.append(rivals_card(walk))
     parts += [_maps(view), _steps(walk)]
     return f'{STYLE}<div class="nv">{"".join(parts)}</div>'
@@ -59,11 +68,16 @@ def _pose(walk: Walk) -> str:
     likely = max(each.probability for each in result.pose_candidates)
     count = len(result.pose_candidates)
     several = f", the likeliest of {count} poses ({likely:.0%})" if count > 1 else ""
-    return f"<p>At {place_in_words(result.place)} in {result.poses_in}, {result.pose_uncertainty}{several}.</p>"
+    return (
+        f"<p>At {place_in_words(result.place)} in {result.poses_in},"
+        f" {result.pose_uncertainty}{several}.</p>"
+    )
 
 
 def preview_card(observation: Observation, walk: Walk) -> str:
-    """What a camera that is being dragged would see, and the leading things as remembered from nearest there."""
+    """What a camera that is being dragged would see, and the leading things as remembered from
+    nearest there.
+    """
     nearest, _ = walk.sphere.nearest(direction_of(observation.pose))
     parts = f"<h3>From here</h3>{_image(observation.picture, 200)}{rivals_card(walk, nearest)}"
     return f'{STYLE}<div class="nv">{parts}</div>'
@@ -75,7 +89,9 @@ def class_card(label: str) -> str:
 
 
 def warm(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A grey picture, (H, W), black where nothing is, in the colours of the things and the ground, (H, W, 3)."""
+    """A grey picture, (H, W), black where nothing is, in the colours of the things and the
+    ground, (H, W, 3).
+    """
     wood = np.minimum(np.array(rgb(WOOD)) * np.minimum(picture[..., None] / 200, 1.15), 255)
     return np.where(picture[..., None] > 0, wood, rgb(GROUND)).astype(np.uint8)
 
@@ -83,7 +99,9 @@ def warm(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _image(pixels: NDArray[np.uint8], width: int) -> str:
     file = BytesIO()
     Image.fromarray(warm(pixels) if pixels.ndim == 2 else pixels).save(file, "png")
-    return f'<img width="{width}" src="data:image/png;base64,{b64encode(file.getvalue()).decode()}">'
+    return (
+        f'<img width="{width}" src="data:image/png;base64,{b64encode(file.getvalue()).decode()}">'
+    )
 
 
 def _figures(walk: Walk, view: View) -> str:
@@ -99,12 +117,18 @@ def _figures(walk: Walk, view: View) -> str:
 
 
 def _maps(view: View) -> str:
-    found = [(name, _image(heat(values[::-1]), CELL * values.shape[1])) for name, values in view.maps.items()]
+    found = [
+        (name, _image(heat(values[::-1]), CELL * values.shape[1]))
+        for name, values in view.maps.items()
+    ]
     return f"<p>Maps of the views around this one:</p>{_captioned(found)}" if found else ""
 
 
 def _captioned(images: Iterable[tuple[str, str]]) -> str:
-    return "".join(f"<figure>{image}<figcaption>{escape(below)}</figcaption></figure>" for below, image in images)
+    return "".join(
+        f"<figure>{image}<figcaption>{escape(below)}</figcaption></figure>"
+        for below, image in images
+    )
 
 
 def _table(rows: Iterable[Iterable[str]]) -> str:
@@ -113,42 +137,77 @@ def _table(rows: Iterable[Iterable[str]]) -> str:
 
 
 def rivals_card(walk: Walk, view: int | None = None) -> str:
-    """The two taught things believed most, as remembered from a view, by default the next; nothing for other models."""
-    rivals, at = walk.rivals, walk.next_view if view is None else view
+    """The two taught things believed most, as remembered from a view, by default the next;
+    nothing for other models.
+    """
+    rivals = walk.rivals
+    at = walk.next_view if view is None else view
     if rivals is None or at is None:
         return ""
     both = [(name, _image(picture, 96)) for name, picture in walk.remembered(rivals, at)]
     differ = 1 - rivals.alike
     if isinstance(walk.sphere, ViewSphere):
-        grid = differ.reshape(walk.sphere.rings, walk.sphere.azimuths)[np.argsort(walk.sphere.elevations)[::-1]]
-        both.append(("how much they differ from each view", _image(heat(grid), CELL * grid.shape[1])))
+        grid = differ.reshape(walk.sphere.rings, walk.sphere.azimuths)[
+            np.argsort(walk.sphere.elevations)[::-1]
+        ]
+        both.append(
+            ("how much they differ from each view", _image(heat(grid), CELL * grid.shape[1]))
+        )
     known = not np.isnan(differ[at])
-    said = f"they differ by {differ[at]:.2f}, {np.nanmax(differ):.2f} at most" if known else "not remembered from there"
+    said = (
+        f"they differ by {differ[at]:.2f}, {np.nanmax(differ):.2f} at most"
+        if known
+        else "not remembered from there"
+    )
     return f"<p>The two likeliest, as view {at} would show them ({said}):</p>{_captioned(both)}"
 
 
 def _beliefs(walk: Walk) -> str:
     """The classes believed most: belief now, what this view says alone, and the change."""
-    view, classes, rows = walk.views[-1], walk.session.models.classes, []
-    before = walk.views[-2].belief if len(walk.views) > 1 else np.full(len(classes), 1 / len(classes))
+    view = walk.views[-1]
+    classes = walk.session.models.classes
+    rows = []
+    before = (
+        walk.views[-2].belief if len(walk.views) > 1 else np.full(len(classes), 1 / len(classes))
+    )
     highest = np.maximum(view.belief, before) if len(walk.views) > 1 else view.belief
     counted = sum(view.observation.seen for view in walk.views)
-    threshold = 100 * float(walk.stopping.threshold_at(max(counted, 1)))  # none is drawn where it is infinite
+    # none is drawn where it is infinite
+    threshold = 100 * float(walk.stopping.threshold_at(max(counted, 1)))
     for c in np.argsort(-highest, kind="stable")[:SHOWN]:
         bars = (
-            f'<div class="bar"><i style="top:0;height:8px;width:{100 * view.belief[c]:.1f}%;background:{ACCENT}"></i>'
-            f'<i style="top:8px;height:5px;width:{100 * view.alone[c]:.1f}%;background:{FAINT}"></i>'
+            '<div class="bar"><i'
+            f' style="top:0;height:8px;width:{100 * view.belief[c]:.1f}%;background:{ACCENT}"></i>'
+            f'<i style="top:8px;height:5px;width:{100 * view.alone[c]:.1f}%;'
+            f'background:{FAINT}"></i>'
             f"""{f'<b style="left:{threshold:.1f}%"></b>' * bool(np.isfinite(threshold))}</div>"""
         )
-        rows.append((escape(classes[c]), bars, f"{view.belief[c]:.1%}", f"{view.belief[c] - before[c]:+.1%}"))
+        rows.append(
+            (
+                escape(classes[c]),
+                bars,
+                f"{view.belief[c]:.1%}",
+                f"{view.belief[c] - before[c]:+.1%}",
+            )
+        )
     legend = "red: belief · grey: by this view alone · dotted: enough to stop · right: change"
     return f"{_table(rows)}<p><small>{legend}</small></p>"
 
 
 def _steps(walk: Walk) -> str:
-    classes, rows = walk.session.models.classes, []
+    classes = walk.session.models.classes
+    rows = []
     for step, view in enumerate(walk.views, 1):
-        best, warnings = int(view.belief.argmax()), ", ".join(warning.name for warning in view.warnings)
+        best = int(view.belief.argmax())
+        warnings = ", ".join(warning.name for warning in view.warnings)
         believed = escape(classes[best]), f"{view.belief[best]:.1%}"
-        rows.append((f"{step}", f"view {view.index}", *believed, f"{view.travel:.2f} cells", escape(warnings)))
+        rows.append(
+            (
+                f"{step}",
+                f"view {view.index}",
+                *believed,
+                f"{view.travel:.2f} cells",
+                escape(warnings),
+            )
+        )
     return _table(rows)

@@ -1,4 +1,6 @@
-"""What is explored, without any page: an object, one or two walks around it, and what their policies value."""
+"""What is explored, without any page: an object, one or two walks around it, and what their
+policies value.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -30,12 +32,17 @@ Float = NDArray[np.float64]
 
 
 class StoredViews:
-    """A camera before one object of a view store: it answers with the stored view nearest to the one asked for."""
+    """A camera before one object of a view store: it answers with the stored view nearest to the
+    one asked for.
+    """
 
     def __init__(self, store: ViewStore, row: int) -> None:
-        self.sphere, self._intrinsics = store.sphere, store.intrinsics
-        self._depth, self._image = store.depth(row), store.image(row)
-        radius, self._exact = float(store.radii[row]), store.attributes.sensor is None
+        self.sphere = store.sphere
+        self._intrinsics = store.intrinsics
+        self._depth = store.depth(row)
+        self._image = store.image(row)
+        radius = float(store.radii[row])
+        self._exact = store.attributes.sensor is None
         self._radius = radius if 0 < radius < np.inf else None
 
     def observe(self, pose: Float) -> Observation:
@@ -47,15 +54,21 @@ class StoredViews:
 
 @dataclass(frozen=True)
 class ShownObject:
-    """An object by its name; ``open`` reads it: a mesh, or a camera where there are only stored views."""
+    """An object by its name; ``open`` reads it: a mesh, or a camera where there are only stored
+    views.
+    """
 
     name: str
     open: Callable[[], Mesh | Camera]
     label: str | None = None
 
 
-def shown_objects(path: Path | None = None, up: str | None = None, unit: str | None = None) -> tuple[ShownObject, ...]:
-    """The objects of a path, in order: of a mesh file, a folder of meshes or a view store; the samples if not given."""
+def shown_objects(
+    path: Path | None = None, up: str | None = None, unit: str | None = None
+) -> tuple[ShownObject, ...]:
+    """The objects of a path, in order: of a mesh file, a folder of meshes or a view store; the
+    samples if not given.
+    """
     if path is None:
         return tuple(ShownObject(name, partial(sample_mesh, name), name) for name in SAMPLES)
     if not path.is_dir():
@@ -66,7 +79,9 @@ def shown_objects(path: Path | None = None, up: str | None = None, unit: str | N
         if not rows:
             raise DatasetError(f"{path}: no object in it is rendered yet")
         labels = [store.classes[label] for label in store.labels]
-        return tuple(ShownObject(store.names[k], partial(StoredViews, store, k), labels[k]) for k in rows)
+        return tuple(
+            ShownObject(store.names[k], partial(StoredViews, store, k), labels[k]) for k in rows
+        )
     # A mesh of its own, outside of class folders, has no label.
     return tuple(
         ShownObject(
@@ -79,12 +94,21 @@ def shown_objects(path: Path | None = None, up: str | None = None, unit: str | N
 
 
 class Walk:
-    """The views of an object so far, and what is believed after them. It ends after all views only."""
+    """The views of an object so far, and what is believed after them.
+
+    It ends after all views only.
+    """
 
     def __init__(self, system: System, camera: Camera, start: int, seed: int = 0) -> None:
-        self.system, self.camera, self.start, self.seed = system, camera, start, seed
-        self.sphere, self.stopping = system.sphere, system.stopping
-        self.session: Session = replace(system, stopping=FixedLength(max_views=len(system.sphere))).session(start, seed)
+        self.system = system
+        self.camera = camera
+        self.start = start
+        self.seed = seed
+        self.sphere = system.sphere
+        self.stopping = system.stopping
+        self.session: Session = replace(
+            system, stopping=FixedLength(max_views=len(system.sphere))
+        ).session(start, seed)
 
     @property
     def views(self) -> list[View]:
@@ -108,20 +132,31 @@ class Walk:
 
     @property
     def values(self) -> Float | None:
-        """The policy's values of the views, (V,), NaN for those not considered; None if there are none yet."""
+        """The policy's values of the views, (V,), NaN for those not considered; None if there
+        are none yet.
+        """
         return self.views[-1].values if self.views else None
 
     @property
     def rivals(self) -> Rivals | None:
-        """The two taught things believed most, and how they differ from each view; None before a view, or untaught."""
-        recogniser, seen = self.session.models.recogniser, [view for view in self.views if view.observation.seen]
+        """The two taught things believed most, and how they differ from each view; None before a
+        view, or untaught.
+        """
+        recogniser = self.session.models.recogniser
+        seen = [view for view in self.views if view.observation.seen]
         if not isinstance(recogniser, TaughtRecogniser) or not seen:
             return None
         evidence = recogniser([view.observation for view in seen])
         azimuths = azimuth_of(np.stack([view.direction for view in [*seen, self.views[-1]]]))
-        total = log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuths[:-1]).sum(0, keepdims=True)
-        joint = recogniser.calibration.joint(total, len(seen), len(recogniser.classes), azimuths[-1:])
-        things = Discriminate(self.sphere, recogniser.memory.views, np.array(recogniser.calibration.hypotheses))
+        total = log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuths[:-1]).sum(
+            0, keepdims=True
+        )
+        joint = recogniser.calibration.joint(
+            total, len(seen), len(recogniser.classes), azimuths[-1:]
+        )
+        things = Discriminate(
+            self.sphere, recogniser.memory.views, np.array(recogniser.calibration.hypotheses)
+        )
         return things.rivals(joint[0], float(azimuths[-1]))
 
     def remembered(self, rivals: Rivals, view: int) -> list[tuple[str, NDArray[np.uint8]]]:
@@ -130,7 +165,10 @@ class Walk:
         assert isinstance(recogniser, TaughtRecogniser)
         seen_from = zip(rivals.classes, rivals.hypotheses, rivals.azimuths[:, view], strict=True)
         ring = int(rivals.rings[view])
-        return [(recogniser.classes[c], remembered_picture(recogniser, int(h), ring, int(a))) for c, h, a in seen_from]
+        return [
+            (recogniser.classes[c], remembered_picture(recogniser, int(h), ring, int(a)))
+            for c, h, a in seen_from
+        ]
 
     @property
     def visited(self) -> list[int]:
@@ -147,7 +185,9 @@ class Walk:
         """Take a view: from a candidate viewpoint, or from a pose, (4, 4), object frame."""
         if self.session.done:
             raise UsageError("every candidate view was taken: start over")
-        return self.session.update(self.camera.observe(self.sphere.poses[where] if isinstance(where, int) else where))
+        return self.session.update(
+            self.camera.observe(self.sphere.poses[where] if isinstance(where, int) else where)
+        )
 
     def step(self) -> View:
         """Take the view that the policy asks for."""
@@ -162,19 +202,23 @@ class Walk:
 
 
 @lru_cache(maxsize=256)
-def remembered_picture(recogniser: TaughtRecogniser, hypothesis: int, ring: int, azimuth: int) -> NDArray[np.uint8]:
+def remembered_picture(
+    recogniser: TaughtRecogniser, hypothesis: int, ring: int, azimuth: int
+) -> NDArray[np.uint8]:
     """Draw a thing in a resting pose, from a ring and an azimuth bin, as a (64, 64) picture.
 
-    It is drawn from the memory's own surface, or else from the mesh that it was taught from; where neither is there,
-    its one picture is taken.
+    It is drawn from the memory's own surface, or else from the mesh that it was taught from; where
+    neither is there, its one picture is taken.
     """
-    memory, about = recogniser.memory, recogniser.card.memory
+    memory = recogniser.memory
+    about = recogniser.card.memory
     assert about is not None
     thing = int(memory.thing[hypothesis])
     surface = memory.surfaces.surface(thing, about.things[thing].name)
     try:
         if surface is None:
-            standing = load_mesh(about.things[thing].source, up="z")  # resting poses are told from the file's own axes
+            # resting poses are told from the file's own axes
+            standing = load_mesh(about.things[thing].source, up="z")
         else:
             standing = make_mesh(surface.vertices, surface.faces, surface.name)
     except MeshError:
@@ -186,7 +230,9 @@ def remembered_picture(recogniser: TaughtRecogniser, hypothesis: int, ring: int,
 
 
 class Exploration:
-    """An object among some, a camera before it, a walk for each of one or two policies; options of nextview.load."""
+    """An object among some, a camera before it, a walk for each of one or two policies; options
+    of nextview.load.
+    """
 
     def __init__(
         self,
@@ -198,7 +244,9 @@ class Exploration:
         **options: Any,
     ) -> None:
         whole(seed, "the seed", most=2**63 - 1)
-        self.objects, self.sensor, self.seed = {shown.name: shown for shown in objects}, sensor, seed
+        self.objects = {shown.name: shown for shown in objects}
+        self.sensor = sensor
+        self.seed = seed
         self._load = lru_cache(maxsize=None)(lambda policy: load(policy=policy, **options))
         self.systems: list[System] = [self._load(policy) for policy in policies]
         views = len(self.systems[0].sphere)
@@ -231,8 +279,14 @@ class Exploration:
     def _begin(self, shown: ShownObject, opened: Mesh | Camera, sensor: str | None) -> None:
         if sensor is not None and not isinstance(opened, Mesh):
             raise UsageError(f"{shown.name} has only stored views: no sensor can look at it")
-        walks = [Walk(system, self._camera(opened, sensor), self.start, self.seed) for system in self.systems]
-        self.shown, self._opened, self.sensor, self.walks = shown, opened, sensor, walks
+        walks = [
+            Walk(system, self._camera(opened, sensor), self.start, self.seed)
+            for system in self.systems
+        ]
+        self.shown = shown
+        self._opened = opened
+        self.sensor = sensor
+        self.walks = walks
 
     def _camera(self, opened: Mesh | Camera, sensor: str | None = None) -> Camera:
         return simulated(opened, sensor, self.seed) if isinstance(opened, Mesh) else opened
@@ -240,8 +294,12 @@ class Exploration:
     def compare(self, policies: Sequence[str | None]) -> None:
         """Use one policy, or two side by side; those that walked before keep their views."""
         systems = [self._load(policy) for policy in policies]
-        walks = [self.walks[min(k, len(self.walks) - 1)].with_policy_of(system) for k, system in enumerate(systems)]
-        self.systems, self.walks = systems, walks
+        walks = [
+            self.walks[min(k, len(self.walks) - 1)].with_policy_of(system)
+            for k, system in enumerate(systems)
+        ]
+        self.systems = systems
+        self.walks = walks
 
     def step(self) -> None:
         """Let each policy take its next view, if there is one."""
@@ -257,10 +315,17 @@ class Exploration:
         return bool(walks)
 
     def preview(self, where: Float) -> Observation:
-        """What would be seen from a position, (3,), object radii, without noise; nothing is taken."""
+        """What would be seen from a position, (3,), object radii, without noise; nothing is
+        taken.
+        """
         return self._camera(self._opened).observe(self.pose_towards(where))
 
     def pose_towards(self, position: Float) -> Float:
-        """A level pose, (4, 4), in the direction of a position, (3,), as far away as the candidate views are."""
+        """A level pose, (4, 4), in the direction of a position, (3,), as far away as the
+        candidate views are.
+        """
         length = np.linalg.norm(position)
-        return level_pose(position / length if length > 0 else np.array([1.0, 0, 0]), self.walks[0].sphere.distance)
+        return level_pose(
+            position / length if length > 0 else np.array([1.0, 0, 0]),
+            self.walks[0].sphere.distance,
+        )

@@ -1,4 +1,6 @@
-"""The explorer's page: what is clicked and dragged goes to an ``Exploration``, and what follows is drawn."""
+"""The explorer's page: what is clicked and dragged goes to an ``Exploration``, and what follows
+is drawn.
+"""
 
 import errno
 import re
@@ -30,7 +32,8 @@ with extras():
     from websockets.asyncio import server as websocket
 
 SAND = "#e9dfd0"  # at the foot of the background
-NOTHING, CLEAN = "nothing", "clean renders"
+NOTHING = "nothing"
+CLEAN = "clean renders"
 APART = 8.5  # between two objects side by side, object radii
 LAMP = (-4.0, -5.0, 8.0)  # where it hangs
 PAUSE = 0.5  # between the views of a policy that walks, seconds: long enough to see each
@@ -40,17 +43,22 @@ _starting = threading.Lock()
 
 
 class Page:
-    """A page in the browser on an exploration, served at a host and a port. All who open it see and drive the same."""
+    """A page in the browser on an exploration, served at a host and a port.
+
+    All who open it see and drive the same.
+    """
 
     def __init__(self, exploration: Exploration, host: str = "127.0.0.1", port: int = 8080) -> None:
         self.exploration = exploration
         self.server = serve(host, port)
         self.stop = self.server.stop
-        self._lock, self._quiet = threading.RLock(), False
+        self._lock = threading.RLock()
+        self._quiet = False
         self._scenes: list[WalkScene] = []
         self._cards: list[viser.GuiHtmlHandle] = []
         self._panels: list[viser.PanelHandle] = []
-        gui, scene = self.server.gui, self.server.scene
+        gui = self.server.gui
+        scene = self.server.scene
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(209, 73, 91))
         gui.set_panel_label("nextview explore")
         scene.set_up_direction("+z")
@@ -58,8 +66,12 @@ class Page:
         scene.set_background_image(sky.astype(np.uint8)[:, None])
         scene.configure_default_lights(False)
         scene.configure_environment_map(None)
-        scene.add_light_hemisphere("/sky", sky_color=rgb(PAPER), ground_color=rgb(GROUND), intensity=3.0)
-        scene.add_light_directional("/lamp", color=rgb(GROUND), intensity=2.0, cast_shadow=True, position=LAMP)
+        scene.add_light_hemisphere(
+            "/sky", sky_color=rgb(PAPER), ground_color=rgb(GROUND), intensity=3.0
+        )
+        scene.add_light_directional(
+            "/lamp", color=rgb(GROUND), intensity=2.0, cast_shadow=True, position=LAMP
+        )
         self._controls(gui)
         self._rebuild()
 
@@ -67,26 +79,34 @@ class Page:
     def address(self) -> str:
         """Where the page is."""
         host = self.server.get_host()
-        return f"http://{'localhost' if host in ('0.0.0.0', '127.0.0.1') else host}:{self.server.get_port()}"
+        name = "localhost" if host in ("0.0.0.0", "127.0.0.1") else host
+        return f"http://{name}:{self.server.get_port()}"
 
     # What can be clicked
 
     def _controls(self, gui: viser.GuiApi) -> None:
         exploration = self.exploration
         by_map = map_policy_names(find_models(exploration.systems[0].loaded["models"]).maps)
-        policies = list(dict.fromkeys([*exploration.policies, *bundled_policies(), *policy_names(), *by_map]))
-        self._policies, self._sensors = [NOTHING, *policies], [CLEAN, *SENSORS, "mix"]
+        policies = list(
+            dict.fromkeys([*exploration.policies, *bundled_policies(), *policy_names(), *by_map])
+        )
+        self._policies = [NOTHING, *policies]
+        self._sensors = [CLEAN, *SENSORS, "mix"]
         second = exploration.policies[1] if len(exploration.policies) > 1 else NOTHING
         gui.main_panel.dock_left()
         gui.add_markdown(HELP)
-        self._object = gui.add_dropdown("Object", list(exploration.objects), initial_value=exploration.shown.name)
+        self._object = gui.add_dropdown(
+            "Object", list(exploration.objects), initial_value=exploration.shown.name
+        )
         self._label = gui.add_html("")  # and no Markdown: viser would take a name for HTML
         self._policy = gui.add_dropdown("Policy", policies, initial_value=exploration.policies[0])
         self._second = gui.add_dropdown("Compare with", self._policies, initial_value=second)
         name, _, strength = (exploration.sensor or "").partition(":")
         self._sensor = gui.add_dropdown("Sensor", self._sensors, initial_value=name or CLEAN)
         given = float(strength or 1)
-        self._strength = gui.add_slider("Noise strength", 0.0, max(4.0, given), 0.25, initial_value=given)
+        self._strength = gui.add_slider(
+            "Noise strength", 0.0, max(4.0, given), 0.25, initial_value=given
+        )
         self._hide = gui.add_checkbox("Only what was seen", initial_value=exploration.mesh is None)
         step = gui.add_button("Take the next view")
         walk = gui.add_button("Go on until it is sure")
@@ -104,10 +124,15 @@ class Page:
         on(self._hide, self._draw)
         step.on_click(lambda event: self._act(lambda: self._drawn(exploration.step), event.client))
         walk.on_click(lambda event: self._walk(event.client))
-        restart.on_click(lambda event: self._act(lambda: self._changed(exploration.restart), event.client))
+        restart.on_click(
+            lambda event: self._act(lambda: self._changed(exploration.restart), event.client)
+        )
 
     def _act(self, act: Callable[[], Any], client: viser.ClientHandle | None) -> Any:
-        """Do one thing at a time. An error is shown, and the page stays as it was; then None is returned."""
+        """Do one thing at a time.
+
+        An error is shown, and the page stays as it was; then None is returned.
+        """
         with self._lock:
             try:
                 return act()
@@ -115,7 +140,9 @@ class Page:
                 with self._silence():
                     self._show_choices()
                 for one in [client] if client is not None else self.server.get_clients().values():
-                    one.add_notification("This cannot be done", str(error), color="red", auto_close_seconds=8)
+                    one.add_notification(
+                        "This cannot be done", str(error), color="red", auto_close_seconds=8
+                    )
                 return None
 
     @contextmanager
@@ -140,8 +167,11 @@ class Page:
         self._changed(lambda: self.exploration.show(name))
 
     def _use_policies(self) -> None:
-        first, second = _listed(self._policy.value, self._policies[1:]), _listed(self._second.value, self._policies)
-        self._changed(lambda: self.exploration.compare([first] if second == NOTHING else [first, second]))
+        first = _listed(self._policy.value, self._policies[1:])
+        second = _listed(self._second.value, self._policies)
+        self._changed(
+            lambda: self.exploration.compare([first] if second == NOTHING else [first, second])
+        )
 
     def _use_sensor(self) -> None:
         sensor = _listed(self._sensor.value, self._sensors)
@@ -163,13 +193,17 @@ class Page:
         self._act(lambda: self._drawn(lambda: self.exploration.walks[walk].look(where)), None)
 
     def _drag(self, walk: int, place: NDArray[np.float64], let_go: bool) -> None:
-        """Show what would be seen while a camera is dragged, as often as there is time; look where it is let go."""
+        """Show what would be seen while a camera is dragged, as often as there is time; look
+        where it is let go.
+        """
         if let_go:
             self._preview.visible = False
             self._look(walk, self.exploration.pose_towards(place))
         elif self._lock.acquire(blocking=False):
             try:
-                self._preview.content = preview_card(self.exploration.preview(place), self.exploration.walks[walk])
+                self._preview.content = preview_card(
+                    self.exploration.preview(place), self.exploration.walks[walk]
+                )
                 self._preview.visible = True
             finally:
                 self._lock.release()
@@ -185,35 +219,50 @@ class Page:
         for shown in (*self._scenes, *self._panels):
             shown.remove()
         n = len(self.exploration.walks)
-        self._scenes, self._cards, self._panels = [], [], []
+        self._scenes = []
+        self._cards = []
+        self._panels = []
         for k, walk in enumerate(self.exploration.walks):
             place = ((k - (n - 1) / 2) * APART, 0.0, 0.0)
-            look, drag = partial(self._look, k), partial(self._drag, k)
-            self._scenes.append(WalkScene(self.server, f"/walk{k}", place, walk, self.exploration.mesh, look, drag))
+            look = partial(self._look, k)
+            drag = partial(self._drag, k)
+            self._scenes.append(
+                WalkScene(self.server, f"/walk{k}", place, walk, self.exploration.mesh, look, drag)
+            )
             panel = self.server.gui.add_panel()
             with panel.add_tab(walk.system.policy_name):
                 self._cards.append(self.server.gui.add_html(""))
             panel.dock_below(self._panels[-1]) if self._panels else panel.dock_right()
             panel.set_width(400)
             self._panels.append(panel)
-        position, at = np.array([0.38 * (n < 2), -0.92, 0.42]) * (6.6 + 6.0 * (n - 1)), np.array([0.0, 0.0, 0.75])
+        position = np.array([0.38 * (n < 2), -0.92, 0.42]) * (6.6 + 6.0 * (n - 1))
+        at = np.array([0.0, 0.0, 0.75])
         if not np.allclose(self.server.initial_camera.position, position):
-            cameras = [self.server.initial_camera, *(client.camera for client in self.server.get_clients().values())]
+            cameras = [
+                self.server.initial_camera,
+                *(client.camera for client in self.server.get_clients().values()),
+            ]
             for camera in cameras:
-                camera.position, camera.look_at = position, at
+                camera.position = position
+                camera.look_at = at
         label = self.exploration.shown.label
         self._label.content = "" if label is None else class_card(label)
         self._draw()
 
     def _draw(self) -> None:
         with self.server.atomic():
-            for walk, scene, card in zip(self.exploration.walks, self._scenes, self._cards, strict=True):
+            for walk, scene, card in zip(
+                self.exploration.walks, self._scenes, self._cards, strict=True
+            ):
                 scene.draw(walk, bool(self._hide.value))
                 card.content = walk_card(walk)
 
 
 def _listed(value: object, options: Collection[str]) -> str:
-    """What was chosen from a list. Whoever reaches the page can send anything, also the name of a plugin: refused."""
+    """What was chosen from a list.
+
+    Whoever reaches the page can send anything, also the name of a plugin: refused.
+    """
     if not isinstance(value, str) or value not in options:
         raise UsageError(f"{value!r} is none of the options here")
     return value
@@ -228,7 +277,11 @@ def serve(host: str, port: int) -> viser.ViserServer:
         def check(connection: Any, request: Any) -> Any:
             headers = request.headers
             reason = refused(headers.get_all("Host"), headers.get_all("Origin"), host)
-            return connection.respond(403, f"{reason}\n") if reason else process_request(connection, request)
+            return (
+                connection.respond(403, f"{reason}\n")
+                if reason
+                else process_request(connection, request)
+            )
 
         return plain(handler, *address, process_request=check, **options)
 
@@ -245,8 +298,9 @@ def serve(host: str, port: int) -> viser.ViserServer:
 def refused(hosts: Sequence[str], origins: Sequence[str], served: str) -> str | None:
     """Why a request is refused, by its headers Host and Origin; None if it is answered.
 
-    A page of another site can reach this machine in two ways. By this machine's address: then Origin names the site.
-    By a name of its own that points to this address: then Host has that name.
+    A page of another site can reach this machine in two ways. By this machine's address: then
+    Origin names the site. By a name of its own that points to this address: then Host has that
+    name.
     """
     name = _host_name(hosts[0]) if len(hosts) == 1 else None
     if name is None:
@@ -282,7 +336,9 @@ def _check_address(host: str, port: int) -> None:
     try:
         if not host:
             raise OSError("there is no name")
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM
+        )[0]
         with socket.socket(family, kind, protocol) as tried:
             tried.bind(address)
     except (OSError, UnicodeError) as error:

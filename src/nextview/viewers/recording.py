@@ -1,4 +1,6 @@
-"""A session as a recording for the Rerun viewer: what was seen from where, and what was made of it."""
+"""A session as a recording for the Rerun viewer: what was seen from where, and what was made of
+it.
+"""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,22 +24,25 @@ TIMELINE = "step"
 
 
 class Recorder:
-    """Writes a file as a session goes on; put it among ``Session.observers``, or call it with a session yourself.
+    """Writes a file as a session goes on; put it among ``Session.observers``, or call it with a
+    session yourself.
 
     On the timeline ``step`` the file holds, in the object frame and object radii:
 
     - ``world/camera``: pose and pinhole of the last view; ``depth`` and ``image`` below it.
-    - ``world/views/K`` and ``world/seen/K``: pose of view K, and the points that were seen from there. Where a later
-      frame shows better where the object is, they are written anew.
+    - ``world/views/K`` and ``world/seen/K``: pose of view K, and the points that were seen from
+      there. Where a later frame shows better where the object is, they are written anew.
     - ``world/thing``: the scan of the thing that is believed most, where it was found.
-    - ``world/candidates``: the candidate views, in the colours of what the policy values them at, and
-      ``world/next``: the one that it chose.
-    - ``belief/CLASS``, ``threshold``, ``travel/cells``, ``travel/radians``: numbers over the steps, as they were then.
-    - ``belief_now``, ``this_view_alone``, ``values``: bars over classes, and over the views that the policy considered.
+    - ``world/candidates``: the candidate views, in the colours of what the policy values them at,
+      and ``world/next``: the one that it chose.
+    - ``belief/CLASS``, ``threshold``, ``travel/cells``, ``travel/radians``: numbers over the steps,
+    as they were then.
+    - ``belief_now``, ``this_view_alone``, ``values``: bars over classes, and over the views that
+    the policy considered.
     - ``maps/NAME``: predicted maps. ``log``: each step in words, with its warnings.
 
-    The file can be read at any time; it is complete once the session is done, or after ``close``. UsageError if its
-    name does not end in .rrd, or it cannot be written.
+    The file can be read at any time; it is complete once the session is done, or after ``close``.
+    UsageError if its name does not end in .rrd, or it cannot be written.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -57,7 +62,9 @@ class Recorder:
         """Write what is new in a session."""
         if not (self._open and session.views):
             return
-        step, view, new = len(session.views), session.views[-1], len(session.views) > len(self._shown)
+        step = len(session.views)
+        view = session.views[-1]
+        new = len(session.views) > len(self._shown)
         self._stream.set_time(TIMELINE, sequence=step)
         for k, earlier in enumerate(session.views):
             if k >= len(self._shown) or self._shown[k] is not earlier.observation:
@@ -83,7 +90,9 @@ class Recorder:
         height, width = observation.depth.shape
         pose = rr.Transform3D(translation=observation.pose[:3, 3], mat3x3=observation.pose[:3, :3])
         how = {"camera_xyz": rr.ViewCoordinates.RDF, "image_plane_distance": 0.4}
-        pinhole = rr.Pinhole(image_from_camera=observation.intrinsics, resolution=(width, height), **how)
+        pinhole = rr.Pinhole(
+            image_from_camera=observation.intrinsics, resolution=(width, height), **how
+        )
         for name in (f"world/views/{step}", "world/camera"):
             self._stream.log(name, pose, pinhole)
         points = observation.points if observation.seen else np.zeros((0, 3), np.float32)
@@ -107,7 +116,9 @@ class Recorder:
 
     def _log_belief(self, session: "Session", view: "View", step: int) -> None:
         for name, belief in zip(session.models.classes, view.belief, strict=True):
-            self._stream.log(f"belief/{rr.escape_entity_path_part(name)}", rr.Scalars(float(belief)))
+            self._stream.log(
+                f"belief/{rr.escape_entity_path_part(name)}", rr.Scalars(float(belief))
+            )
         self._stream.log("belief_now", rr.BarChart(view.belief))
         self._stream.log("this_view_alone", rr.BarChart(view.alone))
         self._stream.log("threshold", rr.Scalars(float(session.stopping.threshold_at(step))))
@@ -116,24 +127,36 @@ class Recorder:
         for name, values in view.maps.items():
             self._stream.log(f"maps/{name}", rr.Tensor(values, dim_names=("ring", "azimuth")))
         for warning in view.warnings:
-            self._log_text(f"step {step}: warning ({warning.name}): {warning.message}", rr.TextLogLevel.WARN)
+            self._log_text(
+                f"step {step}: warning ({warning.name}): {warning.message}", rr.TextLogLevel.WARN
+            )
 
     def _log_choice(self, session: "Session", view: "View", step: int) -> None:
         """What the policy values the views at, and where it goes; again if it is asked again."""
-        places, visited = session.sphere.poses[:, :3, 3], [earlier.index for earlier in session.views]
+        places = session.sphere.poses[:, :3, 3]
+        visited = [earlier.index for earlier in session.views]
         values = np.full(len(places), np.nan) if view.values is None else view.values
         colours = heat(values)
         colours[visited] = rgb(INK)
         names = [f"view {k}" for k in range(len(places))]
-        candidates = rr.Points3D(places, colors=colours, radii=0.07, labels=names, show_labels=False)
+        candidates = rr.Points3D(
+            places, colors=colours, radii=0.07, labels=names, show_labels=False
+        )
         self._stream.log("world/candidates", candidates)
         considered = np.flatnonzero(np.isfinite(values))
         self._stream.log("values", rr.BarChart(values[considered], abscissa=considered))
-        best, to = int(view.belief.argmax()), view.next_view
-        self._stream.log("world/next", rr.Points3D(places[[] if to is None else [to]], colors=rgb(ACCENT), radii=0.1))
+        best = int(view.belief.argmax())
+        to = view.next_view
+        self._stream.log(
+            "world/next",
+            rr.Points3D(places[[] if to is None else [to]], colors=rgb(ACCENT), radii=0.1),
+        )
         onward = "the end" if to is None else f"next view {to}"
         believed = f"{session.models.classes[best]} {view.belief[best]:.3f}"
-        self._log_text(f"step {step}: view {view.index}, {believed}, {view.travel:.2f} cells of travel, {onward}")
+        self._log_text(
+            f"step {step}: view {view.index}, {believed}, {view.travel:.2f} cells of travel,"
+            f" {onward}"
+        )
 
     def _log_text(self, text: str, level: str = rr.TextLogLevel.INFO) -> None:
         self._stream.log("log", rr.TextLog(text, level=level))
@@ -141,11 +164,21 @@ class Recorder:
 
 def blueprint() -> rrb.Blueprint:
     """How the viewer arranges a recording at first."""
-    camera, bars = "world/camera", {"belief": "belief_now", "this view alone": "this_view_alone", "values": "values"}
-    images = [rrb.Spatial2DView(origin=camera, contents=[f"{camera}/{k}"], name=k) for k in ("image", "depth")]
+    camera = "world/camera"
+    bars = {"belief": "belief_now", "this view alone": "this_view_alone", "values": "values"}
+    images = [
+        rrb.Spatial2DView(origin=camera, contents=[f"{camera}/{k}"], name=k)
+        for k in ("image", "depth")
+    ]
     charts = [rrb.BarChartView(origin=origin, name=name) for name, origin in bars.items()]
-    belief = rrb.TimeSeriesView(origin="/", contents=["belief/**", "threshold"], name="belief over the steps")
+    belief = rrb.TimeSeriesView(
+        origin="/", contents=["belief/**", "threshold"], name="belief over the steps"
+    )
     rows = images, charts, [belief, rrb.TimeSeriesView(origin="travel", name="travel")]
-    scene, log = rrb.Spatial3DView(origin="world", name="object frame"), rrb.TextLogView(origin="log")
-    left, right = rrb.Vertical(scene, log, row_shares=[4, 1]), rrb.Vertical(*(rrb.Horizontal(*row) for row in rows))
-    return rrb.Blueprint(rrb.Horizontal(left, right), rrb.TimePanel(timeline=TIMELINE), collapse_panels=True)
+    scene = rrb.Spatial3DView(origin="world", name="object frame")
+    log = rrb.TextLogView(origin="log")
+    left = rrb.Vertical(scene, log, row_shares=[4, 1])
+    right = rrb.Vertical(*(rrb.Horizontal(*row) for row in rows))
+    return rrb.Blueprint(
+        rrb.Horizontal(left, right), rrb.TimePanel(timeline=TIMELINE), collapse_panels=True
+    )

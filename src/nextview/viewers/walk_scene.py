@@ -1,4 +1,6 @@
-"""A walk in 3D: the object, the candidate views in the colours of their values, the path and the camera."""
+"""A walk in 3D: the object, the candidate views in the colours of their values, the path and the
+camera.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -26,8 +28,8 @@ SMOOTH = 10_000  # faces of a mesh from which its vertices are shaded, not its f
 class WalkScene:
     """Draws a walk below one node of the scene; another walk needs another scene.
 
-    ``look`` is called with the candidate view that is clicked; ``drag`` with the place to which the camera is dragged,
-    (3,), object frame, and whether it was let go.
+    ``look`` is called with the candidate view that is clicked; ``drag`` with the place to which the
+    camera is dragged, (3,), object frame, and whether it was let go.
     """
 
     def __init__(
@@ -40,18 +42,32 @@ class WalkScene:
         look: Callable[[int], None],
         drag: Callable[[Float, bool], None],
     ) -> None:
-        self._scene, self._name, self._drag = server.scene, name, drag
+        self._scene = server.scene
+        self._name = name
+        self._drag = drag
         self.remove = server.scene.add_frame(name, show_axes=False, position=place).remove
         self._drawn = 0
         self._object: viser.MeshHandle | None = None
         if mesh is not None:
-            vertices, flat = mesh.vertices.astype(np.float32), len(mesh.faces) < SMOOTH
+            vertices = mesh.vertices.astype(np.float32)
+            flat = len(mesh.faces) < SMOOTH
             self._object = server.scene.add_mesh_simple(
-                f"{name}/object", vertices, mesh.faces, color=rgb(WOOD), flat_shading=flat, side="double"
+                f"{name}/object",
+                vertices,
+                mesh.faces,
+                color=rgb(WOOD),
+                flat_shading=flat,
+                side="double",
             )
         floor = (-1.0 if mesh is None else float(mesh.vertices[:, 2].min())) - 0.03
         server.scene.add_cylinder(
-            f"{name}/table", TABLE, 0.04, (255, 246, 230), radial_segments=96, position=(0, 0, floor), cast_shadow=False
+            f"{name}/table",
+            TABLE,
+            0.04,
+            (255, 246, 230),
+            radial_segments=96,
+            position=(0, 0, floor),
+            cast_shadow=False,
         )
         places = walk.sphere.poses[:, :3, 3]
         server.scene.add_line_segments(f"{name}/rings", _rings(places), rgb(FAINT), thickness=0.015)
@@ -63,7 +79,11 @@ class WalkScene:
         for view, ball in enumerate(self._balls):
             ball.on_click(lambda event, view=view: look(view))
         self._handle = server.scene.add_transform_controls(
-            f"{name}/handle", 0.7, disable_rotations=True, position=places[walk.start], depth_test=False
+            f"{name}/handle",
+            0.7,
+            disable_rotations=True,
+            position=places[walk.start],
+            depth_test=False,
         )
         self._handle.on_update(self._dragged)
 
@@ -72,12 +92,17 @@ class WalkScene:
             self._drag(np.asarray(event.target.position, float), event.phase == "end")
 
     def draw(self, walk: Walk, hide_unseen: bool) -> None:
-        """Draw the walk as it is now; ``hide_unseen`` hides the object, but for the points that were seen."""
+        """Draw the walk as it is now; ``hide_unseen`` hides the object, but for the points that
+        were seen.
+        """
         if self._object is not None:
             self._object.visible = not hide_unseen
         self._colour(walk)
-        points, name = walk.points, self._name
-        self._scene.add_point_cloud(f"{name}/seen", points, rgb(ACCENT), point_size=0.012, visible=len(points) > 0)
+        points = walk.points
+        name = self._name
+        self._scene.add_point_cloud(
+            f"{name}/seen", points, rgb(ACCENT), point_size=0.012, visible=len(points) > 0
+        )
         self._draw_path(walk)
         if not walk.views:
             return
@@ -98,22 +123,32 @@ class WalkScene:
         )
 
     def _colour(self, walk: Walk) -> None:
-        """Candidates by value; those visited dark and small, the next one in the accent colour and large."""
+        """Candidates by value; those visited dark and small, the next one in the accent colour
+        and large.
+        """
         values = np.full(len(walk.sphere), np.nan) if walk.values is None else walk.values.copy()
         values[walk.visited] = np.nan
         for view, (ball, colour) in enumerate(zip(self._balls, heat(values), strict=True)):
-            visited, asked = view in walk.visited, view == walk.next_view
-            ball.color = rgb(INK) if visited else rgb(ACCENT) if asked else tuple(int(c) for c in colour)
+            visited = view in walk.visited
+            asked = view == walk.next_view
+            ball.color = (
+                rgb(INK) if visited else rgb(ACCENT) if asked else tuple(int(c) for c in colour)
+            )
             scale = 0.5 if visited else 1.5 if asked else 1.0
             if ball.scale != scale:
                 ball.scale = scale
 
     def _draw_path(self, walk: Walk) -> None:
-        """The places where the camera stood, numbered, and great circles between them; those that are new."""
-        distance, places = walk.sphere.distance, [view.direction for view in walk.views]
+        """The places where the camera stood, numbered, and great circles between them; those
+        that are new.
+        """
+        distance = walk.sphere.distance
+        places = [view.direction for view in walk.views]
         for step in range(self._drawn, len(places)):
             name = f"{self._name}/path/{step + 1}"
-            self._scene.add_label(f"{name}/number", str(step + 1), position=1.1 * distance * places[step])
+            self._scene.add_label(
+                f"{name}/number", str(step + 1), position=1.1 * distance * places[step]
+            )
             if step:
                 line = distance * great_circle(places[step - 1], places[step])
                 segments = np.stack([line[:-1], line[1:]], 1)
@@ -122,7 +157,9 @@ class WalkScene:
 
 
 def _rings(places: Float) -> NDArray[np.float32]:
-    """Level circles below views, (V, 3), as segments, (S, 2, 3); none for views that lie on no rings."""
+    """Level circles below views, (V, 3), as segments, (S, 2, 3); none for views that lie on no
+    rings.
+    """
     around = np.linspace(0, 2 * np.pi, 97)
     heights = np.unique(np.round(places[:, 2], 3))
     heights = heights[: 0 if len(heights) > 12 else None]
