@@ -511,6 +511,18 @@ def test_what_is_always_explained_badly_is_not_unknown_for_that():
     assert known.p_value(0.6, 0, 7) == known.p_value(0.6, 0, 1)
 
 
+def test_what_the_noise_of_a_real_camera_explains_is_no_stranger():
+    known = KnownResiduals(np.full(1, 0.05), (np.linspace(-0.3, 0.3, 99),))
+    # Pixels that are off by the noise, 30 % more of it than was measured, have this mean.
+    off = np.random.default_rng(0).normal(0, 1.29, 100_000)
+    explained = float((off**2 / 2).mean())
+    assert known.p_value(explained, 0, 1) == pytest.approx(0.01)
+    assert known.of_real_camera(explained, 0, 1) >= 0.5
+    assert known.of_real_camera(explained + 0.1, 0, 1) == pytest.approx(0.01)
+    # better explained things have larger p-values still
+    assert known.of_real_camera(0.04, 0, 1) > known.of_real_camera(0.06, 0, 1)
+
+
 def episode(geometry: float, features: float, truth: int = 0, views: int = 1) -> JudgedEpisode:
     """Two things; by how much geometry, in each view, and features speak for the first one."""
     mean = np.tile([[geometry], [0.0]], (1, views))

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -337,7 +337,7 @@ class Cohort:
 class TaskEnv(gymnasium.Env[Any, Any]):
     """One episode at a time of any task."""
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}  # Gymnasium's own form
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
 
     def __init__(self, task: Task) -> None:
         self.task = task
@@ -392,10 +392,8 @@ class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
     way at most.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
-        "render_modes": [],
-        "autoreset_mode": AutoresetMode.SAME_STEP,
-    }
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
+    metadata["autoreset_mode"] = AutoresetMode.SAME_STEP
 
     def __init__(self, task: Task, num_envs: int) -> None:
         self.task = task

@@ -149,7 +149,8 @@ class VerifiedRecogniser(TaughtRecogniser):
         residuals = self.things.residuals
         if residuals is None:
             return None
-        return residuals.p_value(found.residual, int(found.things[0]), found.mean.shape[1])
+        likeliest = int(found.things[0])
+        return residuals.of_real_camera(found.residual, likeliest, found.mean.shape[1])
 
 
 def open_recogniser(model: str | Path, threads: int = 0) -> NetworkRecogniser:

@@ -11,6 +11,8 @@ SHRINKAGE = (
     2.0  # number of residuals that the mean of all things counts for, beside those of a thing
 )
 LEAST_RESIDUAL = 0.02  # below which residuals do not differ
+NOISE_RESIDUAL = 0.5  # of pixels that are off by just the noise: half a squared standard normal
+NOISE_KNOWN = 1.3  # by what factor the noise of a real camera may be larger than it is measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +108,27 @@ class KnownResiduals:
         over = np.log(exceeded)
         as_bad = len(excess) - np.searchsorted(excess, over - 1e-12)
         return float((1 + as_bad) / (1 + len(excess)))
+
+    def of_real_camera(self, residual: float, thing: int, views: int) -> float:
+        """The p-value of what a real camera sees, whose noise is not known exactly.
+
+        Cameras have errors that no model of their noise holds. Known things are then explained
+        worse than in the simulation that this was fitted to. So a residual that the noise alone
+        explains, if it is larger than it was measured by ``NOISE_KNOWN``, is no reason to call a
+        thing unknown.
+
+        Args:
+            residual: of the likeliest hypothesis.
+            thing: which thing it is of.
+            views: how many views there are.
+
+        Returns:
+            See ``p_value``; at least 0.5 where the noise explains the residual.
+        """
+        p_value = self.p_value(residual, thing, views)
+        if residual <= NOISE_RESIDUAL * NOISE_KNOWN**2:
+            return 0.5 + p_value / 2
+        return p_value
 
 
 def _logarithms(residuals: Float) -> Float:
