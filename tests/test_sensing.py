@@ -289,6 +289,32 @@ def test_a_frame_without_the_object_is_not_taken_in():
     assert len(thing.observations) == 2
 
 
+@pytest.mark.parametrize("thing", ["carton", "tin", "tray"])
+@pytest.mark.parametrize("raised", [-0.004, 0.004])
+def test_the_table_is_no_part_of_an_object_where_the_poses_of_an_arm_err(thing, raised):
+    made = {
+        "carton": box((0.12, 0.07, 0.09), (0.02, 0, 0.045)),
+        "tin": trimesh.creation.cylinder(0.04, 0.12).apply_translation((0.02, 0, 0.06)),
+        "tray": box((0.2, 0.14, 0.018), (0, 0, 0.009)),
+    }[thing]
+    views = [(40, 20), (28, 75), (45, 200)]
+    turn = Rotation.from_euler("xyz", (-0.4, 0.4, 0.2), degrees=True).as_matrix()
+    seen = ObservedObject()
+
+    for k, (view, sign) in enumerate(zip(views, (0, 1, -1), strict=True)):
+        pose = pose_at(*view, 0.55, (0, 0, 0.04))
+        believed = pose.copy()
+        believed[:3, :3] = np.linalg.matrix_power(turn, sign) @ pose[:3, :3]
+        believed[:3, 3] += sign * np.array([0, 0.003, raised])
+        seen.add(replace(frame([TABLE, made], pose, seed=k), pose=believed, pixel_centre=0.5))
+
+        plane = seen.sightings[-1].plane
+        on_table = np.linalg.inv(pose) @ [0.2, -0.1, 0, 1]  # a point of it, as the camera sees it
+        assert abs(plane.height((believed @ on_table)[:3])) < 0.002
+
+    assert seen.object_frame.radius == pytest.approx(true_frame(made).radius, rel=0.15)
+
+
 def test_a_pose_that_contradicts_the_frames_before_is_warned_of():
     thing = ObservedObject()
     thing.add(frame([TABLE, WEDGE], pose_at(40, 25, 0.7)))

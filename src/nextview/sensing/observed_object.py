@@ -34,7 +34,7 @@ from nextview.sensing.object_frame import Box, ObjectFrame, enclose, three, upri
 from nextview.sensing.outliers import without_outliers
 from nextview.sensing.pieces import STANDS, cut
 from nextview.sensing.plausibility import ViewWarning, check_frame, check_observation, check_views
-from nextview.sensing.segmentation import Plane, Samples, find_plane, refine_plane, sample
+from nextview.sensing.segmentation import Plane, Samples, find_plane, sample
 from nextview.sensing.walls import before_walls, find_walls
 
 Float = NDArray[np.float64]
@@ -269,11 +269,10 @@ class ObservedObject:
         if self.support:
             earlier = [s.plane for s in before.sightings if s.plane is not None]
             rng = rng if earlier else deepcopy(rng)
-            plane = (
-                refine_plane(earlier[0], samples, loose=2)
-                if earlier
-                else self._plane(frame, samples, up, rng)
-            )
+            if earlier:
+                plane = segmentation.find_again(earlier[0], samples, self._near(samples))
+            else:
+                plane = self._plane(frame, samples, up, rng)
         if up is None:
             if plane is None:
                 why = "no support plane is seen, so there is no telling where up is"
@@ -314,6 +313,16 @@ class ObservedObject:
             cell,
             before.joins,
         )
+
+    def _near(self, samples: Samples) -> Mask:
+        """Which samples lie in the sphere of the object, as it is known from earlier frames, (N,)
+        bool.
+        """
+        known = self.state.frame
+        if known is None:
+            return np.zeros(len(samples.points), bool)
+        away = np.linalg.norm(samples.points - known.centre, axis=1)
+        return np.asarray(away < known.radius)
 
     def _plane(
         self, frame: Frame, samples: Samples, up: Float | None, rng: np.random.Generator

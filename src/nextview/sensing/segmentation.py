@@ -26,6 +26,11 @@ RANGE = 1.05
 SAMPLES = 1500  # blocks of pixels in which planes are searched
 LARGE_SIDE = 8  # pixels across such a block from which on every second one is looked at
 STEEP_LAG = 2  # samples between two that tell how steep a surface is
+# error of a camera's pose, at most: by it a plane known from earlier frames is moved in this one
+POSE_SHIFT = 0.02  # metres
+POSE_TURN = np.radians(2.0)
+# tolerances from a plane up to which few samples lie beside it, if it is a surface that is seen
+ASIDE = 3.0
 STEEP_RISE = 0.7  # rise of a steep surface, as a part of the way
 # times by which the mean over a block is more exact than a pixel, at most: the lens errs, too
 MOST_ALONE = 4.0
@@ -208,6 +213,43 @@ def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:
         normal *= np.sign(normal @ plane.normal) or 1.0
         plane = Plane(normal, float(-normal @ centre))
     return plane
+
+
+def find_again(plane: Plane, samples: Samples, other: Mask) -> Plane:
+    """The plane of an earlier frame as this frame shows it, though the pose of one of them errs.
+
+    Least squares from the plane of the earlier frame is enough where the error is below the
+    noise. By a larger error only a strip of the surface lies in reach, and the fit is a plane that
+    cuts it. Samples then lie beside the fit as well as on it, and the surface is searched for as
+    far around as the pose may err.
+
+    Args:
+        plane: of an earlier frame.
+        samples: of this frame.
+        other: which samples may be of the object, (N,) bool: they are not searched for the plane.
+
+    Returns:
+        The plane in this frame; that of least squares where no other holds more samples.
+    """
+    fit = refine_plane(plane, samples, loose=2)
+    if _is_seen(fit, samples):
+        return fit
+
+    away = np.linalg.norm(samples.points - samples.camera, axis=1)
+    reach = POSE_SHIFT + np.sin(POSE_TURN) * away
+    around = samples.some((np.abs(plane.height(samples.points)) < reach) & ~other)
+    found = find_plane(around, np.random.default_rng(0), plane.normal)
+    if found is None or found.normal @ plane.normal < np.cos(POSE_TURN):
+        return fit
+    return found if found.holds(around).sum() > fit.holds(around).sum() else fit
+
+
+def _is_seen(plane: Plane, samples: Samples) -> bool:
+    """Whether more samples lie on a plane than closely beside it, as those of a surface do."""
+    away = np.abs(plane.height(samples.points)) / samples.tolerance
+    on = np.count_nonzero(away < 1)
+    beside = np.count_nonzero(away < ASIDE) - on
+    return bool(on > beside)
 
 
 def lies_better_as_range(
