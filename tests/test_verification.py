@@ -519,6 +519,8 @@ def test_what_the_noise_of_a_real_camera_explains_is_no_stranger():
     assert known.p_value(explained, 0, 1) == pytest.approx(0.01)
     assert known.of_real_camera(explained, 0, 1) >= 0.5
     assert known.of_real_camera(explained + 0.1, 0, 1) == pytest.approx(0.01)
+    # a banana does not explain a ring, though it lies on a part of it
+    assert known.of_real_camera(explained, 0, 1, explained=0.5) == pytest.approx(0.01)
     # better explained things have larger p-values still
     assert known.of_real_camera(0.04, 0, 1) > known.of_real_camera(0.06, 0, 1)
 

@@ -150,7 +150,9 @@ class VerifiedRecogniser(TaughtRecogniser):
         if residuals is None:
             return None
         likeliest = int(found.things[0])
-        return residuals.of_real_camera(found.residual, likeliest, found.mean.shape[1])
+        views = found.mean.shape[1]
+        explained = float(found.explained[0].mean())
+        return residuals.of_real_camera(found.residual, likeliest, views, explained)
 
 
 def open_recogniser(model: str | Path, threads: int = 0) -> NetworkRecogniser:
