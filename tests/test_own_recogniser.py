@@ -143,6 +143,18 @@ def believes(value):
             believes(JointBelief(np.array([0.5, 0.5]), (PoseCandidate("a", 5, np.eye(4), 1.0),))),
             "of class 5",
         ),
+        *(
+            (
+                believes(
+                    JointBelief(
+                        np.array([0.5, 0.5]),
+                        (PoseCandidate("a", 0, np.eye(4), 1.0, displacements=displacements),),
+                    )
+                ),
+                r"displacements of a pose are \(views, 3\) finite numbers",
+            )
+            for displacements in (np.zeros(3), np.zeros((1, 2)), np.full((1, 3), np.nan))
+        ),
     ],
 )
 def test_what_it_says_is_checked(given, sentence):

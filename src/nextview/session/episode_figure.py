@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Wedge
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
+from scipy.ndimage import label
 
 from nextview.errors import UsageError
 from nextview.files import new_file
@@ -32,6 +33,8 @@ GAP = 0.3
 LARGE = 6.0
 SHOWN = 4  # classes
 FIGURE_FORMATS = (".png", ".pdf", ".svg")
+# of the silhouette: parts and holes below this share of it are specks of the scan
+SPECK_SHARE = 0.002
 # of the dome: its lines, its candidate views
 RING = "#cdbfa6"
 RIM = "#a8977a"
@@ -74,13 +77,18 @@ def draw_episode(
     stopping: Stopping,
     heading: str,
     posed: Triangles | None = None,
+    displaced: NDArray[np.float64] | None = None,
 ) -> Figure:
     """A column for each view (image, belief, what the policy valued the views at); beside them
     object and path.
 
     ``posed`` is a surface in the object frame and object radii whose outline is drawn over the
-    images.
+    images, and ``displaced``, (views, 3), by how much each view shows it beside that place; not at
+    all if not given.
     """
+    caster = None if posed is None else RayCaster([posed])
+    if displaced is None:
+        displaced = np.zeros((len(views), 3))
     valued = any(view.values is not None for view in views)
     light = SoftLight([view.observation for view in views])
     path = np.array([view.direction for view in views])
@@ -116,8 +124,8 @@ def draw_episode(
             axis = axes(GAP + k * (WIDE + GAP), y, WIDE, high)
             if title == rows[0][0]:
                 _draw_image(axis, view, k + 1, light)
-                if posed is not None:
-                    _draw_outline(axis, view, posed)
+                if caster is not None:
+                    _draw_outline(axis, view, caster, displaced[k])
             elif title == rows[1][0]:
                 _draw_belief(axis, view, float(stopping.threshold_at(k + 1)), classes, shown)
             else:
@@ -170,15 +178,17 @@ def _draw_image(axis: Axes, view: View, step: int, light: SoftLight) -> None:
         **NUMBER,
         bbox={"boxstyle": "circle,pad=0.25", "color": BLUE},
     )
-    where = f"view {view.index}: {elevation:.0f}° up, {round(azimuth) % 360}° around"
+    where = f"view {view.index}: {round(elevation)}° up, {round(azimuth) % 360}° around"
     axis.text(0.13, 1.08, where, va="center_baseline", color=INK, **inside)
     said = [] if seen.seen else ["nothing is seen"]
     said += [warning.name for warning in view.warnings]
     axis.text(0.04, 0.03, "\n".join(said), va="bottom", color=ACCENT, **inside)
 
 
-def _draw_outline(axis: Axes, view: View, posed: Triangles) -> None:
-    """The outline of a surface as a view sees it, over the image of that view."""
+def _draw_outline(
+    axis: Axes, view: View, caster: RayCaster, displacement: NDArray[np.float64]
+) -> None:
+    """The outline of a surface, displaced, as a view sees it, over the image of that view."""
     seen = view.observation
     height, width = axis.get_images()[0].get_size()
     shape = (int(height), int(width))
@@ -186,10 +196,24 @@ def _draw_outline(axis: Axes, view: View, posed: Triangles) -> None:
     rays = pixel_rays(seen.intrinsics * [[times], [times], [1]], shape).reshape(-1, 3)
 
     along = rays @ seen.pose[:3, :3].T.astype(np.float32)
-    depth, _ = RayCaster([posed]).cast(seen.pose[:3, 3], along)
-    shows = np.isfinite(depth).reshape(shape)
+    # Seen from a camera that is displaced the other way, the surface itself is where it should be.
+    depth, _ = caster.cast(seen.pose[:3, 3] - displacement, along)
+    shows = without_specks(np.isfinite(depth).reshape(shape))
     if shows.any() and not shows.all():
-        axis.contour(shows, levels=[0.5], colors=[ACCENT], linewidths=1.3)
+        drawn = axis.contour(shows, levels=[0.5], colors=[ACCENT], linewidths=1.3)
+        drawn.set_path_effects([withStroke(linewidth=2.8, foreground=PAPER)])
+
+
+def without_specks(silhouette: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """A silhouette, (H, W), without its tiny parts, and with its tiny holes filled."""
+    least = SPECK_SHARE * silhouette.sum()
+    cleaned = silhouette.copy()
+    for shows in (True, False):
+        parts, _ = label(cleaned == shows)
+        tiny = np.bincount(parts.ravel()) < least
+        tiny[0] = False  # the pixels of the other kind
+        cleaned[tiny[parts]] = not shows
+    return cleaned
 
 
 def _draw_belief(

@@ -1,5 +1,6 @@
 """How an episode ended: the answer, how sure it is, and its picture."""
 
+import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,8 @@ from nextview.session.view import View
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+logger = logging.getLogger(__name__)
 
 # an object as novel as so many times the share that may be called unknown gets no confident answer
 SUSPICIOUS = 5.0
@@ -230,12 +233,41 @@ class Recognition:
         radius = self.radius
         if not self._candidates_of_answer or radius is None:
             return None
-        label = self._candidates_of_answer[0].label
-        found = next(each for each in self._joint_poses if each.label == label)
+        found = self._likeliest_in_object_frame
         if found.vertices is None or found.faces is None:
             return None
         in_metres = found.vertices @ found.pose[:3, :3].T + found.pose[:3, 3]
         return in_metres / radius, found.faces
+
+    @property
+    def _displacements(self) -> NDArray[np.float64]:
+        """By how much each view shows ``posed_surface`` displaced, because its camera does not
+        stand where it is said to, (views, 3), object frame, object radii; 0 where that is not
+        known, as in a view that shows nothing.
+        """
+        displaced = np.zeros((len(self.views), 3))
+        radius = self.radius
+        if not self._candidates_of_answer or radius is None:
+            return displaced
+
+        known = self._likeliest_in_object_frame.displacements
+        seen = np.array([view.observation.seen for view in self.views])
+        if len(known) == seen.sum():
+            displaced[seen] = known / radius
+        elif len(known):
+            logger.warning(
+                "displacements of %d views are given with a pose, and %d views show something:"
+                " outlines are drawn without them",
+                len(known),
+                seen.sum(),
+            )
+        return displaced
+
+    @property
+    def _likeliest_in_object_frame(self) -> PoseCandidate:
+        """The likeliest pose of a thing of the class that is the answer, in the object frame."""
+        label = self._candidates_of_answer[0].label
+        return next(each for each in self._joint_poses if each.label == label)
 
     @property
     def why_no_pose(self) -> str:
@@ -316,7 +348,8 @@ class Recognition:
         """Draw the episode: images, what the policy valued the views at, beliefs and the path on
         the sphere.
 
-        The outline of the scan of the thing that was named, in its pose, is drawn over the images.
+        The outline of the scan of the thing that was named, in its pose, is drawn over the images,
+        in each where its camera sees it: errors of the cameras' places are taken off.
         With a path it is written to that file too, PNG, PDF or SVG, and replaces one of that name.
         UsageError: it is another format. ResultsError: the path is a link or a folder, or cannot be
         written.
@@ -325,7 +358,13 @@ class Recognition:
 
         heading = f"{title}: {self!r}" if title else repr(self)
         figure = draw_episode(
-            self.views, self.classes, self.sphere, self.stopping, heading, self.posed_surface
+            self.views,
+            self.classes,
+            self.sphere,
+            self.stopping,
+            heading,
+            self.posed_surface,
+            self._displacements,
         )
         if path is not None:
             save_figure(figure, Path(path))

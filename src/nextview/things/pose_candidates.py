@@ -42,8 +42,8 @@ def candidates_of(
     shown = [depth_view(observation, FINE_SIDE) for observation in observations]
     views = [view for view in shown if view is not None]
     candidates = []
-    for thing, pose, probability in zip(
-        found.things, found.poses, found.probabilities, strict=True
+    for thing, pose, probability, displacements in zip(
+        found.things, found.poses, found.probabilities, found.cameras, strict=True
     ):
         surface = things.verifier.caster.surfaces[thing]
         candidate = PoseCandidate(
@@ -55,6 +55,7 @@ def candidates_of(
             vertices=surface.vertices,
             faces=surface.faces,
             symmetry=things.symmetries[thing],
+            displacements=displacements,
         )
         candidates.append(candidate)
 
