@@ -315,6 +315,19 @@ def test_the_table_is_no_part_of_an_object_where_the_poses_of_an_arm_err(thing, 
     assert seen.object_frame.radius == pytest.approx(true_frame(made).radius, rel=0.15)
 
 
+@pytest.mark.parametrize(("raised", "warned"), [(0.0, False), (0.08, True), (0.12, True)])
+def test_an_object_that_becomes_another_order_of_size_is_warned_of(raised, warned):
+    small = box((0.08, 0.05, 0.06), (0, 0, 0.03))
+    thing = ObservedObject()
+    thing.add(frame([TABLE, small], pose_at(40, 25, 0.6)))
+
+    seen = frame([TABLE, small], pose_at(40, 70, 0.6))
+    wrong = seen.camera_to_world.copy()
+    wrong[2, 3] += raised
+    thing.add(replace(seen, pose=wrong, axes="opencv", pixel_centre=0.5))
+    assert ("size" in [warning.name for warning in thing.warnings]) is warned
+
+
 def test_a_pose_that_contradicts_the_frames_before_is_warned_of():
     thing = ObservedObject()
     thing.add(frame([TABLE, WEDGE], pose_at(40, 25, 0.7)))

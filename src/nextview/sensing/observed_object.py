@@ -297,6 +297,8 @@ class ObservedObject:
         warnings = check_frame(frame) + check_observation(made[-1]) + [MAY_BE_TWO] * two
         if last is not None:
             warnings += plausibility.check_pose_moved(frame, last)
+        if before.frame is not None:
+            warnings += plausibility.check_size(latest.radius, before.frame.radius)
         if self.point is not None:
             aside = upright_axes(up)[:2] @ (self.point - latest.centre)
             warnings += plausibility.check_point(aside, latest.radius)

@@ -48,6 +48,7 @@ FEWEST_SHARED = 50  # points on which two frames have to agree or not before a d
 # metres from the origin of the world, within which robots work; where positions in millimetres
 # begin
 FAR_ORIGIN = 30.0
+ORDER_OF_SIZE = np.sqrt(10)  # factor from which a radius is nearer to ten times than to once
 
 
 @dataclass(frozen=True)
@@ -215,6 +216,24 @@ def check_point(aside: Float, radius: float) -> list[ViewWarning]:
     return [
         ViewWarning(
             "point", f"{message}: is the point of another world, or what stands there out of view?"
+        )
+    ]
+
+
+def check_size(radius: float, before: float) -> list[ViewWarning]:
+    """Whether a frame makes the object one of another order of size; usually not.
+
+    Args:
+        radius: of the object with this frame, metres.
+        before: of the object as earlier frames show it, metres.
+    """
+    if radius <= ORDER_OF_SIZE * before:
+        return []
+    return [
+        ViewWarning(
+            "size",
+            f"the radius of the object grows from {before:.2g} to {radius:.2g} m by this frame: is"
+            " its pose wrong, so that the support or a neighbour is taken for a part of it?",
         )
     ]
 
