@@ -333,6 +333,26 @@ def test_reach_and_cost_are_asked_in_the_world(tiny):
         np.testing.assert_allclose(pose, first, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("shift", "refused"),
+    [((1.2, 0, 0), True), ((0, -1.3, 0), True), ((0, 0, 0), False), ((0.01, 0, 0), False)],
+)
+def test_frames_that_only_together_show_a_too_large_object_blame_the_poses(tiny, shift, refused):
+    session = begin(tiny, distance=0.5)
+    session.update(frame(pose_at(40, 20, 0.7), masked=True))
+    before = snapshot(session)
+    move = np.eye(4)
+    move[:3, 3] = shift
+    second = frame(pose_at(40, 60, 0.7), move, masked=True)
+    if not refused:
+        session.update(second)
+        assert len(session.views) == 2
+        return
+    with pytest.raises(ObservationError, match=r"do not fit together: .* poses wrong"):
+        session.update(second)
+    np.testing.assert_equal(snapshot(session), before)
+
+
 @pytest.mark.parametrize(("distance", "words"), [(0.15, "outside of it"), (700, "in millimetres")])
 def test_a_distance_that_cannot_be_is_refused_once_the_radius_is_known(tiny, distance, words):
     session = begin(tiny, distance=distance)

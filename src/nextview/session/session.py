@@ -46,6 +46,8 @@ FARTHEST_TARGET = 60.0
 """Object radii: a camera looks at a thing of 0.01 m radius from 0.6 m; in millimetres it would
 be a thousand times.
 """
+# times as large as in any single frame: from there an object of several frames is none
+MUCH_LARGER = 1.5
 CONTRADICTABLE = 3
 """Views before the last with whose geometry it is compared."""
 
@@ -483,8 +485,8 @@ class Session:
 
         Raises:
             SessionError: the episode has ended, or a session mixes frames and observations.
-            ObservationError: the object is not found in the frame, or the image does not suit the
-                networks.
+            ObservationError: the object is not found in the frame, the frames do not fit together,
+                or the image does not suit the networks.
             UsageError: the session's ``distance`` is inside the object, or more than 60 object
                 radii.
             PolicyError: the policy failed.
@@ -531,6 +533,7 @@ class Session:
             else:
                 object.add(frame)
                 self._reconsider(object)
+            self._refuse_disagreement(object)
             self._check_distance(object.object_frame.radius)
             return self._take(
                 object.observations[self._before :], object.warnings, frame.camera_to_world, object
@@ -558,6 +561,24 @@ class Session:
 
         if score.of_views([novelty(object.observations[-1:])]) < SUSPICIOUS * self.unknown:
             object.reconsider(novelty)
+
+    def _refuse_disagreement(self, object: ObservedObject) -> None:
+        """Refuse frames that only together make the object reach as far as the camera's distance.
+
+        A wrong distance or depth scale shows in a single frame. Where each frame alone shows a much
+        smaller object, the frames do not fit together.
+        """
+        together = object.object_frame.radius
+        if self.distance is None or together < self.distance or object.known is not None:
+            return
+        alone = max(_half_diagonal(sighting.hull) for sighting in object.sightings)
+        if len(object.sightings) == 1 or alone >= self.distance or together < MUCH_LARGER * alone:
+            return
+        raise ObservationError(
+            f"the frames do not fit together: the object has a radius of {together:.2g} m in all of"
+            f" them, and of {alone:.2g} m at most in a single one: are the poses wrong (inverse, or"
+            " in another unit), or has the object moved?"
+        )
 
     def _check_distance(self, radius: float) -> None:
         """Refuse targets inside the object or far from it, as soon as its radius is known."""
@@ -811,6 +832,13 @@ class Session:
 
 def _next_of(step: Step) -> int | None:
     return None if step.stopped[0] else int(step.next_views[0])
+
+
+def _half_diagonal(points: Float) -> float:
+    """Half the diagonal of the box around points, (N, 3), metres; 0 around none."""
+    if not len(points):
+        return 0.0
+    return float(np.linalg.norm(np.ptp(points, axis=0)) / 2)
 
 
 def _checked_distance(given: float | None) -> float | None:
