@@ -541,3 +541,14 @@ def test_nothing_is_ranked_where_nothing_can_be_foreseen(known, meshes):
     policy = DiscriminateGeometry(plain.sphere)
     with pytest.raises(SessionError, match="needs things of known geometry"):
         nextview.Session(plain.models, policy, plain.sphere)
+
+
+@pytest.mark.parametrize("scale", [0.01, 0.1, 5.0])
+def test_what_is_of_another_order_of_size_is_unknown(known, scale):
+    recogniser = recogniser_of(known)
+    system = nextview.load(models=known, threads=1, recogniser=recogniser, unknown=0.02)
+    carton = THINGS["carton"]()
+    carton.apply_scale(scale)
+    result = system.recognise(make_mesh(carton.vertices, carton.faces, unit="m"), start=10)
+    assert result.unknown or not result.seen
+    assert result.pose is None

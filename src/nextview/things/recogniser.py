@@ -24,6 +24,9 @@ from nextview.things.verifier import Verified
 Float = NDArray[np.float64]
 
 NO_SCALE = "the scale of what is seen is not known in metres"
+# The radius of what is seen, of that of the whole thing: much may be hidden, or little taken in.
+SMALLEST_SHARE = 0.25
+LARGEST_SHARE = 2.0
 
 
 class VerifiedRecogniser(TaughtRecogniser):
@@ -122,7 +125,7 @@ class VerifiedRecogniser(TaughtRecogniser):
             belief,
             poses=poses,
             camera_error=camera_error,
-            p_value=self._p_value(found),
+            p_value=self._p_value(observations, found),
             found=found,
         )
 
@@ -144,13 +147,23 @@ class VerifiedRecogniser(TaughtRecogniser):
         """Why there is no pose of the class believed most, in words."""
         return f"the geometry of {self.classes[int(belief.argmax())]} is not known in metres"
 
-    def _p_value(self, found: Verified) -> float | None:
-        """Share of known things that are explained as badly by the likeliest hypothesis."""
+    def _p_value(self, observations: Sequence[Observation], found: Verified) -> float | None:
+        """Share of known things that are explained as badly by the likeliest hypothesis.
+
+        What is of another order of size than the likeliest thing is none of them, whatever its
+        few pixels say: it gets the least p-value that there is.
+        """
         residuals = self.things.residuals
         if residuals is None:
             return None
+
         likeliest = int(found.things[0])
         views = found.mean.shape[1]
+        seen = max(observation.radius or 0.0 for observation in observations)
+        share = seen / float(self.things.verifier.caster.radii[likeliest])
+        if not SMALLEST_SHARE <= share <= LARGEST_SHARE:
+            return residuals.p_value(np.inf, likeliest, views)
+
         explained = float(found.explained[0].mean())
         return residuals.of_real_camera(found.residual, likeliest, views, explained)
 
