@@ -26,8 +26,8 @@ FACES = [[0, 1, 2, 3, 4], [9, 8, 7, 6, 5], *SIDES[:-1], [4, 9, 5], [4, 5, 0]]
 AREA = 2 * 3.0 + 3 * (2 + 1 + 1 + 2 * np.sqrt(2))
 
 
-def same_house(mesh) -> None:
-    """Whether a mesh is the house, which is closed, in the units of the file."""
+def assert_is_the_house(mesh) -> None:
+    """See that a mesh is the house, which is closed, in the units of the file."""
     assert len(mesh.vertices) in (10, 3 * len(mesh.faces))
     a, b, c = (mesh.vertices[corner] * mesh.radius for corner in mesh.faces.T)
     assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(AREA, rel=1e-5)
@@ -93,7 +93,7 @@ def test_a_text_in_any_encoding_is_the_same_mesh(tmp_path, kind, encoding, ends)
     mark, codec = ENCODINGS[encoding]
     path = tmp_path / f"house.{kind}"
     path.write_bytes(mark + TEXTS[kind]("B\xfcro \xb5").replace("\n", ends).encode(codec))
-    same_house(load_mesh(path))
+    assert_is_the_house(load_mesh(path))
 
 
 @pytest.mark.parametrize("kind", TEXTS)
@@ -169,9 +169,9 @@ def binary_ply(
 def test_every_kind_of_binary_ply(tmp_path, order, how):
     path = tmp_path / "house.ply"
     path.write_bytes(binary_ply(order, **how))
-    same_house(load_mesh(path))
+    assert_is_the_house(load_mesh(path))
     path.write_bytes(binary_ply(order, **how) + b"\0 what a program puts at the end")
-    same_house(load_mesh(path))
+    assert_is_the_house(load_mesh(path))
 
 
 def test_a_binary_ply_cut_anywhere_in_its_rows_is_refused(tmp_path):
@@ -207,7 +207,7 @@ def test_numbers_beside_lists_of_different_lengths(tmp_path, order):
         )
     path = tmp_path / "house.ply"
     path.write_bytes(header.encode() + body)
-    same_house(load_mesh(path))
+    assert_is_the_house(load_mesh(path))
 
 
 # the second one turns: it names a vertex twice
@@ -342,9 +342,9 @@ def test_a_ply_that_is_no_mesh_is_called_what_it_is(tmp_path, case, capfd):
 def test_stl_texts_with_any_name_and_without_normals(tmp_path, name, end, normal, capfd):
     path = tmp_path / "house.stl"
     path.write_text(as_stl(name, end, normal))
-    same_house(load_mesh(path))
+    assert_is_the_house(load_mesh(path))
     path.write_text(as_stl(name, end, normal).upper().replace("NAN", "nan"))
-    same_house(load_mesh(path))
+    assert_is_the_house(load_mesh(path))
     assert capfd.readouterr() == ("", "")
 
 
@@ -364,7 +364,7 @@ def binary_stl(header=b"", after=b"", announced=None) -> bytes:
 def test_binary_stl_with_any_header_and_bytes_after_its_end(tmp_path, header, after):
     path = tmp_path / "house.stl"
     path.write_bytes(binary_stl(header, after))
-    same_house(load_mesh(path))
+    assert_is_the_house(load_mesh(path))
 
 
 @pytest.mark.parametrize(
@@ -442,13 +442,13 @@ OFF_DIALECTS = {
 def test_dialects_of_off(tmp_path, dialect):
     path = tmp_path / "house.off"
     path.write_text(OFF_DIALECTS[dialect])
-    same_house(load_mesh(path))
+    assert_is_the_house(load_mesh(path))
 
 
 def test_an_obj_in_capitals(tmp_path):
     path = tmp_path / "house.obj"
     path.write_text(as_obj("house").upper())
-    same_house(load_mesh(path))
+    assert_is_the_house(load_mesh(path))
 
 
 WEB_PAGE = "<html><head><title>Sign in</title></head></html>"

@@ -131,8 +131,10 @@ def _in_pool(
 
 
 def _of_script(function: Callable, items: Sequence[Any]) -> bool:
-    """Whether a worker needs the script that runs: the function, or what it is called with, is
-    defined there.
+    """Whether a worker needs the script that runs.
+
+    It does if the function, or what it is called with, is defined there. What is sent to workers
+    names the modules that they have to import; nothing is unpickled here.
     """
     return b"__main__" in pickle.dumps((function, items))
 
