@@ -108,24 +108,21 @@ def page(results: Results, store: ViewStore | None, why_not: str) -> str:
         .set_index("policy")
         .to_dict("index")
     )
-    shown = [
-        n
-        for n in dict.fromkeys((reference, best, DEFAULT, *draw.ceiling(results)))
-        if n in policies
-    ]
+    wanted = dict.fromkeys((reference, best, DEFAULT, *draw.ceiling(results)))
+    shown = [name for name in wanted if name in policies]
 
     def spoken(measure: str) -> str:
-        known = [
-            (name, found[name, at, measure])
-            for name in draw.compared(results)
-            if (name, at, measure) in found
-        ]
-        return (
-            f"At threshold {at:g}: "
-            + ", ".join(f"{name} {number.value:.3f}" for name, number in known)
-            + "."
-        )
+        known = [(name, found.get((name, at, measure))) for name in draw.compared(results)]
+        values = [f"{name} {number.value:.3f}" for name, number in known if number is not None]
+        return f"At threshold {at:g}: {', '.join(values)}."
 
+    thresholds = [(name, value) for name, value, measure in found if measure == "accuracy"]
+    fixed_at = {name: None for name, value in thresholds if value is None}
+    confusions = {
+        name: picture(draw.confusion(results.episodes(name, at), p.classes, name))
+        for name in dict.fromkeys((reference, best))
+        if name in policies
+    }
     return render(
         "report.html",
         title=_title(tests.get(best), best, reference, at),
@@ -148,18 +145,10 @@ def page(results: Results, store: ViewStore | None, why_not: str) -> str:
         level_differences=board.level_differences(t, reference),
         risks=board.promised_risks(t),
         by_class_at=_thresholds(results, at),
-        fixed_at={
-            name: None
-            for name, threshold, measure in found
-            if threshold is None and measure == "accuracy"
-        },
+        fixed_at=fixed_at,
         spoken=spoken,
         figures={name: picture(figure) for name, figure in _figures(results, best, at).items()},
-        confusions={
-            name: picture(draw.confusion(results.episodes(name, at), p.classes, name))
-            for name in dict.fromkeys((reference, best))
-            if name in policies
-        },
+        confusions=confusions,
         failures=_failures(results, best, at, store),
         made=_made(results, store, why_not),
     )

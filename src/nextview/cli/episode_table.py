@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from rich import box
+from rich.console import JustifyMethod
 from rich.table import Table
 from rich.text import Text
 
@@ -21,73 +22,87 @@ def _angles(view: int, angles: tuple[float, float]) -> str:
 
 
 def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[str] = ()) -> None:
-    """Print each view and the answer; of captured views, which frame answered and how far off it
-    was.
+    """Print each view and the answer.
+
+    Args:
+        result: how the episode ended.
+        name: of what was looked at.
+        policy: that chose the views.
+        frames: of captured views, which frame answered each.
     """
-    sphere = result.sphere
-    table = Table(box=box.SIMPLE, show_lines=True, pad_edge=False, padding=(0, 1, 0, 0))
-    table.title = f"Looking at {name}, next views by {policy}"
-    table.caption = (
-        f"view: number, elevation, azimuth; travel: grid cells; stops by {result.stopping}"
-    )
     stops = [float(result.stopping.threshold_at(step)) for step in range(1, len(result.views) + 1)]
-    enough = ["stops at"] * any(np.isfinite(stops))  # a rule of your own need not stop at a belief
-    for column in ("step", "view", "this view alone", "belief, top 3", *enough, "next", "travel"):
-        table.add_column(
-            column, justify="right" if column in ("step", "travel") else "left", no_wrap=True
-        )
-    if frames:  # their names may be long
-        table.columns[1].no_wrap, table.columns[1].overflow = False, "fold"
-        table.columns[1].min_width, table.columns[1].max_width = 9, 12
-    for step, view in enumerate(result.views, 1):
-        top = np.argsort(-view.belief)[:3]
-        own = int(view.alone.argmax())
-        table.add_row(
-            str(step),
-            _angles(view.index, view.angles)
-            + (f"\n{frames[step - 1]}\n{view.degrees_off:.1f}° off" if frames else ""),
-            (
-                f"{result.classes[own]}\n{view.alone[own]:.3f}"
-                if view.observation.seen
-                else "nothing\nis seen"
-            ),
-            "\n".join(f"{result.classes[c]} {view.belief[c]:.3f}" for c in top),
-            *[f"{stops[step - 1]:.2f}"] * len(enough),
-            (
-                "stop"
-                if view.next_view is None
-                else _angles(view.next_view, sphere.angles(view.next_view))
-            ),
-            f"{view.travel:.2f}",
-        )
+    has_threshold = bool(np.isfinite(stops).any())  # a rule of your own need not stop at a belief
+
     console = Terminal()
-    console.print(table)
+    console.print(_table_of_views(result, name, policy, frames, stops if has_threshold else []))
     for step, view in enumerate(result.views, 1):
         for warning in view.warnings:
             console.print(f"Step {step}: warning ({warning.name}): {warning.message}.")
-    left = "no other view in reach" if result.stranded else "not confident"
-    reason = ("threshold reached" if enough else f"{result.stopping}") if result.confident else left
-    views = f"{len(result.views)} view{'s' * (len(result.views) > 1)}"
-    rest = (
-        f"{result.views[-1].belief.max():.3f}, after {views} and {result.travel:.2f} cells of"
-        f" travel ({reason})."
-    )
-    if result.unknown:
-        why = (
-            f": {printable(result.why_unknown)}, after {views} and {result.travel:.2f} cells of"
-            " travel."
-        )
-        console.print(Text.assemble("It is ", (printable(result.none_of_them), "bold"), why))
-    else:
-        console.print(
-            Text.assemble("It is a ", (printable(f"{result.answer}"), "bold"), ", belief ", rest)
-        )
+
+    console.print(_answer_in_words(result, has_threshold))
     if result.novelty is not None and not result.unknown:
         console.print(
             f"Of objects of known classes, {100 * result.novelty:.3g} % are at least as novel."
         )
     for line in _pose_in_words(result):
         console.print(line, soft_wrap=True)
+
+
+def _table_of_views(
+    result: Recognition, name: str, policy: str, frames: Sequence[str], stops: Sequence[float]
+) -> Table:
+    """A row for each view; ``stops`` are the thresholds at which each stops, if there are any."""
+    table = Table(box=box.SIMPLE, show_lines=True, pad_edge=False, padding=(0, 1, 0, 0))
+    table.title = f"Looking at {name}, next views by {policy}"
+    table.caption = (
+        f"view: number, elevation, azimuth; travel: grid cells; stops by {result.stopping}"
+    )
+
+    columns = ["step", "view", "this view alone", "belief, top 3", "next", "travel"]
+    if stops:
+        columns.insert(4, "stops at")
+    for column in columns:
+        justify: JustifyMethod = "right" if column in ("step", "travel") else "left"
+        table.add_column(column, justify=justify, no_wrap=True)
+    if frames:  # their names may be long
+        table.columns[1].no_wrap = False
+        table.columns[1].overflow = "fold"
+        table.columns[1].min_width = 9
+        table.columns[1].max_width = 12
+
+    for row, view in enumerate(result.views):
+        looked = _angles(view.index, view.angles)
+        if frames:
+            looked += f"\n{frames[row]}\n{view.degrees_off:.1f}° off"
+
+        own = int(view.alone.argmax())
+        alone = "nothing\nis seen"
+        if view.observation.seen:
+            alone = f"{result.classes[own]}\n{view.alone[own]:.3f}"
+
+        top = np.argsort(-view.belief)[:3]
+        belief = "\n".join(f"{result.classes[c]} {view.belief[c]:.3f}" for c in top)
+        stop = [f"{stops[row]:.2f}"] if stops else []
+        after = "stop"
+        if view.next_view is not None:
+            after = _angles(view.next_view, result.sphere.angles(view.next_view))
+        table.add_row(str(row + 1), looked, alone, belief, *stop, after, f"{view.travel:.2f}")
+    return table
+
+
+def _answer_in_words(result: Recognition, has_threshold: bool) -> Text:
+    """What the object is, or that it is unknown, and after how many views."""
+    views = f"{len(result.views)} view{'s' * (len(result.views) > 1)}"
+    effort = f"after {views} and {result.travel:.2f} cells of travel"
+    if result.unknown:
+        why = f": {printable(result.why_unknown)}, {effort}."
+        return Text.assemble("It is ", (printable(result.none_of_them), "bold"), why)
+
+    reason = "no other view in reach" if result.stranded else "not confident"
+    if result.confident:
+        reason = "threshold reached" if has_threshold else f"{result.stopping}"
+    rest = f"{result.views[-1].belief.max():.3f}, {effort} ({reason})."
+    return Text.assemble("It is a ", (printable(f"{result.answer}"), "bold"), ", belief ", rest)
 
 
 def _pose_in_words(result: Recognition) -> list[str]:

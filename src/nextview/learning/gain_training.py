@@ -353,13 +353,12 @@ class _Data:
     rng: np.random.Generator
 
 
-def _load(
-    predictions: Path,
-    validation: Path | None,
-    sensed: Sequence[Path],
-    recipe: GainRecipe,
-    folds: int,
-) -> _Data:
+def _sources(
+    predictions: Path, validation: Path | None, sensed: Sequence[Path], recipe: GainRecipe
+) -> tuple[Predictions, Predictions, list[Predictions], list[tuple[Path, Predictions]]]:
+    """What is learned from and what it is judged on, the first through sensors, and all with their
+    files, checked.
+    """
     table = Predictions.load(predictions).deduplicate()
     other = table if validation is None else Predictions.load(validation).deduplicate()
     if (other.classes, other.sphere) != (table.classes, table.sphere):
@@ -379,6 +378,17 @@ def _load(
     sources += zip(sensed, variants, strict=True)
     for path, p in sources:
         _check(path, p, recipe)
+    return table, other, variants, sources
+
+
+def _load(
+    predictions: Path,
+    validation: Path | None,
+    sensed: Sequence[Path],
+    recipe: GainRecipe,
+    folds: int,
+) -> _Data:
+    table, other, variants, sources = _sources(predictions, validation, sensed, recipe)
     everything = np.arange(len(table))
     if validation is None:
         # of few objects each has a fold of its own

@@ -244,48 +244,25 @@ class ObservedObject:
 
     def _after(self, frame: Frame) -> ObjectState:
         before = self.state
-        if not isinstance(frame, Frame):
-            raise ObservationError(
-                f"what a depth camera gave is a Frame, not {one_line(repr(frame))}"
-            )
-        if before.sightings and (frame.pose is None or before.sightings[0].frame.pose is None):
-            raise ObservationError(
-                "a second frame needs a pose, and the first one too: how else do they fit together?"
-            )
-        target, radius = (
-            (self.point, 0.0) if self.known is None else (self.known.centre, self.known.radius)
-        )
         last = before.sightings[-1].frame if before.sightings else None
-        plausibility.refuse_far(frame, last, target, radius)
+        self._refuse(frame, last)
+
         few = slice(None, None, max(1, frame.shape[0] // ROWS))
         noise = estimate_noise(frame.depth[few], frame.depth[few] > 0)
         seen = frame.depth > 0 if frame.mask is None else (frame.depth > 0) & ~frame.mask
         samples = sample(frame, seen, noise)
-        up = None if frame.pose is None else self.up
-        rng = before.rng
-        if before.frame is not None:
-            up = before.frame.axes[2]
-        plane = None
-        if self.support:
-            earlier = [s.plane for s in before.sightings if s.plane is not None]
-            rng = rng if earlier else deepcopy(rng)
-            if earlier:
-                plane = segmentation.find_again(earlier[0], samples, self._near(samples))
-            else:
-                plane = self._plane(frame, samples, up, rng)
-        if up is None:
-            if plane is None:
-                why = "no support plane is seen, so there is no telling where up is"
-                raise ObservationError(f"{why}: give it, and the camera's pose")
-            up = plane.normal
+        plane, up, rng = self._support(frame, samples)
+
         ahead = frame.camera_to_world[:3, 2]
         down = frame.camera_to_world[:3, 1]
         front = -ahead if abs(ahead @ up) < 0.99 else down  # from above the bottom of the image
         axes = upright_axes(up, front) if before.frame is None else before.frame.axes
+
         sightings, cell, two = self._find(frame, upright_axes(up), plane, samples, noise)
         latest = self._estimate(sightings, axes)
         if before.frame is not None and _same(latest, before.frame):
             latest = before.frame
+
         made = list(before.observations)
         for i, (sighting, old) in enumerate(zip(sightings, before.sightings, strict=False)):
             if latest is not before.frame or sighting is not old:
@@ -294,17 +271,12 @@ class ObservedObject:
             new is not old for new, old in zip(made, before.observations, strict=True)
         )
         made.append(self._observe(sightings[-1], latest))
-        warnings = check_frame(frame) + check_observation(made[-1]) + [MAY_BE_TWO] * two
-        if last is not None:
-            warnings += plausibility.check_pose_moved(frame, last)
-        if before.frame is not None:
-            warnings += plausibility.check_size(latest.radius, before.frame.radius)
-        if self.point is not None:
-            aside = upright_axes(up)[:2] @ (self.point - latest.centre)
-            warnings += plausibility.check_point(aside, latest.radius)
+
+        warnings = self._warnings(frame, latest, made, up, two)
         warnings += [NO_PLANE] * (self.support and plane is None and self.known is None)
         for view in made[-4:-1]:
             warnings = warnings or check_views(view, made[-1])
+
         return ObjectState(
             rng,
             latest,
@@ -315,6 +287,74 @@ class ObservedObject:
             cell,
             before.joins,
         )
+
+    def _refuse(self, frame: Frame, last: Frame | None) -> None:
+        """Refuse what is no frame, does not fit those before, or is too far from the object."""
+        if not isinstance(frame, Frame):
+            raise ObservationError(
+                f"what a depth camera gave is a Frame, not {one_line(repr(frame))}"
+            )
+        sightings = self.state.sightings
+        if sightings and (frame.pose is None or sightings[0].frame.pose is None):
+            raise ObservationError(
+                "a second frame needs a pose, and the first one too: how else do they fit together?"
+            )
+
+        target = self.point if self.known is None else self.known.centre
+        radius = 0.0 if self.known is None else self.known.radius
+        plausibility.refuse_far(frame, last, target, radius)
+
+    def _support(
+        self, frame: Frame, samples: Samples
+    ) -> tuple[Plane | None, Float, np.random.Generator]:
+        """The support plane, where one is seen, the direction up, (3,), and the state of the random
+        numbers after both were found.
+        """
+        before = self.state
+        up = None if frame.pose is None else self.up
+        if before.frame is not None:
+            up = before.frame.axes[2]
+
+        rng = before.rng
+        plane = None
+        if self.support:
+            earlier = [s.plane for s in before.sightings if s.plane is not None]
+            if earlier:
+                plane = segmentation.find_again(earlier[0], samples, self._near(samples))
+            else:
+                rng = deepcopy(rng)
+                plane = self._plane(frame, samples, up, rng)
+
+        if up is None:
+            if plane is None:
+                why = "no support plane is seen, so there is no telling where up is"
+                raise ObservationError(f"{why}: give it, and the camera's pose")
+            up = plane.normal
+        return plane, up, rng
+
+    def _warnings(
+        self,
+        frame: Frame,
+        latest: ObjectFrame,
+        made: Sequence[Observation],
+        up: Float,
+        two: bool,
+    ) -> list[ViewWarning]:
+        """What is likely to be wrong with a frame, beside those taken before; ``two`` says that the
+        object may be two.
+        """
+        before = self.state
+        warnings = check_frame(frame) + check_observation(made[-1])
+        if two:
+            warnings.append(MAY_BE_TWO)
+        if before.sightings:
+            warnings += plausibility.check_pose_moved(frame, before.sightings[-1].frame)
+        if before.frame is not None:
+            warnings += plausibility.check_size(latest.radius, before.frame.radius)
+        if self.point is not None:
+            aside = upright_axes(up)[:2] @ (self.point - latest.centre)
+            warnings += plausibility.check_point(aside, latest.radius)
+        return warnings
 
     def _near(self, samples: Samples) -> Mask:
         """Which samples lie in the sphere of the object, as it is known from earlier frames, (N,)
@@ -453,21 +493,9 @@ class ObservedObject:
         free = before_walls(frame, walls, noise)
         above &= free
         ground = plane.extent(samples) @ axes[:2].T
-        if not cell:  # by the distance from the camera to the object
-            camera = frame.camera_to_world[:3, 3]
-            distance = 1.0
-            if self.point is not None:
-                distance = float(np.linalg.norm(self.point - camera))
-                if distance < NEAREST:
-                    raise ObservationError(
-                        f"the object's point is {distance:.2g} m from the camera: of the world?"
-                    )
-            else:
-                points = sample(frame, above, noise).points
-                points = points[clusters.on_ground(points @ axes[:2].T, ground)]
-                points = points if len(points) else _ahead(frame)[None]
-                distance = float(np.median(np.linalg.norm(points - camera, axis=1)))
-            cell = clusters.CELL * distance
+        if not cell:
+            cell = clusters.CELL * self._distance(frame, axes, above, ground, noise)
+
         pieces = cut(frame.depth, above, height, noise, free if walls else None)
         middle = axes[:2] @ (_ahead(frame) if place is None else place)
         if place is None:  # what is far ahead, such as a wall, is no place on the plane
@@ -475,6 +503,7 @@ class ObservedObject:
         foot = clusters.footprint(frame, pieces, axes, cell, middle / cell)
         footprints = [*(s.footprint for s in earlier if s.footprint is not None), foot]
         labels, two = clusters.clusters(footprints, self.state.joins)
+
         target = self._target(
             labels, footprints, ground / cell, axes[:2] / cell, frame.intrinsics[:2, 2]
         )
@@ -484,6 +513,7 @@ class ObservedObject:
             if was and not any(was in label and target in label for label in labels):
                 for label in labels:
                     label[label == was] = target
+
         chosen = labels[-1] == target
         mask = foot.pixels_of(chosen)
         if (labels[-1][~chosen] > 0).any():  # cells at the border may hold pixels of a neighbour
@@ -493,9 +523,36 @@ class ObservedObject:
             raise ObservationError(
                 f"this frame shows nothing {where}: check its pose, or aim the camera at the object"
             )
+
+        sightings = self._reconsidered(labels[:-1], target)
+        latest = replace(self._sighting(frame, mask, plane, noise), footprint=foot, chosen=chosen)
+        return [*sightings, latest], cell, bool(two[target])
+
+    def _distance(
+        self, frame: Frame, axes: Float, above: Mask, ground: Float, noise: Noise
+    ) -> float:
+        """From the camera to the object, metres: to the point that asks for it, or to the middle of
+        what stands on the plane, (M, 2), by the pixels above it, (h, w).
+        """
+        camera = frame.camera_to_world[:3, 3]
+        if self.point is not None:
+            distance = float(np.linalg.norm(self.point - camera))
+            if distance < NEAREST:
+                raise ObservationError(
+                    f"the object's point is {distance:.2g} m from the camera: of the world?"
+                )
+            return distance
+
+        points = sample(frame, above, noise).points
+        points = points[clusters.on_ground(points @ axes[:2].T, ground)]
+        points = points if len(points) else _ahead(frame)[None]
+        return float(np.median(np.linalg.norm(points - camera, axis=1)))
+
+    def _reconsidered(self, labels: Sequence[Index], target: int) -> list[Sighting]:
+        """The earlier sightings, each with what now counts as the object in it."""
         sightings = list[Sighting]()
-        old_labels = iter(labels[:-1])
-        for s in earlier:
+        old_labels = iter(labels)
+        for s in self.state.sightings:
             if s.footprint is not None and s.chosen is not None:
                 now = next(old_labels) == target
                 if _changed(s.footprint, s.chosen, now):
@@ -512,8 +569,7 @@ class ObservedObject:
                         )
                     s = replace(mended, footprint=s.footprint, chosen=now)
             sightings.append(s)
-        latest = replace(self._sighting(frame, mask, plane, noise), footprint=foot, chosen=chosen)
-        return [*sightings, latest], cell, bool(two[target])
+        return sightings
 
     def _place(self) -> Float | None:
         """Where the object is known to be, (3,), world, metres: by the point that asks for it,

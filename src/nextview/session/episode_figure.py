@@ -262,23 +262,8 @@ def _draw_values(axis: Axes, views: Sequence[View], sphere: Viewpoints, seen_fro
     flat = np.stack([out * np.cos(turned), out * np.sin(turned)], 1)
     limit = max(97.0, float(out.max()) + 10)
     if isinstance(sphere, ViewSphere):
-        rings = np.sort(90 - np.asarray(sphere.elevations, float))
-        between = (rings[1:] + rings[:-1]) / 2
-        first, last = (
-            (between[0] - rings[0], rings[-1] - between[-1]) if len(rings) > 1 else (9.0, 9.0)
-        )
-        edges = np.array([max(rings[0] - first, 0), *between, rings[-1] + last])
-        half = 180 / sphere.azimuths
-        limit = max(limit, edges[-1] + 2)
-        for radius, angle, colour in zip(out, np.degrees(turned), colours, strict=True):
-            inner, outer = edges[np.searchsorted(edges, radius) - 1 :][:2]
-            shape: dict[str, Any] = {
-                "width": outer - inner,
-                "facecolor": colour,
-                "edgecolor": PAPER,
-                "linewidth": 1.2,
-            }
-            axis.add_patch(Wedge((0, 0), outer, angle - half, angle + half, **shape))
+        farthest = _draw_cells(axis, sphere, np.degrees(turned), colours)
+        limit = max(limit, farthest + 2)
     else:
         axis.scatter(
             flat[:, 0],
@@ -315,6 +300,35 @@ def _draw_values(axis: Axes, views: Sequence[View], sphere: Viewpoints, seen_fro
             va="center",
             path_effects=[withStroke(linewidth=3, foreground=PAPER)],
         )
+
+
+def _draw_cells(
+    axis: Axes, sphere: ViewSphere, angles: NDArray[np.floating], colours: NDArray[np.floating]
+) -> float:
+    """A cell around each view of a grid, by its angle around, degrees, and its colour; returns how
+    far out they reach, degrees from the zenith.
+    """
+    out = 90 - np.degrees(sphere.elevation)
+    rings = np.sort(90 - np.asarray(sphere.elevations, float))
+    between = (rings[1:] + rings[:-1]) / 2
+    first = 9.0
+    last = 9.0
+    if len(rings) > 1:
+        first = between[0] - rings[0]
+        last = rings[-1] - between[-1]
+    edges = np.array([max(rings[0] - first, 0), *between, rings[-1] + last])
+
+    half = 180 / sphere.azimuths
+    for radius, angle, colour in zip(out, angles, colours, strict=True):
+        inner, outer = edges[np.searchsorted(edges, radius) - 1 :][:2]
+        shape: dict[str, Any] = {
+            "width": outer - inner,
+            "facecolor": colour,
+            "edgecolor": PAPER,
+            "linewidth": 1.2,
+        }
+        axis.add_patch(Wedge((0, 0), outer, angle - half, angle + half, **shape))
+    return float(edges[-1])
 
 
 def _draw_scale(axis: Axes) -> None:

@@ -601,30 +601,25 @@ class Session:
     ) -> View:
         """Take in the last of some observations, and whichever of the others has changed."""
         last = len(observations) - 1
-        changed = [
-            k
-            for k, seen in enumerate(observations)
-            if k == last or seen is not self.views[k].observation
-        ]
+        earlier = observations[:last]
+        changed = [k for k, seen in enumerate(earlier) if seen is not self.views[k].observation]
+        changed.append(last)
+
         found = self.models.evidence([observations[k] for k in changed])
         once = np.array(
             [REPEATED not in (warnings if k == last else self.views[k].warnings) for k in changed]
         )
         found = replace(found, seen=once if found.seen is None else found.seen & once)
         evidence = {k: found.select([row]) for row, k in enumerate(changed)}
-        at = [
-            (towards, *self.sphere.nearest(towards))
-            for towards in (direction_of(o.pose) for o in observations)
-        ]
-        directions = [
-            self.sphere.directions[view] if there else towards for towards, view, there in at
-        ]
+        directions = [self._snapped(direction_of(seen.pose)) for seen in observations]
+
         episodes = self._episodes
         if changed != [last]:
             episodes = self._begin(self.view)
             for k, step in enumerate(self._episodes.steps):
                 # What all views said together then is not asked again: it takes time.
                 episodes.take(evidence.get(k, step.evidence), directions[k][None], step.joint)
+
         reach = self._reach
         doubtful = bool(warnings) or self._contradicted(last + 1)
         taken = episodes.next_step(
@@ -634,18 +629,12 @@ class Session:
             hold=lambda step: doubtful or self._suspicious([*episodes.steps, step], observations),
         )
         steps = [*episodes.steps, taken.step]
-        views = list(self.views)
         travel = self._travelled([int(step.views[0]) for step in steps], directions)
+        views = list(self.views)
         for k in changed[:-1]:
-            was = views[k]
             seen = self._view(steps[k], observations[k], directions[k], travel[k])
-            views[k] = replace(
-                seen,
-                next_view=was.next_view,
-                values=was.values,
-                warnings=was.warnings,
-                degrees_off=was.degrees_off,
-            )
+            views[k] = _seen_anew(views[k], seen)
+
         off = angle_between(self.sphere.directions[self.view], directions[last])
         asked = bool(self.views) or object is None or object.known is not None
         view = replace(
@@ -655,11 +644,17 @@ class Session:
             warnings=tuple(warnings),
             degrees_off=float(np.degrees(off)) if asked else 0.0,
         )
+
         episodes.keep(taken)
         self._episodes = episodes
         self.views = [*views, view]
         self.object = object
         return view
+
+    def _snapped(self, towards: Float) -> Float:
+        """A direction, (3,), or that of the candidate view at which it is."""
+        view, there = self.sphere.nearest(towards)
+        return self.sphere.directions[view] if there else towards
 
     def _view(
         self, step: Step, observation: Observation, direction: Float, travel: tuple[float, float]
@@ -828,6 +823,17 @@ class Session:
         things = bool(self.models.recogniser.calibration.hypotheses)
         wrong = sizes.impossible(radius, THING_SIZE if things else MUCH)
         return tuple(name for name, off in zip(self.models.classes, wrong, strict=True) if off)
+
+
+def _seen_anew(before: View, seen: View) -> View:
+    """A view that is seen in a better object frame: what was chosen and noticed then stays."""
+    return replace(
+        seen,
+        next_view=before.next_view,
+        values=before.values,
+        warnings=before.warnings,
+        degrees_off=before.degrees_off,
+    )
 
 
 def _next_of(step: Step) -> int | None:

@@ -246,6 +246,21 @@ class _Object(Struct):
     cam_t_m2c: Three | None = None
 
 
+LACKS_POSE = (
+    "lacks the camera's pose (cam_R_w2c, cam_t_w2c); an object's pose in scene_gt.json will do,"
+    " named with --object-id if there are several"
+)
+
+
+def _bop_mask(folder: Path, name: str, here: list[int]) -> Path | None:
+    """The mask of an object by its place in an image; of all objects, without scene_gt.json, if
+    there is only one.
+    """
+    which = f"{here[0]:06d}" if here else "*"
+    masks = list(folder.glob(f"mask_visib/{name}_{which}.png"))
+    return masks[0] if len(masks) == 1 else None
+
+
 def _read_bop(folder: Path, intrinsics: Float | None, object_id: int | None) -> _Views:
     """Views of scene_camera.json.
 
@@ -265,9 +280,11 @@ def _read_bop(folder: Path, intrinsics: Float | None, object_id: int | None) -> 
         known = f"there are {named}" if numbers else "there is no scene_gt.json"
         raise DatasetError(f"{folder}: no object has the number {object_id}; {known}")
     single = numbers[0] if object_id is None and len(numbers) == 1 else object_id
+
     notes = ["intrinsics of scene_camera.json"] if intrinsics is None else []
     if single is None and numbers:
         notes.append(f"objects {named}: name one with --object-id, and its masks are used")
+
     views = _Views([], notes)
     from_model = False
     for number, camera in sorted(cameras.items()):
@@ -286,25 +303,16 @@ def _read_bop(folder: Path, intrinsics: Float | None, object_id: int | None) -> 
             rotation = thing.cam_R_m2c
             translation = thing.cam_t_m2c
         if rotation is None or translation is None:
-            what = (
-                f"{where}: lacks the camera's pose (cam_R_w2c, cam_t_w2c); an object's pose in"
-                " scene_gt.json will do"
-            )
-            raise DatasetError(f"{what}, named with --object-id if there are several")
+            raise DatasetError(f"{where}: {LACKS_POSE}")
         try:
             pose = _from_world_to_camera(rotation, translation, where)
         except DatasetError as error:
             views.unreadable[name] = str(error)
             continue
         k = np.reshape(camera.cam_K, (3, 3)) if intrinsics is None else intrinsics
-        masks: list[Path] = []  # those of the object; without scene_gt.json, all that there are
-        if len(here) == 1 or not numbers:
-            masks = list(folder.glob(f"mask_visib/{name}_{f'{here[0]:06d}' if here else '*'}.png"))
-        mask = masks[0] if len(masks) == 1 else None
-        images = (
-            folder / file for file in (f"rgb/{name}.png", f"rgb/{name}.jpg", f"gray/{name}.png")
-        )
-        image = next(filter(Path.exists, images), None)
+        mask = _bop_mask(folder, name, here) if len(here) == 1 or not numbers else None
+        files = (f"rgb/{name}.png", f"rgb/{name}.jpg", f"gray/{name}.png")
+        image = next((folder / file for file in files if (folder / file).exists()), None)
         depth = folder / f"depth/{name}.png"
         step = camera.depth_scale * MILLIMETRES
         views.frames.append(CapturedFrame(name, depth, step, k, pose, mask, image))

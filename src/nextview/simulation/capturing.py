@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from nextview.checks import number
@@ -84,21 +85,22 @@ def write_capture(
             }
             placed = 1000 * (rotation @ model + translation)
             objects[str(i)] = [{"obj_id": 1, "cam_R_m2c": flat, "cam_t_m2c": placed.tolist()}]
-            depth, which = caster.cast(
-                pose[:3, 3], rays @ np.ascontiguousarray(rotation, np.float32)
-            )
-            steps = (
-                np.rint(np.where(which < 0, np.float32(0), depth) / STEP)
-                .astype(np.uint16)
-                .reshape(SHAPE)
-            )
-            Image.fromarray(steps).save(new / f"depth/{i:06d}.png")
-            if masks:
-                mask = np.where(which == 0, 255, 0).astype(np.uint8).reshape(SHAPE)
-                Image.fromarray(mask).save(new / f"mask_visib/{i:06d}_000000.png")
+            seen = caster.cast(pose[:3, 3], rays @ np.ascontiguousarray(rotation, np.float32))
+            _write_images(new, i, *seen, masks)
             yield i + 1
         for name, values in (("scene_camera", cameras), ("scene_gt", objects)):
             (new / f"{name}.json").write_text(json.dumps(values, indent=1) + "\n")
+
+
+def _write_images(
+    folder: Path, index: int, depth: NDArray[np.float32], which: NDArray[np.integer], masks: bool
+) -> None:
+    """Write the depth of each ray, and the mask of the object, by which thing it meets."""
+    steps = np.rint(np.where(which < 0, np.float32(0), depth) / STEP).astype(np.uint16)
+    Image.fromarray(steps.reshape(SHAPE)).save(folder / f"depth/{index:06d}.png")
+    if masks:
+        mask = np.where(which == 0, 255, 0).astype(np.uint8).reshape(SHAPE)
+        Image.fromarray(mask).save(folder / f"mask_visib/{index:06d}_000000.png")
 
 
 def _check_others(folder: Path, views: int, masks: bool) -> None:
