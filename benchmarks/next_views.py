@@ -55,7 +55,7 @@ from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated
-from nextview.geometry.viewsphere import ViewSphere
+from nextview.geometry.viewsphere import ViewSphere, rotation_z
 from nextview.policies.base import EpisodeState, Policy, best_view
 from nextview.policies.baselines import Furthest, RandomAll, Spread
 from nextview.policies.discriminate import Discriminate
@@ -68,7 +68,7 @@ from nextview.simulation.sensor import sensor_named
 from nextview.things.depth_view import depth_view
 from nextview.things.expected_views import Hypotheses, Outlook
 from nextview.things.memory import TaughtRecogniser
-from nextview.things.registration import FINE, align, rotation_about_z, start
+from nextview.things.registration import FINE, align, start
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 from nextview.things.verifier import FINE_SIDE, Verified
@@ -115,7 +115,7 @@ class Episode:
         self._verified: dict[frozenset[int], tuple[Verified, float]] = {}
 
         rng = np.random.default_rng(self._seed)
-        turn = rotation_about_z(rng.uniform(0, 2 * np.pi, 1))[0]
+        turn = rotation_z(rng.uniform(0, 2 * np.pi))
         self._standing = rotated(mesh, turn)
         radius = self._standing.metres
         assert radius is not None

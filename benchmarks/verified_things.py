@@ -42,11 +42,10 @@ from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated
-from nextview.geometry.viewsphere import ViewSphere
+from nextview.geometry.viewsphere import ViewSphere, rotation_z
 from nextview.simulation.scene import boxes_around
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.things.memory import TaughtRecogniser
-from nextview.things.registration import rotation_about_z
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 from nextview.things.unknown import KnownResiduals
@@ -215,7 +214,7 @@ def symmetry_order(surface: Surface, points: Float) -> int:
     apart = tree.query(centred, k=2)[0][:, 1].mean() / 2  # of the points themselves
     same = []
     for order in ORDERS:
-        turn = rotation_about_z(np.array([2 * np.pi / order]))[0]
+        turn = rotation_z(2 * np.pi / order)
         distance = np.quantile(tree.query(centred @ turn.T)[0], 0.99) - apart
         same.append(distance < SYMMETRIC * surface.diameter)
     highest = max(order for order, alike in zip(ORDERS, same, strict=True) if alike or order == 1)
@@ -225,7 +224,7 @@ def symmetry_order(surface: Surface, points: Float) -> int:
 def shown(taught: Taught, things: TaughtThings, thing: int, draw: int, setting: Setting) -> Episode:
     """Look at a thing from random viewpoints through a sensor, at its true size."""
     rng = np.random.default_rng([thing, draw])
-    turn = rotation_about_z(rng.uniform(0, 2 * np.pi, 1))[0]
+    turn = rotation_z(rng.uniform(0, 2 * np.pi))
     mesh = taught.meshes[thing]
     if setting.resting:
         poses = np.random.default_rng([thing, draw, 1])

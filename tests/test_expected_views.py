@@ -9,7 +9,7 @@ import trimesh
 from nextview.errors import PolicyError, UsageError
 from nextview.geometry.mesh import Mesh, make_mesh
 from nextview.geometry.observation import SceneView
-from nextview.geometry.viewsphere import ViewSphere, angle_between, look_at_origin
+from nextview.geometry.viewsphere import ViewSphere, angle_between, look_at_origin, rotation_z
 from nextview.policies.base import EpisodeState
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.recognition.evidence import Evidence
@@ -26,7 +26,7 @@ from nextview.things.expected_views import (
     Surroundings,
     expected_views,
 )
-from nextview.things.registration import RegistrationPrior, render, rotation_about_z, start
+from nextview.things.registration import RegistrationPrior, render, start
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.verification import PixelModel, likelihood
 from nextview.things.verifier import Verifier
@@ -55,7 +55,7 @@ def surfaces_of(*meshes: Mesh) -> SurfaceCaster:
 def hypotheses_of(things, belief, yaws=None) -> Hypotheses:
     poses = np.tile(np.eye(4), (len(things), 1, 1))
     if yaws is not None:
-        poses[:, :3, :3] = rotation_about_z(np.array(yaws))
+        poses[:, :3, :3] = rotation_z(yaws)
     return Hypotheses(np.array(things), poses, np.array(belief, float))
 
 

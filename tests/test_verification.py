@@ -13,7 +13,7 @@ from nextview.geometry.mesh import Mesh, load_mesh, make_mesh
 from nextview.geometry.observation import Observation, SceneView
 from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.resting import rotated
-from nextview.geometry.viewsphere import ViewSphere, look_at_origin
+from nextview.geometry.viewsphere import ViewSphere, look_at_origin, rotation_z
 from nextview.simulation.captured import read_capture
 from nextview.simulation.captured_camera import CapturedCamera
 from nextview.simulation.capturing import write_capture
@@ -31,7 +31,6 @@ from nextview.things.registration import (
     centred,
     different_poses,
     render,
-    rotation_about_z,
     start,
 )
 from nextview.things.surface import Surface, SurfaceCaster
@@ -70,7 +69,7 @@ def cup(handle: bool) -> Mesh:
 
 def views_of(mesh: Mesh, yaw: float = 0.0, directions=VIEWS) -> list[Observation]:
     """Exact views of a mesh turned about the vertical."""
-    camera = SimulatedCamera(rotated(mesh, rotation_about_z(np.array([yaw]))[0]))
+    camera = SimulatedCamera(rotated(mesh, rotation_z(yaw)))
     return [
         camera.observe(look_at_origin(np.radians(up), np.radians(around)))
         for up, around in directions
@@ -79,7 +78,7 @@ def views_of(mesh: Mesh, yaw: float = 0.0, directions=VIEWS) -> list[Observation
 
 def true_pose(mesh: Mesh, yaw: float) -> np.ndarray:
     """The scan file's frame in the object frame, metres, of what ``views_of`` shows."""
-    turn = rotation_about_z(np.array([yaw]))[0]
+    turn = rotation_z(yaw)
     shown = rotated(mesh, turn)
     pose = np.eye(4)
     pose[:3, :3] = turn
@@ -118,7 +117,7 @@ def aligned(mesh: Mesh, observations, yaws) -> tuple[SurfaceCaster, np.ndarray, 
     caster = SurfaceCaster([Surface.from_mesh(mesh, "thing")])
     coarse = [depth_view(each, 24) for each in observations]
     fine = [depth_view(each, SIDE) for each in observations]
-    found = start(np.zeros(len(yaws), int), rotation_about_z(yaws), len(observations))
+    found = start(np.zeros(len(yaws), int), rotation_z(yaws), len(observations))
     found = align(caster, centred(caster, found, coarse), coarse, (*FIRST, *COARSE))
     found = align(caster, found, fine, FINE)
     judged = [likelihood(view, render(caster, found, view, k)).mean for k, view in enumerate(fine)]
@@ -233,9 +232,7 @@ def test_the_ground_tells_the_vertical_and_the_noise():
 
 def test_a_thing_is_found_upright_on_a_table_that_leans():
     mesh = cup(True)
-    lean = (
-        Rotation.from_rotvec([0.06, -0.05, 0.0]).as_matrix() @ rotation_about_z(np.array([0.7]))[0]
-    )
+    lean = Rotation.from_rotvec([0.06, -0.05, 0.0]).as_matrix() @ rotation_z(0.7)
     observation = standing_view(mesh, lean, noise=0.003)
     found = verifier_of(mesh, l_block())([observation], even_belief(2))
     true = np.eye(4)
@@ -265,7 +262,7 @@ def test_nothing_reaches_below_the_ground():
 
 def test_hypotheses_that_come_to_one_pose_are_one():
     caster = SurfaceCaster([Surface.from_mesh(mesh, "thing") for mesh in (l_block(), cup(True))])
-    turns = rotation_about_z(np.array([0.5, 0.51, 0.5, 0.9, 0.5]))
+    turns = rotation_z(np.array([0.5, 0.51, 0.5, 0.9, 0.5]))
     placed = start(np.array([0, 0, 1, 0, 0]), turns, 1)
     placed.centres[4, 0] += 0.01
     assert different_poses(caster, placed).tolist() == [0, 2, 3, 4]

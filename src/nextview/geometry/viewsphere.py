@@ -28,11 +28,17 @@ MOST = 5_000
 SNAP = 1e-6
 
 
-def rotation_z(angle: float) -> Float:
-    """Returns the rotation about +z by an angle in radians, counter-clockwise, (3, 3) float64."""
+def rotation_z(angle: ArrayLike) -> Float:
+    """Rotations about +z, counter-clockwise, (..., 3, 3) float64, by angles in radians, (...)."""
     cosine = np.cos(angle)
     sine = np.sin(angle)
-    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    turned = np.zeros((*np.shape(angle), 3, 3))
+    turned[..., 0, 0] = cosine
+    turned[..., 0, 1] = -sine
+    turned[..., 1, 0] = sine
+    turned[..., 1, 1] = cosine
+    turned[..., 2, 2] = 1
+    return turned
 
 
 def look_at_origin(elevation: ArrayLike, azimuth: ArrayLike, distance: float = DISTANCE) -> Float:

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from nextview.errors import ObservationError
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.observation import Observation
-from nextview.geometry.viewsphere import look_at_origin
+from nextview.geometry.viewsphere import look_at_origin, rotation_z
 from nextview.recognition.model_card import Verification
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.things.memory import RINGS, TaughtRecogniser
-from nextview.things.registration import rotation_about_z
 from nextview.things.taught import TaughtThings, residuals_of
 from nextview.things.unknown import KnownResiduals
 from nextview.things.weighing import LEAST_BELIEF, EvidenceWeights, JudgedEpisode, fit_weights
@@ -159,7 +158,7 @@ def _views(known: TaughtThings, thing: int, sensor: str, rng: Generator) -> list
     """Some random views of a thing that show it."""
     surface = known.verifier.caster.surfaces[thing]
     resting = known.verifier.rotations[rng.choice(np.flatnonzero(known.verifier.owners == thing))]
-    turn = rotation_about_z(rng.uniform(0, 2 * np.pi, 1))[0] @ resting
+    turn = rotation_z(rng.uniform(0, 2 * np.pi)) @ resting
     mesh = make_mesh(surface.vertices.astype(np.float64) @ turn.T, surface.faces, surface.name, "m")
     camera = SensedCamera(mesh, sensor, rng.spawn(1)[0])
 

@@ -624,11 +624,6 @@ def rotations_of(vectors: Float) -> Float:
     return Rotation.from_rotvec(vectors).as_matrix()
 
 
-def rotation_about_z(angles: Float) -> Float:
-    """Rotation matrices, (H, 3, 3), by some angles about the vertical, (H,), radians."""
-    return rotations_of(np.asarray(angles)[:, None] * (0.0, 0.0, 1.0))
-
-
 def camera_cost(
     alignment: Alignment,
     views: Sequence[DepthView],

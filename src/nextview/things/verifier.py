@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from nextview.errors import ModelError, ObservationError
 from nextview.geometry.observation import Observation
+from nextview.geometry.viewsphere import rotation_z
 from nextview.things.depth_view import DepthView, MetricImage
 from nextview.things.ground import levelling
 from nextview.things.proposals import Proposals, propose
@@ -23,7 +24,6 @@ from nextview.things.registration import (
     centred,
     different_poses,
     render,
-    rotation_about_z,
     start,
 )
 from nextview.things.surface import Surface, SurfaceCaster
@@ -177,7 +177,7 @@ class Verifier:
             )
 
         proposals = propose(joint)
-        turns = rotation_about_z(proposals.azimuths) @ self.rotations[proposals.hypotheses]
+        turns = rotation_z(proposals.azimuths) @ self.rotations[proposals.hypotheses]
         images = _images(observations)
         level = levelling([image.ground for image in images if image.ground is not None])
         images = [image.turned(level) for image in images]
