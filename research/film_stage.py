@@ -175,9 +175,9 @@ def shot(stage: Stage, r: float, centre: Array, size: tuple[int, int]) -> Shot:
     light = stage.lit(points, normals, colours, rng, SAMPLES)
     grain = np.where(points[:, 2:] < 1e-4, wood(points)[:, None], 1)
     light = [x * grain for x in light]
-    far = (
-        np.clip(np.linalg.norm(points - centre, axis=1) / 2.2 - 0.25, 0, 1)[:, None] ** 2
-    )  # into the background's haze
+    # Into the background's haze.
+    away = np.linalg.norm(points - centre, axis=1) / 2.2 - 0.25
+    far = np.clip(away, 0, 1)[:, None] ** 2
     sky[hit], lamp[hit] = light[0] * (1 - far) + 1.15 * SKY * far, light[1] * (1 - far)
     where[hit] = points
     return Shot(*(x.reshape(height, width, 3) for x in (sky, lamp, where)), pose, focal, centre, r)

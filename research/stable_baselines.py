@@ -186,9 +186,10 @@ def learner(env: TaskVectorEnv, recipe: AgentRecipe) -> BaseAlgorithm:
         learning_starts=4 * recipe.batch,
         **shared,
     )
+    # The algorithm's own begins anew with each call of ``learn``.
     model.exploration_schedule = lambda _: float(
         np.interp(2 * model.num_timesteps, [0, recipe.steps], [first, last])
-    )  # the algorithm's own begins anew with each call of ``learn``
+    )
     return model
 
 

@@ -145,9 +145,8 @@ def refuse_lost_shape(vertices: NDArray[np.float64], radius: float, name: str) -
     """
     column = vertices[:, np.abs(vertices).max(0).argmax()]
     farthest = np.abs(column).max()
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # what single precision cannot hold at all is none of its numbers
+    # What single precision cannot hold at all is none of its numbers.
+    with np.errstate(over="ignore", invalid="ignore"):
         step = float(np.spacing(np.float32(farthest)))
         if step < LOST_STEP * radius:
             return

@@ -96,9 +96,8 @@ class Memory:
             raise ModelError(f"its radii are not above zero and at most {LARGEST_RADIUS:g} m")
 
         head = self.head.astype(np.float64)
-        largest = np.linalg.norm(head, axis=0) + np.abs(
-            self.head_bias.astype(np.float64)
-        )  # views are unit vectors
+        # Views are unit vectors.
+        largest = np.linalg.norm(head, axis=0) + np.abs(self.head_bias.astype(np.float64))
         if largest.max() > LARGEST_LOGIT:
             raise ModelError(
                 f"its head says more than {LARGEST_LOGIT:g} of a view, which no chance has"

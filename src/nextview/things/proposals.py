@@ -13,9 +13,8 @@ FEWEST_PROPOSALS = 24
 MOST_PROPOSALS = 96
 ENOUGH_BELIEF = 0.99  # of the flattened belief that the proposals hold together
 FLATTENING = 0.35  # exponent of the belief: features alone are too sure, above all of real frames
-ALL_AROUND = (
-    3  # likeliest hypotheses that are proposed at azimuths all around: features may be wrong there
-)
+# likeliest hypotheses that are proposed at azimuths all around: features may be wrong there
+ALL_AROUND = 3
 MOST_PEAKS = 2  # azimuths of any other hypothesis
 
 

@@ -15,9 +15,8 @@ from nextview.geometry.ray_caster import embree_scene
 Float32 = NDArray[np.float32]
 
 FEWEST_FACES = 500  # a simplified surface has at least so many triangles, if it had as many
-FINEST_ERROR = (
-    0.0004  # metres by which a simplified surface may be off: less than depth cameras measure
-)
+# metres by which a simplified surface may be off: less than depth cameras measure
+FINEST_ERROR = 0.0004
 SURFACE_SAMPLES = 2000  # points at which the error of a simplified surface is measured
 LARGEST_ERROR = 5.0  # errors by which no point of a simplified surface is off
 NEARBY_SAMPLES = 50_000  # points of a simplified surface that others are looked for beside
@@ -213,9 +212,8 @@ class SurfaceCaster:
         row, column = np.divmod(np.arange(len(self.surfaces)), side)
         pitch = SPACING * self.radii.max()
         places = np.stack([column - side / 2, row - side / 2, np.zeros(len(row))], 1) * pitch
-        self._shifts = (
-            places.astype(np.float32) - self.centres
-        )  # from its own frame to its place in the scene
+        # From its own frame to its place in the scene.
+        self._shifts = places.astype(np.float32) - self.centres
 
         placed = zip(self.surfaces, self._shifts, strict=True)
         self._scene = embree_scene(

@@ -19,9 +19,8 @@ from nextview.things.surface import Surface
 
 Float = NDArray[np.float64]
 
-LEAST_TOLERANCE = (
-    0.005  # metres: three deviations of edges that a stereo camera sees at arm's length
-)
+# metres: three deviations of edges that a stereo camera sees at arm's length
+LEAST_TOLERANCE = 0.005
 TOLERANCE = 0.02  # of the diameter: a camera stands farther from a large thing
 COMPARED = 0.95  # share of the surface that has to be that near: scans have spurs
 HIGHEST_ORDER = 8

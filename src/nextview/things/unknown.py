@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
-SHRINKAGE = (
-    2.0  # number of residuals that the mean of all things counts for, beside those of a thing
-)
+# number of residuals that the mean of all things counts for, beside those of a thing
+SHRINKAGE = 2.0
 LEAST_RESIDUAL = 0.02  # below which residuals do not differ
 NOISE_RESIDUAL = 0.5  # of pixels that are off by just the noise: half a squared standard normal
 NOISE_SHARE = 0.8  # of a thing's pixels that the surface explains, if only the noise is in the way
