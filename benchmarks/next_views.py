@@ -66,7 +66,8 @@ from nextview.simulation.scene import boxes_around
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.things.depth_view import depth_view
-from nextview.things.expected_views import Hypotheses, Outlook
+from nextview.things.expected_views import Outlook
+from nextview.things.leading import Hypotheses
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.registration import FINE, align, start
 from nextview.things.surface import Surface

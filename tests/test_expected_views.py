@@ -18,14 +18,9 @@ from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.depth_view import depth_view
-from nextview.things.expected_views import (
-    ExpectedSensor,
-    ExpectedViews,
-    Hypotheses,
-    Outlook,
-    Surroundings,
-    expected_views,
-)
+from nextview.things.expected_images import ExpectedSensor, Surroundings
+from nextview.things.expected_views import ExpectedViews, Outlook, expected_views
+from nextview.things.leading import Hypotheses
 from nextview.things.registration import RegistrationPrior, render, start
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.verification import PixelModel, likelihood

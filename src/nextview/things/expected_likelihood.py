@@ -1,0 +1,284 @@
+"""What the verifier is expected to say of two hypotheses in views that were not taken yet.
+
+If a hypothesis is true, the depth that is measured is its own, under the noise of the sensor, with
+holes where the surface is seen at a grazing angle. ``verification.likelihood`` then judges this
+depth given each other hypothesis; what it will say on average is computed here without drawing any
+image.
+
+Both directions of a difference count: a handle that only the rival has shows as surface that is
+missing, and a handle that only the leading hypothesis has as surface that no rival explains.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.things.expected_images import LOWEST_COSINE, ExpectedSensor, HypothesisImages
+from nextview.things.registration import SCAN_ERROR, RegistrationPrior
+from nextview.things.verification import PixelModel
+
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Index = NDArray[np.int64]
+
+FITTED_EVERY = 3  # every so many pixels take part in the fit of one hypothesis to another
+FITTED_REACH = 0.004  # metres of deviation at which a pixel of this fit counts half
+GRAZING_COSINE = 0.3  # of incidence, below which holes become usual: see the cameras of simulation
+SURFACE_ERROR = 0.001  # metres by which a surface is off from its scan, in this fit
+LARGEST_DEVIATION = 12.0  # standard deviations, beyond which a pixel is an outlier
+TABLE_STEPS = 20  # entries of a table per standard deviation
+
+
+def _displaced(images: HypothesisImages, prior: RegistrationPrior) -> Float:
+    """By how much each camera may see the thing displaced along each axis, (V,), metres.
+
+    As ``RegistrationPrior.displaced`` says of views that were taken.
+    """
+    away = np.linalg.norm(images.origins - images.centre, axis=1).astype(np.float64)
+    return np.hypot(prior.camera, prior.aim * away)
+
+
+def _pairs(count: int) -> tuple[Index, Index]:
+    """Rows of all pairs of hypotheses, each once."""
+    first, second = np.triu_indices(count, 1)
+    return first, second
+
+
+def _depth_variance(
+    images: HypothesisImages, sensor: ExpectedSensor, pixels: PixelModel
+) -> Float32:
+    """Variance of the depth that is measured of each hypothesis, (V, H, P) float32, metres^2."""
+    depth = np.where(np.isfinite(images.depth), images.depth, 1)
+    steepness = np.sqrt(1 - images.cosine**2) / images.cosine
+    noise = sensor.noise * depth**2
+    sideways = pixels.steep * sensor.pitch * depth * steepness
+    return (noise**2 + SCAN_ERROR**2 + sideways**2).astype(np.float32)
+
+
+def gaps_after_alignment(
+    images: HypothesisImages, sensor: ExpectedSensor, prior: RegistrationPrior
+) -> Float32:
+    """Difference in depth of each pair that is left once one is aligned with the other.
+
+    When the view is there, all hypotheses are aligned anew, and each camera may be displaced. What
+    a small motion takes away tells nothing. One Gauss-Newton step, held near zero by the prior, is
+    what registration would do.
+
+    Returns:
+        (V, pairs, P) float32, metres; 0 where not both show.
+    """
+    first, second = _pairs(images.depth.shape[1])
+    depth_a = images.depth[:, first]
+    depth_b = images.depth[:, second]
+    both = np.isfinite(depth_a) & np.isfinite(depth_b)
+    a = np.where(both, depth_a, 0)
+    gap = a - np.where(both, depth_b, 0)
+    if not len(first):
+        return gap
+
+    # A symmetric Jacobian: the surface halfway between the two.
+    axes = [images.normals[..., k] for k in range(3)]
+    normals = [axis[:, first] + axis[:, second] for axis in axes]
+    scale = both / np.sqrt(normals[0] ** 2 + normals[1] ** 2 + normals[2] ** 2 + 1e-12)
+    normals = [axis * scale for axis in normals]
+    middle = a - gap / 2
+    start = images.origins - images.centre
+    rays = [images.rays[..., k] for k in range(3)]
+    arms = [start[:, k, None, None] + rays[k][:, None] * middle for k in range(3)]
+    columns = [
+        arms[1] * normals[2] - arms[2] * normals[1],
+        arms[2] * normals[0] - arms[0] * normals[2],
+        arms[0] * normals[1] - arms[1] * normals[0],
+        *normals,
+    ]
+    steepest = -LOWEST_COSINE * images.lengths[:, None]
+    along = np.minimum(sum(normals[k] * rays[k][:, None] for k in range(3)), steepest)
+
+    some = slice(None, None, FITTED_EVERY)
+    distance = (gap * along)[..., some]
+    noise = sensor.noise * middle[..., some] ** 2
+    weights = both[..., some] / (SURFACE_ERROR**2 + noise**2)
+    weights = weights / (1 + (distance / FITTED_REACH) ** 2)
+    used = np.maximum(both[..., some].sum(2, keepdims=True), 1)
+    weights = (weights * np.minimum(1, prior.pixels / used)).astype(np.float32)
+    thinned = np.stack([column[..., some] for column in columns], 2)
+    weighted = thinned * weights[:, :, None]
+    held = np.zeros((len(images.origins), 1, 6))
+    held[..., :3] = 1 / prior.tilt**2
+    held[..., 3:] = 1 / _displaced(images, prior)[:, None, None] ** 2
+    left = (weighted @ thinned.swapaxes(2, 3)).astype(np.float64)
+    left += held[..., None] * np.eye(6)
+    right = (weighted @ distance[..., None]).astype(np.float64)
+    motion = np.linalg.solve(left, right)[..., 0].astype(np.float32)
+
+    taken_away = sum(columns[k] * motion[:, :, k, None] for k in range(6)) / along
+    return np.where(both, gap - taken_away, 0).astype(np.float32)
+
+
+def divergences(
+    images: HypothesisImages,
+    gaps: Float32,
+    sensor: ExpectedSensor,
+    pixels: PixelModel,
+    prior: RegistrationPrior,
+) -> tuple[Float, Float]:
+    """Expected difference of two hypotheses' mean log-likelihood, and of their pixels.
+
+    Returns:
+        Mean of both directions, (V, H, H), and the share of their pixels that differ, (V, H, H).
+    """
+    views, count = images.depth.shape[:2]
+    first, second = _pairs(count)
+    divergence = np.zeros((views, count, count))
+    different = np.zeros((views, count, count))
+    if not len(first):
+        return divergence, different
+
+    judged = _Judged.of(images, sensor, pixels, prior)
+    forth = judged.ratio(first, second, gaps)
+    back = judged.ratio(second, first, gaps)
+    both_ways = np.maximum((forth + back) / 2, 0)
+    share = judged.different(first, second, gaps)
+    for rows, columns in ((first, second), (second, first)):
+        divergence[:, rows, columns] = both_ways
+        different[:, rows, columns] = share
+    return divergence, different
+
+
+@dataclass(frozen=True, eq=False)
+class _Judged:
+    """What the judgement of pixels rests on, (V, H, P) each if not said otherwise.
+
+    Attributes:
+        shows: where a hypothesis shows, bool.
+        lost: chance that nothing is measured there.
+        deviation: standard deviation of the depth there, metres.
+        hole: log-likelihood of a hole there.
+        missing: log-likelihood of a pixel of the thing that shows nothing of another hypothesis.
+        apart: how surely a pixel beside a hypothesis is beside it after it is aligned anew, 0 to
+            1.
+        behind: whether something is measured where a hypothesis does not show, (V, 1, P).
+        area: pixels of the camera in one of these, (V, 1).
+        enough: pixels of the camera from which on a view counts in full.
+        matches: expected log-likelihood of a depth by its deviation, see ``_match_table``.
+    """
+
+    shows: NDArray[np.bool_]
+    lost: Float32
+    deviation: Float32
+    hole: Float32
+    missing: Float32
+    apart: Float32
+    behind: NDArray[np.bool_]
+    area: Float
+    enough: float
+    outlier: float
+    matches: Float32
+
+    @classmethod
+    def of(
+        cls,
+        images: HypothesisImages,
+        sensor: ExpectedSensor,
+        pixels: PixelModel,
+        prior: RegistrationPrior,
+    ) -> "_Judged":
+        shows = np.isfinite(images.depth)
+        size = images.step / sensor.pitch  # of a pixel here, pixels of the camera
+        within, beside = _rings(shows, images.side)
+        deep = np.clip(within * size.mean(1)[:, None, None] / pixels.edge, 0.1, 1)
+
+        away = np.linalg.norm(images.origins - images.centre, axis=1)
+        metres = images.step.mean(1) * away
+        displaced = _displaced(images, prior).astype(np.float32)
+        beside = beside * (metres / displaced)[:, None, None]
+        return cls(
+            shows=shows,
+            lost=np.where(shows, np.maximum(1 - images.cosine / GRAZING_COSINE, 0), 0),
+            deviation=np.sqrt(_depth_variance(images, sensor, pixels)),
+            hole=(pixels.hole * images.cosine).astype(np.float32),
+            missing=(pixels.outlier * deep).astype(np.float32),
+            apart=1 - np.exp(-0.5 * beside**2),
+            behind=images.behind[:, None],
+            area=size.prod(1)[:, None].astype(np.float64),
+            enough=prior.pixels,
+            outlier=pixels.outlier,
+            matches=_match_table(pixels.outlier),
+        )
+
+    def ratio(self, true: Index, other: Index, gaps: Float32) -> Float:
+        """Expected mean log-likelihood of the true hypotheses less that of the others, (V, K)."""
+        shows = self.shows[:, true]
+        rival = self.shows[:, other]
+        lost = self.lost[:, true]
+        kept = shows * (1 - lost)
+
+        # Where both show.
+        off = np.abs(gaps) / self.deviation[:, other] * TABLE_STEPS
+        match = self.matches[np.minimum(off, len(self.matches) - 1).astype(np.int32)]
+        hole = self.hole[:, other]
+        judged = np.where(rival, kept * match + lost * hole, 0)
+        # Where only the true one shows: surface that the other one does not explain.
+        alone = shows & ~rival
+        judged += np.where(alone, kept * self.missing[:, true] * self.apart[:, other], 0)
+        # Where only the other one shows: what is behind is seen through it, or nothing is measured.
+        through = rival & ~shows
+        seen_through = self.outlier * self.apart[:, true]
+        judged += np.where(through, np.where(self.behind, seen_through, hole), 0)
+        counted = (kept + np.where(rival, lost, 0) + through).sum(2)
+
+        best = kept * self.matches[0] + lost * self.hole[:, true]
+        own = shows.sum(2)
+        mean = judged.sum(2) / np.maximum(counted, 1) - best.sum(2) / np.maximum(own, 1)
+        union = (shows | rival).sum(2)
+        return -mean.astype(np.float64) * np.minimum(1, union * self.area / self.enough)
+
+    def different(self, first: Index, second: Index, gaps: Float32) -> Float:
+        """Share of the pixels of either hypothesis in which they differ, (V, K)."""
+        shows = self.shows[:, first]
+        rival = self.shows[:, second]
+        off = np.abs(gaps) > 3 * self.deviation[:, second]
+        alone = np.where(shows, self.apart[:, second], self.apart[:, first]) > 0.5
+        differ = np.where(shows & rival, off, (shows ^ rival) & alone)
+        return differ.sum(2) / np.maximum((shows | rival).sum(2), 1)
+
+
+@lru_cache(maxsize=4)
+def _match_table(outlier: float) -> Float32:
+    """Expected log-likelihood of a depth by its deviation from the surface, standard deviations.
+
+    The expectation of ``verification.likelihood``'s mixture over Gaussian noise, by Gauss-Hermite
+    quadrature; one entry for every 1 / TABLE_STEPS.
+    """
+    nodes, shares = np.polynomial.hermite_e.hermegauss(40)
+    deviations = np.arange(int(LARGEST_DEVIATION * TABLE_STEPS) + 1) / TABLE_STEPS
+    squared = (deviations[:, None] + nodes) ** 2
+    match = np.log(np.exp(-squared / 2) + np.exp(outlier)) - np.log1p(np.exp(outlier))
+    return (match @ shares / shares.sum()).astype(np.float32)
+
+
+def _rings(shows: NDArray[np.bool_], side: int) -> tuple[Float32, Float32]:
+    """Distance to the outline within it, and beside it, (V, H, P) each, pixels; at most 2.5."""
+    image = shows.reshape(*shows.shape[:2], side, side)
+    within = np.full(image.shape, 0.5, np.float32)
+    beside = np.full(image.shape, 0.5, np.float32)
+    inner = image
+    outer = image
+    for _ in range(2):
+        inner = inner & _neighbours(inner).all(0)
+        outer = outer | _neighbours(outer).any(0)
+        within += inner
+        beside += ~outer
+    return within.reshape(shows.shape), beside.reshape(shows.shape)
+
+
+def _neighbours(image: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The four neighbours of each pixel of images, (4, V, H, rows, columns)."""
+    padded = np.pad(image, ((0, 0), (0, 0), (1, 1), (1, 1)))
+    up = padded[..., :-2, 1:-1]
+    down = padded[..., 2:, 1:-1]
+    left = padded[..., 1:-1, :-2]
+    right = padded[..., 1:-1, 2:]
+    return np.stack([up, down, left, right])
