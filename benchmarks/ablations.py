@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from nextview.cli.ending import require
+from nextview.cli.exit_status import require
 
 require("train")
 require("benchmark")
@@ -24,15 +24,15 @@ from numpy.typing import NDArray
 
 from nextview.benchmark.evaluation import fused_views
 from nextview.benchmark.statistics import interval, resample
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.data.metrics import mean_over_classes, ratio
 from nextview.data.predictions import Predictions
 from nextview.data.splits import split_training
 from nextview.data.store import ViewStore
 from nextview.errors import PredictionsError
-from nextview.learning.card_fits import fit_temperature
-from nextview.learning.fitting_set import for_fitting
 from nextview.recognition.belief import Calibration
+from nextview.training.card_fits import fit_temperature
+from nextview.training.fitting_set import for_fitting
 
 Float = NDArray[np.float64]
 VIEWS = (1, 2, 3, 5, 8, 15, 40)
@@ -81,7 +81,7 @@ def bins_told(p: Predictions, store: ViewStore) -> tuple[float, float]:
         store: that they are of. The planes from which bins are counted come from its training
             split.
     """
-    from nextview.learning.recogniser_training import azimuth_bins, mirror_planes
+    from nextview.training.recogniser_training import azimuth_bins, mirror_planes
 
     if p.azimuth_bins is None:
         raise PredictionsError(

@@ -23,13 +23,13 @@ from matplotlib.patches import Polygon
 from scene_pictures import COLOURS, SIZE, picture
 
 import nextview
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.data.folders import list_dataset
 from nextview.data.scene_drawing import Meshes, draw_scene
 from nextview.errors import UsageError
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.recognition.belief import FixedLength
-from nextview.session.recognition import Recognition
+from nextview.session.result import Recognition
 from nextview.session.session import Session
 from nextview.session.style import BLUE, GREY, PAPER, STYLE
 from nextview.simulation.robot_camera import RobotCamera

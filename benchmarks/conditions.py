@@ -27,7 +27,7 @@ from scipy.stats import binomtest
 
 import nextview
 from nextview import Camera, Mesh, System, load_mesh
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
 from nextview.data.folders import Entry, list_dataset
 from nextview.data.metrics import calibration_error

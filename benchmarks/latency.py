@@ -14,7 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from nextview.cli.ending import require
+from nextview.cli.exit_status import require
 
 require("train")
 
@@ -24,7 +24,7 @@ import tyro
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, shape_inference
 
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.recognition.inference import open_weights
 from nextview.recognition.model_card import ModelCard, bundled_cards, find_card
 from nextview.recognition.runtime import ort

@@ -14,7 +14,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
-from nextview.cli.ending import require
+from nextview.cli.exit_status import require
 
 require("benchmark")
 
@@ -24,7 +24,7 @@ import tyro
 from nextview.benchmark.entries import default_entries
 from nextview.benchmark.replay import THRESHOLDS, Grid, make_specs, run_grid
 from nextview.benchmark.summary import summarise
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.data.predictions import Predictions
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.belief import Calibration

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from nextview.cli.ending import require
+from nextview.cli.exit_status import require
 
 require("benchmark")
 
@@ -24,7 +24,7 @@ from nextview.benchmark.leaderboard import SIGNIFICANT, nothing_differs
 from nextview.benchmark.published import published, published_threshold
 from nextview.benchmark.replay import THRESHOLDS, Grid, make_specs, run_grid
 from nextview.benchmark.summary import Tables, summarise
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.data.predictions import Predictions
 from nextview.files import sha256_of
 from nextview.recognition.belief import PLAIN_SUM

@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.data.folders import list_dataset
 from nextview.data.scene_drawing import Meshes, draw_scene
 from nextview.errors import UsageError

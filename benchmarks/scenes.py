@@ -22,7 +22,7 @@ from dataclasses import dataclass, fields
 from itertools import pairwise, product
 from pathlib import Path
 
-from nextview.cli.ending import require
+from nextview.cli.exit_status import require
 
 require("benchmark")
 
@@ -37,18 +37,18 @@ from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.replay import Grid, make_specs, run_grid
 from nextview.benchmark.statistics import bootstrap_p, holm, interval, resample
 from nextview.benchmark.summary import grid_mean, levels_of
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
 from nextview.data.metrics import calibration_error
 from nextview.data.predictions import Predictions
 from nextview.data.scene_views import scenes_of
 from nextview.errors import UsageError
-from nextview.learning.rollout import ReplayTable
-from nextview.learning.rollout import judge as follow
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import of_true_class
 from nextview.session.style import STYLE
 from nextview.simulation.scene_layout import LEVELS
+from nextview.training.rollout import ReplayTable
+from nextview.training.rollout import judge as follow
 
 POLICIES = ("random", "gain", "visibility", "volumetric", "visible-gain")
 RIVALS = ("random-all", "visibility", "volumetric", "gain")

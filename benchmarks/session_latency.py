@@ -26,7 +26,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 import nextview
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.data.samples import sample_mesh
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.sensing import Frame, ObservedObject, observed_object

@@ -17,7 +17,7 @@ import trimesh
 import tyro
 
 import nextview
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
 
 SHAPES = {

@@ -20,7 +20,7 @@ import tyro
 
 import nextview
 from nextview.benchmark.statistics import interval, resample
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
 from nextview.data.folders import Entry, list_dataset
 from nextview.data.scene_drawing import Meshes, draw_scene

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from nextview.benchmark.replay import Trajectories, make_specs, replay, replay_policy
 from nextview.benchmark.statistics import holm, interval, mcnemar, resample
 from nextview.checks import extras
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.data.metrics import ratio
 from nextview.data.predictions import Predictions
 from nextview.errors import UsageError

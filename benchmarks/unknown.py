@@ -23,7 +23,7 @@ import tyro
 from numpy.typing import NDArray
 
 from nextview.benchmark.statistics import interval, resample
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
 from nextview.data.store import ViewStore
 from nextview.recognition.belief import log_evidence_of

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from nextview.cli.ending import require
+from nextview.cli.exit_status import require
 
 require("benchmark")
 
@@ -21,7 +21,7 @@ import tyro
 
 from nextview.benchmark.evaluation import baselines
 from nextview.benchmark.statistics import interval, resample
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
 from nextview.data.measures import normalise_per_object
 from nextview.data.metrics import map_scores, ratio

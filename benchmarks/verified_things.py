@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 from scipy.spatial import cKDTree
 
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.observation import Observation

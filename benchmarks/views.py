@@ -17,7 +17,7 @@ from itertools import pairwise, product
 from pathlib import Path
 from typing import Literal
 
-from nextview.cli.ending import require
+from nextview.cli.exit_status import require
 
 require("benchmark")
 
@@ -35,7 +35,7 @@ from nextview.benchmark.entries import EpisodeSpecs, entry_policy, knows_truth
 from nextview.benchmark.figures import COLOURS, OWN
 from nextview.benchmark.replay import Grid, make_specs, run_grid
 from nextview.benchmark.views import CEILING, as_rows, by_key, markdown, measured
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
 from nextview.data.predictions import Predictions
 from nextview.errors import UsageError

@@ -15,7 +15,7 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 import nextview
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.geometry.ray_caster import RayCaster, pixel_rays
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.sensing import Frame

@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 import nextview
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.errors import MissingExtraError
 from nextview.sensing import ObservedObject
 

@@ -28,7 +28,7 @@ from nextview.simulation.sensor import SENSORS, Sensor
 from research.extras import extras
 
 if TYPE_CHECKING:
-    from nextview.session.recognition import Recognition
+    from nextview.session.result import Recognition
     from nextview.session.session import Session
 
 Float = NDArray[np.float64]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from nextview.cli.ending import require
+from nextview.cli.exit_status import require
 
 require("benchmark")
 
@@ -24,7 +24,7 @@ from nextview.benchmark.evaluation import judged_objects
 from nextview.benchmark.page import words
 from nextview.benchmark.run import chosen_split
 from nextview.benchmark.true_maps import known_maps, true_map
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import console
 from nextview.data.predictions import Predictions
 from nextview.errors import ResultsError

@@ -3,7 +3,7 @@
 from contextlib import AbstractContextManager
 
 from nextview import checks
-from nextview.cli import ending
+from nextview.cli import exit_status
 
 EXTRAS = {  # packages by the optional part, as in pyproject.toml, that brings them
     "ap-gym": ("ap_gym", "gymnasium"),
@@ -16,9 +16,9 @@ PROJECT = "./research"
 
 def require(extra: str) -> None:
     """End a script with the sentence that says what to install, see
-    ``nextview.cli.ending.require``.
+    ``nextview.cli.exit_status.require``.
     """
-    ending.require(extra, EXTRAS, PROJECT)
+    exit_status.require(extra, EXTRAS, PROJECT)
 
 
 def extras() -> AbstractContextManager[None]:

@@ -31,7 +31,7 @@ from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
 import nextview
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import azimuth_of, look_at_origin

@@ -16,17 +16,17 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.data.predictions import Predictions
 from nextview.data.splits import divide
 from nextview.errors import PredictionsError, UsageError
 from nextview.files import check_new, command, sha256_of
-from nextview.learning.card_fits import calibration_of
-from nextview.learning.fitting_set import blind_walks, for_fitting
 from nextview.policies.base import Scope
 from nextview.policies.learned_tables import FixedRing, cells_from, cells_to
 from nextview.policies.policy_card import LearnedFrom, PolicyCard, write_policy_card
 from nextview.recognition.belief import Calibration, of_true_class
+from nextview.training.card_fits import calibration_of
+from nextview.training.fitting_set import blind_walks, for_fitting
 
 Float = NDArray[np.float64]
 VARIANTS: tuple[tuple[str, Scope], ...] = (("", "global"), ("-local", "local"), ("-near", "global"))

@@ -12,7 +12,7 @@ import resource
 from collections.abc import Iterator, Sequence
 from time import perf_counter
 
-from nextview.cli.ending import require
+from nextview.cli.exit_status import require
 
 require("large")
 
@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 import nextview
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.recognition.novelty import unit
 from nextview.things.approximate import NearestViews
 from nextview.things.memory import AZIMUTHS, TaughtRecogniser, by_ring, ring_shares, similarities

@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from nextview.cli.ending import orderly_end
+from nextview.cli.common_options import check_file
+from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import console
-from nextview.cli.sources import check_file
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.files import new_file

@@ -29,7 +29,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from nextview.cli.ending import require
+from nextview.cli.exit_status import require
 
 require("benchmark")
 
@@ -46,7 +46,7 @@ from nextview.benchmark.page import write_figures
 from nextview.benchmark.replay import make_specs, replay
 from nextview.benchmark.statistics import holm, interval, mcnemar, resample
 from nextview.benchmark.true_maps import true_map, true_measure
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import console, follow, track
 from nextview.data import predicting
 from nextview.data.measures import measure
@@ -56,10 +56,10 @@ from nextview.data.splits import sample
 from nextview.data.store import ViewStore
 from nextview.errors import UsageError
 from nextview.files import new_file
-from nextview.learning.card_fits import valley_gains
 from nextview.recognition.map_names import map_name
 from nextview.recognition.model_card import find_card, find_models
 from nextview.session.style import BLUE, INK, STYLE, PlainFigure, to_png
+from nextview.training.card_fits import valley_gains
 from research.measure import measure as measure_meshes
 
 Split = Literal["train", "test"]

@@ -15,7 +15,7 @@ import tyro
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import console, track
 from nextview.data.measures import normalise_per_object
 from nextview.data.pool import WorkerDied, each

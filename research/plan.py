@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import follow, say_done
 from nextview.data.measures import Made, keep
 from nextview.data.scene_views import SceneSight, scene_views, sight_of

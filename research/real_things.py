@@ -15,7 +15,7 @@ import tyro
 from PIL import Image
 
 import nextview
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.sensing import Frame, ObservedObject
 
 INTRINSICS = np.array([[618.017, 0, 312.377], [0, 618.003, 232.375], [0, 0, 1.0]])

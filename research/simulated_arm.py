@@ -22,7 +22,7 @@ import numpy as np
 import tyro
 
 import nextview
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
 from nextview.data.folders import list_dataset
 from nextview.geometry.viewsphere import Viewpoints

@@ -20,7 +20,7 @@ from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
 
-from nextview.cli.ending import require
+from nextview.cli.exit_status import require
 
 require("train")
 
@@ -33,19 +33,19 @@ from onnx import TensorProto, compose, helper, numpy_helper, utils
 from torch import nn
 from torch.nn import functional as F
 
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.data.folders import list_dataset
 from nextview.files import sha256_of
 from nextview.geometry.mesh import load_mesh, make_mesh
 from nextview.geometry.viewsphere import look_at_origin
-from nextview.learning.architectures import LiteNet
-from nextview.learning.export import export_onnx
-from nextview.learning.runs import start_from
 from nextview.recognition.inference import FEATURES_OUTPUT, OnnxFile, open_onnx
 from nextview.recognition.model_card import BUNDLED, RECOGNISER, find_card, read_card
 from nextview.recognition.network_input import from_observations
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.training.architectures import LiteNet
+from nextview.training.export import export_onnx
+from nextview.training.runs import start_from
 
 VIEWS = 16
 SETUP = 8

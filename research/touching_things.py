@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 
 import nextview
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.simulation.robot_camera import Named, RobotCamera
 from nextview.simulation.scene import (
     build_scene,

@@ -26,17 +26,17 @@ import tyro
 from numpy.typing import NDArray
 
 from nextview.benchmark.environments import Rules, TaskVectorEnv, replayed
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import console, track
 from nextview.data.predictions import Predictions
 from nextview.data.progress import Track, silently
 from nextview.errors import UsageError
 from nextview.files import check_new, command, sha256_of
-from nextview.learning.fitting_set import for_fitting, hold_out
-from nextview.learning.gain_training import Perceptrons, Score, write_gain
-from nextview.learning.rollout import ReplayTable, Value, judge, rollout
 from nextview.policies.gain import Gain, features
 from nextview.policies.policy_card import LearnedFrom, PolicyCard
+from nextview.training.fitting_set import for_fitting, hold_out
+from nextview.training.gain_training import Perceptrons, Score, write_gain
+from nextview.training.rollout import ReplayTable, Value, judge, rollout
 from research.stable_baselines import MVSELECT, AgentRecipe, Layers, learn, learner
 
 

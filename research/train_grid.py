@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from nextview.cli.ending import require
+from nextview.cli.exit_status import require
 
 require("train")
 require("benchmark")
@@ -26,18 +26,18 @@ from numpy.typing import NDArray
 from torch import nn
 
 from nextview.benchmark.published import published_recognisers, read_rows
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track as progress
 from nextview.data.progress import Track, silently
 from nextview.data.store import ViewStore
 from nextview.errors import ResultsError, UsageError
 from nextview.files import new_file
-from nextview.learning.export import run_network
-from nextview.learning.inputs import PackedViews, load_inputs
-from nextview.learning.recipes import THESIS_RECOGNISER, Hardware, RecogniserRecipe
-from nextview.learning.recogniser_training import train_recogniser
-from nextview.learning.runs import is_first
 from nextview.session.style import ACCENT, BLUE, legend, new_figure, percent_axis, to_png
+from nextview.training.export import run_network
+from nextview.training.inputs import PackedViews, load_inputs
+from nextview.training.recipes import THESIS_RECOGNISER, Hardware, RecogniserRecipe
+from nextview.training.recogniser_training import train_recogniser
+from nextview.training.runs import is_first
 from research.training_curves import draw_curves
 
 TABLE = "grid.csv"

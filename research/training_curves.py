@@ -14,7 +14,7 @@ import tyro
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.errors import ResultsError
 from nextview.files import new_file
 from nextview.session.style import ACCENT, INK, LIGHT_BLUE, STYLE, PlainFigure, to_png

@@ -17,9 +17,9 @@ from filelock import FileLock
 from hypothesis import settings
 
 from nextview.data.samples import sample_mesh
-from nextview.learning.learn import learn
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import MapNetwork, Models, NetworkRecogniser
+from nextview.teaching.learn import learn
 
 LONG = ("test_workflow.py", "test_training.py")
 """Files that take longest: begun first, no process is left alone with one at the end."""

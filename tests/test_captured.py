@@ -15,17 +15,17 @@ from pipeline import refused
 from scipy.spatial.transform import Rotation
 
 import nextview
+from nextview.captured.camera import CapturedCamera
+from nextview.captured.check import check_capture
+from nextview.captured.folders import read_box, read_capture
+from nextview.captured.writing import write_capture
 from nextview.cli.main import main
 from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError
 from nextview.geometry.ray_caster import RayCaster, pixel_rays
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
-from nextview.learning.learn import learn
-from nextview.simulation.captured import read_box, read_capture
-from nextview.simulation.captured_camera import CapturedCamera
-from nextview.simulation.captured_check import check_capture
-from nextview.simulation.capturing import write_capture
 from nextview.simulation.scene import square
+from nextview.teaching.learn import learn
 
 TWELVE = ViewSphere.named("12")
 RADIUS = 0.55

@@ -20,7 +20,7 @@ from rich.console import Console
 
 from nextview.checks import EXTRAS, extras
 from nextview.cli import progress
-from nextview.cli.call import find
+from nextview.cli.call_with_arguments import find
 from nextview.cli.commands import COMMANDS
 from nextview.cli.main import main
 from nextview.cli.predict import summed_up
@@ -121,9 +121,9 @@ def test_a_misspelt_command_is_guessed(words, meant, capsys):
 
 @pytest.mark.parametrize("preset", [None, "thesis"])
 def test_a_preset_sets_defaults_that_options_change(preset, monkeypatch):
-    stage = pytest.importorskip("nextview.learning.recogniser_training")
+    stage = pytest.importorskip("nextview.training.recogniser_training")
     kind, called = stage.RecogniserRecipe, []
-    recipe = find("nextview.learning.recipes:THESIS_RECOGNISER") if preset else kind()
+    recipe = find("nextview.training.recipes:THESIS_RECOGNISER") if preset else kind()
 
     def train(store: str, out: str, recipe: kind = kind()) -> list[str]:
         called.append(recipe)
@@ -227,9 +227,9 @@ PathFinder.find_spec = staticmethod(find)
         ("from nextview.benchmark.report import report", "benchmark"),
         ("from nextview.benchmark.evaluation_page import write_evaluation", "benchmark"),
         ("from nextview.viewers.page import Page", "explore"),
-        ("from nextview.learning.recogniser_training import train_recogniser", "train"),
-        ("from nextview.learning.export import export_map", "train"),
-        ("from nextview.learning.gain_training import train_gain", "train"),
+        ("from nextview.training.recogniser_training import train_recogniser", "train"),
+        ("from nextview.training.export import export_map", "train"),
+        ("from nextview.training.gain_training import train_gain", "train"),
         (
             (
                 "from nextview.data.pool import each; list(each(print, [1], None,"

@@ -159,7 +159,7 @@ print("torch" in sys.modules)
 def test_every_module_imports_in_the_base_installation_or_names_its_extra(base):
     *missing, torch_is_there = in_base(base, IMPORT_ALL).splitlines()
     assert torch_is_there == "False"
-    assert any(line.startswith("nextview.learning.export ") for line in missing)
+    assert any(line.startswith("nextview.training.export ") for line in missing)
     for line in missing:
         named = [extra for extra in EXTRAS if line.endswith(f": pip install 'nextview[{extra}]'")]
         assert len(named) == 1, line

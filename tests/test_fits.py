@@ -17,18 +17,6 @@ from nextview.data.samples import sample_mesh
 from nextview.data.splits import divide
 from nextview.errors import DatasetError, ModelError, PredictionsError, ResultsError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.learning import card_fits as calibration
-from nextview.learning.card_fits import (
-    error_bound,
-    fit_calibration,
-    fit_risk,
-    fit_temperature,
-    loss,
-    valley_gains,
-)
-from nextview.learning.fitting_set import blind_walks, card_to_fit
-from nextview.learning.teaching import embeddings
-from nextview.learning.unknown import fit_novelty, fit_unknown
 from nextview.policies.baselines import Random
 from nextview.policies.learned_tables import ClassTable, cells_from, cells_to
 from nextview.policies.registry import make_policy
@@ -36,6 +24,18 @@ from nextview.recognition.belief import PLAIN_SUM, Calibration
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import values_of
+from nextview.teaching.thing_views import embeddings
+from nextview.training import card_fits as calibration
+from nextview.training.card_fits import (
+    error_bound,
+    fit_calibration,
+    fit_risk,
+    fit_temperature,
+    loss,
+    valley_gains,
+)
+from nextview.training.fitting_set import blind_walks, card_to_fit
+from nextview.training.unknown import fit_novelty, fit_unknown
 from research.fit_policies import fit_class_table, fit_policies, fit_ring, fit_sequence, fitting_set
 
 SPHERE = ViewSphere.named("40")

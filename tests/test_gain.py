@@ -19,17 +19,6 @@ from nextview.cli.main import main
 from nextview.data.predictions import Predictions
 from nextview.data.samples import sample_mesh
 from nextview.errors import ModelError, SessionError
-from nextview.learning.gain_training import Perceptrons, Score, best_epoch, train, write_gain
-from nextview.learning.recipes import GainRecipe
-from nextview.learning.rollout import (
-    OBJECTIVES,
-    ReplayTable,
-    candidate_values,
-    fit_travel_weight,
-    judge,
-    rollout,
-    value_after,
-)
 from nextview.policies.base import Evidence
 from nextview.policies.baselines import Random, RandomAll
 from nextview.policies.gain import Gain, features, mirrored, mirrored_features
@@ -38,6 +27,17 @@ from nextview.policies.policy_card import PolicyCard
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import Calibration
 from nextview.session.session import Session
+from nextview.training.gain_training import Perceptrons, Score, best_epoch, train, write_gain
+from nextview.training.recipes import GainRecipe
+from nextview.training.rollout import (
+    OBJECTIVES,
+    ReplayTable,
+    candidate_values,
+    fit_travel_weight,
+    judge,
+    rollout,
+    value_after,
+)
 
 CLASSES = 4
 MAPS = ("lem", "lcm", "mine:clutter", "view_area", "lem-sphere", "lcm-sphere", "view_area-sphere")

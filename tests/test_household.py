@@ -8,7 +8,7 @@ import trimesh
 from pipeline import box
 
 import nextview
-from nextview.learning.learn import learn
+from nextview.teaching.learn import learn
 
 pytestmark = pytest.mark.long
 

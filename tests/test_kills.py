@@ -72,8 +72,8 @@ LEARN = """
 import shutil
 import numpy as np
 from types import SimpleNamespace
-from nextview.learning import learn as module
-from nextview.learning.learn import learn
+from nextview.teaching import learn as module
+from nextview.teaching.learn import learn
 from nextview.things.memory import AZIMUTHS, RINGS, open_memory
 from nextview.recognition.novelty import unit
 
@@ -152,8 +152,8 @@ CAPTURE = """
 import shutil
 from nextview.data.samples import sample_mesh
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.simulation.captured import is_capture
-from nextview.simulation.capturing import write_capture
+from nextview.captured.folders import is_capture
+from nextview.captured.writing import write_capture
 
 folder = Path(sys.argv[1])
 old, new, out = folder / "old", folder / "new", folder / "place/out"

@@ -20,7 +20,6 @@ from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
-from nextview.learning.learn import learn
 from nextview.policies.base import EpisodeState
 from nextview.policies.discriminate import Discriminate
 from nextview.recognition.belief import Calibration, Stopping, log_evidence_of, reorient
@@ -28,6 +27,7 @@ from nextview.recognition.evidence import Evidence
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.teaching.learn import learn
 from nextview.things.approximate import NearestViews
 from nextview.things.memory import AZIMUTHS, RINGS, by_ring, open_memory, similarities
 from nextview.viewers.card import preview_card, walk_card

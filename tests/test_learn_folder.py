@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-import nextview.learning.learn as learning
+import nextview.teaching.learn as teaching
 from nextview import learn
 from nextview.cli.main import main
 from nextview.errors import DatasetError, UsageError
-from nextview.learning.learned_picture import draw_learned
-from nextview.learning.sizes import check_sizes
-from nextview.learning.things import find_things
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
+from nextview.teaching.learned_picture import draw_learned
+from nextview.teaching.sizes import check_sizes
+from nextview.teaching.thing_sources import find_things
 from nextview.things.memory import AZIMUTHS, RINGS
 
 FEATURES = 256
@@ -43,7 +43,7 @@ def quickly(monkeypatch):
             "pictures": rng.integers(0, 255, (64, 64)).astype(np.uint8),
         }
 
-    monkeypatch.setattr(learning, "teach", drawn)
+    monkeypatch.setattr(teaching, "teach", drawn)
 
 
 def scans_in(folder: Path, *names: str) -> Path:
@@ -141,7 +141,7 @@ def test_a_value_that_makes_no_sense_is_refused_before_anything_is_taught(
     def teach(*arguments):
         raise AssertionError("a thing was taught")
 
-    monkeypatch.setattr("nextview.learning.learn.teach", teach)
+    monkeypatch.setattr("nextview.teaching.learn.teach", teach)
     scans_in(tmp_path / "things", "box.ply", "tin.ply")
     with pytest.raises(UsageError, match=re.escape(str(value).rpartition(":")[2])):
         learn(tmp_path / "things", tmp_path / "mine", **({"workers": 0} | {option: value}))

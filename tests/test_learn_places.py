@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from pipeline import SAMPLE_FILES
 
+from nextview.captured.writing import write_capture
 from nextview.data.predicting import predict
 from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError, ModelError, ResultsError, UsageError
 from nextview.files import MARKER, new_folder, only_one
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.learning import learn as module
-from nextview.learning.learn import learn
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
-from nextview.simulation.capturing import write_capture
+from nextview.teaching import learn as module
+from nextview.teaching.learn import learn
 from nextview.things.memory import AZIMUTHS, RINGS, open_memory
 
 

@@ -18,7 +18,7 @@ from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh, mesh_warnings
 from nextview.geometry.mesh_parts import mesh_doubts
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.learning import teaching
+from nextview.teaching import thing_views
 
 NOISE = np.random.default_rng(0)
 
@@ -286,15 +286,15 @@ def test_what_is_taught_of_a_scan_says_what_is_odd_about_it(tmp_path, monkeypatc
     def no_embeddings(observations):  # what they are does not matter here, and they take time
         return np.zeros((len(observations), 4), np.float32)
 
-    monkeypatch.setattr(teaching, "embeddings", no_embeddings)
+    monkeypatch.setattr(thing_views, "embeddings", no_embeddings)
     path = saved(tmp_path / "scan.ply", joined(thing(), disc(0.4)))
     radii = []
     for largest, sentence in (
         (False, "it has 2 parts"),
         (True, "the largest of its 2 parts was taken"),
     ):
-        taught = teaching.teach(
-            path, "egg", teaching.How(unit="m", upright=True, largest_part=largest)
+        taught = thing_views.teach(
+            path, "egg", thing_views.TeachingOptions(unit="m", upright=True, largest_part=largest)
         )
         assert taught["doubts"].tobytes().decode().startswith(sentence)
         radii.append(float(taught["radii"][0]))

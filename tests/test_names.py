@@ -13,7 +13,7 @@ from pipeline import benchmark, refused, some_predictions
 
 from nextview.benchmark.figures import confusion_matrix
 from nextview.benchmark.report import report
-from nextview.cli.ending import printable
+from nextview.cli.exit_status import printable
 from nextview.cli.main import main
 from nextview.data.folders import list_dataset
 from nextview.errors import DatasetError

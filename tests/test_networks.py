@@ -14,9 +14,9 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from nextview.errors import ModelError
-from nextview.learning.architectures import InvertedBottleneck, LiteNet, PointNet, ResNet
-from nextview.learning.export import export_onnx
-from nextview.learning.runs import start_from
+from nextview.training.architectures import InvertedBottleneck, LiteNet, PointNet, ResNet
+from nextview.training.export import export_onnx
+from nextview.training.runs import start_from
 
 LITE0 = ((16, 3, 1), (24, 3, 2), (40, 5, 2), (80, 3, 3), (112, 5, 3), (192, 5, 4), (320, 3, 1))
 """Width, kernel and blocks of the stages of EfficientNet-Lite0."""

@@ -127,7 +127,7 @@ def test_each_page_names_what_its_commands_need():
 
 def test_a_command_has_nothing_but_what_it_needs(tmp_path):
     environments = documented_commands.Environments(tmp_path / "environments")
-    asked = "python -c 'import nextview.learning.export'"
+    asked = "python -c 'import nextview.training.export'"
     status, said, _ = environments.run(asked, tmp_path)
     assert status == 1
     assert "pip install 'nextview[train]'" in said

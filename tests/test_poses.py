@@ -22,13 +22,13 @@ from nextview.errors import SessionError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh
 from nextview.geometry.ray_caster import RayCaster, pixel_rays
 from nextview.geometry.resting import rotated
-from nextview.learning.learn import learn
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.recognition.belief import FixedLength
 from nextview.recognition.poses import PoseCandidate, uncertainty_of
 from nextview.sensing import Frame
 from nextview.session.episode_figure import draw_episode, without_specks
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.teaching.learn import learn
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.recogniser import VerifiedRecogniser
 from nextview.things.taught import TaughtThings

@@ -229,8 +229,8 @@ def test_views_without_the_target_are_no_evidence(predictions):
 
 
 def test_gain_learns_in_scenes_what_to_make_of_what_shows(predictions, tmp_path):
-    from nextview.learning.gain_training import train_gain
-    from nextview.learning.recipes import GainRecipe
+    from nextview.training.gain_training import train_gain
+    from nextview.training.recipes import GainRecipe
 
     train = np.array(["train"] * len(predictions))
     replace(predictions, splits=train).save(tmp_path / "p.npz")

@@ -17,10 +17,10 @@ from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.learning.card_fits import ANY_SIZE, RADII, densities, fit_weight
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import read_card
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.training.card_fits import ANY_SIZE, RADII, densities, fit_weight
 
 SPHERE = ViewSphere.named("40")
 CLASSES = ["big", "small"]

@@ -21,25 +21,25 @@ from nextview.data.store import ViewStore
 from nextview.errors import ModelError, ResultsError, UsageError
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.learning import recogniser_training as training
-from nextview.learning.architectures import ResNet, ViewMap
-from nextview.learning.export import export_map, export_recogniser, run_network
-from nextview.learning.fitting_set import hold_out
-from nextview.learning.inputs import load_inputs
-from nextview.learning.map_training import Windows, train_map
-from nextview.learning.recipes import (
+from nextview.recognition.inference import MapNetwork, NetworkRecogniser
+from nextview.recognition.model_card import read_card
+from nextview.recognition.network_input import InputSpec, from_store
+from nextview.simulation.simulated import SimulatedCamera
+from nextview.training import recogniser_training as training
+from nextview.training.architectures import ResNet, ViewMap
+from nextview.training.export import export_map, export_recogniser, run_network
+from nextview.training.fitting_set import hold_out
+from nextview.training.inputs import load_inputs
+from nextview.training.map_training import Windows, train_map
+from nextview.training.recipes import (
     THESIS_MAP,
     THESIS_RECOGNISER,
     Hardware,
     MapRecipe,
     RecogniserRecipe,
 )
-from nextview.learning.recogniser_training import Source, Views, train_recogniser
-from nextview.learning.runs import fit, load_run, read_run, start_from
-from nextview.recognition.inference import MapNetwork, NetworkRecogniser
-from nextview.recognition.model_card import read_card
-from nextview.recognition.network_input import InputSpec, from_store
-from nextview.simulation.simulated import SimulatedCamera
+from nextview.training.recogniser_training import StoredInputs, Views, train_recogniser
+from nextview.training.runs import fit, load_run, read_run, start_from
 from research.training_curves import read_log
 
 V = 5
@@ -60,7 +60,7 @@ SMALL_MAP = MapRecipe(size=32, epochs=1, views_per_object=2, batch=4, validation
 def views_of(recipe, objects=6, views=V):
     """Inputs whose pixels say which object and view they are."""
     which = np.arange(objects * views, dtype=np.uint8).reshape(objects, views, 1, 1, 1)
-    source = Source(np.broadcast_to(which, (objects, views, 4, 2, 2)), np.arange(objects))
+    source = StoredInputs(np.broadcast_to(which, (objects, views, 4, 2, 2)), np.arange(objects))
     return Views([source], np.arange(objects), np.arange(objects) % 2, recipe)
 
 
@@ -78,7 +78,7 @@ def test_balanced_draws_even_out_the_classes():
     labels = np.repeat([0, 1], [90, 10])
     inputs = np.zeros((100, V, 1, 1, 1), np.uint8)
     recipe = RecogniserRecipe(views_per_object=100, batch=100)
-    views = Views([Source(inputs, np.arange(100))], np.arange(100), labels, recipe)
+    views = Views([StoredInputs(inputs, np.arange(100))], np.arange(100), labels, recipe)
     seen = np.concatenate([label for _, label in views])
     share = 10**0.5 / (10**0.5 + 90**0.5)  # a class of n objects is drawn with weight n / sqrt(n)
     assert (seen == 1).mean() == pytest.approx(
@@ -89,7 +89,7 @@ def test_balanced_draws_even_out_the_classes():
 def test_objects_without_a_deformed_twin_are_seen_as_they_are():
     own, twins = (np.full((2, 40, 1, 1, 1), k, np.uint8) for k in (0, 1))
     recipe = RecogniserRecipe(views_per_object=2000, batch=50, deformed_share=0.5, balanced=False)
-    sources = [Source(own, np.arange(2)), Source(twins, np.array([-1, 0]))]
+    sources = [StoredInputs(own, np.arange(2)), StoredInputs(twins, np.array([-1, 0]))]
     views = Views(sources, np.arange(2), np.arange(2), recipe)
     drawn = [[x.numpy() for x in batch] for batch in views]
     images, labels = (np.concatenate(part).ravel() for part in zip(*drawn, strict=True))
@@ -212,7 +212,7 @@ def data(classes=3, objects=12, views=5, size=32):
         rng.integers(1, 200, (objects, views, 4, size, size))
         + 20 * labels[:, None, None, None, None]
     )
-    return [Source(inputs.astype(np.uint8), np.arange(objects))], labels
+    return [StoredInputs(inputs.astype(np.uint8), np.arange(objects))], labels
 
 
 class SmallNet(torch.nn.Module):

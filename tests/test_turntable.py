@@ -9,13 +9,13 @@ import pytest
 from PIL import Image
 
 import nextview
+from nextview.captured.turntable import read_turntable
 from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError
 from nextview.geometry.ray_caster import RayCaster, pixel_rays
 from nextview.geometry.viewsphere import look_at_origin
-from nextview.learning.learn import learn
 from nextview.simulation.scene import square
-from nextview.simulation.turntable import read_turntable
+from nextview.teaching.learn import learn
 
 RADIUS, N, SHAPE = 0.3, 24, (240, 320)
 K = np.array([[262.5, 0, 159.5], [0, 262.5, 119.5], [0, 0, 1]])  # first pixel's centre at 0

@@ -22,7 +22,6 @@ from nextview.data.samples import sample_mesh
 from nextview.files import sha256_of
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.observation import SceneView
-from nextview.learning.unknown import quantiles
 from nextview.recognition.novelty import (
     NEIGHBOUR,
     Novelty,
@@ -32,6 +31,7 @@ from nextview.recognition.novelty import (
     read_novelty,
 )
 from nextview.sensing import Frame, ObservedObject
+from nextview.training.unknown import quantiles
 
 
 def some_score(rng, f=7, neighbours=40, objects=50, levels=31, n_views=4) -> Novelty:

@@ -8,15 +8,15 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from nextview.captured.camera import CapturedCamera
+from nextview.captured.folders import read_capture
+from nextview.captured.writing import write_capture
 from nextview.errors import MeshError, ModelError, ObservationError
 from nextview.geometry.mesh import Mesh, load_mesh, make_mesh
 from nextview.geometry.observation import Observation, SceneView
 from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin, rotation_z
-from nextview.simulation.captured import read_capture
-from nextview.simulation.captured_camera import CapturedCamera
-from nextview.simulation.capturing import write_capture
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, MetricImage, depth_view
 from nextview.things.fusion import fuse

@@ -9,7 +9,8 @@ import pytest
 import trimesh
 
 import nextview
-from nextview.learning.verification_fit import (
+from nextview.recognition.model_card import read_card
+from nextview.teaching.verification_fit import (
     DEFAULT_THINGS,
     Shown,
     as_stored,
@@ -18,7 +19,6 @@ from nextview.learning.verification_fit import (
     to_be_shown,
     with_new_things,
 )
-from nextview.recognition.model_card import read_card
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.taught import TaughtThings, residuals_of
 from nextview.things.unknown import KnownResiduals

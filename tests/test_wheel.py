@@ -31,7 +31,7 @@ EXAMPLES = {
         " report"
     ),
     "cluster": "from distributed import LocalCluster; import nextview.data.pool",
-    "train": "import lightning, torch; from nextview.learning import export, runs",
+    "train": "import lightning, torch; from nextview.training import export, runs",
     "workflow": "import snakemake",
     "explore": "import viser; from nextview.viewers.exploration import Exploration",
     "browser": "import playwright",

@@ -15,7 +15,7 @@ from math import isfinite
 from pathlib import Path
 from textwrap import wrap
 
-from nextview.cli.ending import require
+from nextview.cli.exit_status import require
 
 require("benchmark")
 

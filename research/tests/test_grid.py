@@ -6,7 +6,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from nextview.learning.recipes import RecogniserRecipe
+from nextview.training.recipes import RecogniserRecipe
 from research import train_grid
 from research.train_grid import published_cells
 

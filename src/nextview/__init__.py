@@ -33,7 +33,7 @@ from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import Stopping
 from nextview.recognition.inference import Models
-from nextview.session.recognition import Recognition
+from nextview.session.result import Recognition
 from nextview.session.session import Session
 from nextview.session.system import System, load, recognise
 from nextview.session.view import View
@@ -87,7 +87,7 @@ def __getattr__(name: str) -> Any:
 
         return SimulatedCamera
     if name == "learn":
-        from nextview.learning.learn import learn
+        from nextview.teaching.learn import learn
 
         return learn
     raise AttributeError(f"module 'nextview' has no attribute {name!r}")

@@ -23,7 +23,6 @@ from nextview.data.samples import SAMPLES, sample_mesh
 from nextview.errors import DatasetError, PredictionsError, SessionError, UsageError
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.learning.rollout import OBJECTIVES, value_of
 from nextview.policies.base import EpisodeState
 from nextview.policies.gain import (
     INPUTS,
@@ -43,6 +42,7 @@ from nextview.recognition.map_names import in_order
 from nextview.recognition.model_card import find_models
 from nextview.session.episode import Episodes
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.training.rollout import OBJECTIVES, value_of
 
 with extras():
     import gymnasium
@@ -51,7 +51,7 @@ with extras():
 
 log = logging.getLogger(__name__)
 Rows = NDArray[np.int64]
-Source = str | Path | Predictions
+PredictionsSource = str | Path | Predictions
 CAMERAS = 16  # meshes that are kept ready to be looked at
 _HERE = "nextview.benchmark.environments"
 gymnasium.register(
@@ -197,7 +197,10 @@ class Task:
 
 
 def replayed(
-    predictions: Source, split: Split = "train", balanced: bool = False, rules: Rules = Rules()
+    predictions: PredictionsSource,
+    split: Split = "train",
+    balanced: bool = False,
+    rules: Rules = Rules(),
 ) -> Task:
     """The task of recognising the objects of one split, each shape once for "train"; None takes all
     objects.
@@ -382,7 +385,11 @@ class RecogniseEnv(TaskEnv):
     """
 
     def __init__(
-        self, predictions: Source, split: Split = "train", balanced: bool = False, **rules: Any
+        self,
+        predictions: PredictionsSource,
+        split: Split = "train",
+        balanced: bool = False,
+        **rules: Any,
     ) -> None:
         super().__init__(replayed(predictions, split, balanced, Rules(**rules)))
 
@@ -473,7 +480,7 @@ class RecogniseVectorEnv(TaskVectorEnv):
     def __init__(
         self,
         num_envs: int,
-        predictions: Source,
+        predictions: PredictionsSource,
         split: Split = "train",
         balanced: bool = False,
         **rules: Any,

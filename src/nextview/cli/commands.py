@@ -25,9 +25,10 @@ class Command:
 
 
 CLI = "nextview.cli"
-LEARNING = "nextview.learning"
-THESIS = f"{LEARNING}.recipes:THESIS"
-EXPORT = f"{LEARNING}.export:export"
+TEACHING = "nextview.teaching"
+TRAINING = "nextview.training"
+THESIS = f"{TRAINING}.recipes:THESIS"
+EXPORT = f"{TRAINING}.export:export"
 EXPORTED = (
     "{found.card}: largest difference between torch and ONNX on real views {found.difference:.2g}"
 )
@@ -37,7 +38,7 @@ COMMANDS = {  # by name, in the order in which they are listed
     ),
     "demo": Command(f"{CLI}.recognise:demo", "recognise a sample object, and draw the episode"),
     "learn": Command(
-        f"{LEARNING}.learn:learn_things",
+        f"{TEACHING}.learn:learn_things",
         "teach it your things: scans, or depth frames; minutes",
         "{found}\nnext: nextview recognise MESH --models {out}; what was learned is drawn in"
         " {out}/learned.png",
@@ -60,19 +61,19 @@ COMMANDS = {  # by name, in the order in which they are listed
     "check": Command(f"{CLI}.stores:check", "check that a view store is sound"),
     "measure": Command(f"{CLI}.stores:measure", "compute view measures, into the store"),
     "train recogniser": Command(
-        f"{LEARNING}.recogniser_training:train_recogniser",
+        f"{TRAINING}.recogniser_training:train_recogniser",
         "train a recogniser",
         "next: nextview export recogniser {out} {store} MODELS",
         thesis=f"{THESIS}_RECOGNISER",
     ),
     "train map": Command(
-        f"{LEARNING}.map_training:train_map",
+        f"{TRAINING}.map_training:train_map",
         "train a network that predicts a measure of views",
         "next: nextview export map {out} {store} MODELS",
         thesis=f"{THESIS}_MAP",
     ),
     "train gain": Command(
-        f"{LEARNING}.gain_training:train_gain",
+        f"{TRAINING}.gain_training:train_gain",
         "train the policy that predicts the gain of a view",
         "learned from {found.objects} objects; on {found.validated_on} the {recipe.objective} after"
         " 2, 3, ... views is {found.value} at travel weight 0; travel weight"
@@ -85,27 +86,27 @@ COMMANDS = {  # by name, in the order in which they are listed
     "export map": Command(f"{EXPORT}_map", "turn a trained map network into a model", EXPORTED),
     "predict": Command(f"{CLI}.predict:predict", "run the models over every view of a store, once"),
     "fit calibration": Command(
-        f"{LEARNING}.card_fits:fit_calibration",
+        f"{TRAINING}.card_fits:fit_calibration",
         "calibrate a recogniser's belief",
         "{found.objects} objects: temperature of one view {found.calibration.temperature},"
         " correlation of two views {found.calibration.correlation}; negative log-likelihood over 1"
         " to 5 views {found.before:.3f} before, {found.after:.3f} after",
     ),
     "fit size": Command(
-        f"{LEARNING}.card_fits:fit_size",
+        f"{TRAINING}.card_fits:fit_size",
         "learn how large the objects of each class are",
         "sizes of {found.objects} objects; by {found.weighed_on} others, weight beside the logits"
         " {found.size.weight:.2f}; negative log-likelihood of single views {found.before:.3f} by"
         " shape alone, {found.after:.3f} with the size",
     ),
     "fit unknown": Command(
-        f"{LEARNING}.unknown:fit_unknown",
+        f"{TRAINING}.unknown:fit_unknown",
         "learn to notice objects of no known class",
         "views of {found.objects} known objects; false-alarm rates by {found.held_out} others; "
         "meshes left out: {found.left_out}",
     ),
     "fit valleys": Command(
-        f"{LEARNING}.card_fits:fit_valleys",
+        f"{TRAINING}.card_fits:fit_valleys",
         "find classes whose best views are a map's valleys",
         "{found.objects} objects: the valley is better for these classes: {found.classes}",
     ),

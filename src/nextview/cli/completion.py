@@ -4,7 +4,7 @@ from typing import Literal
 
 from tyro.extras import SubcommandApp
 
-from nextview.cli.call import CONFIG, entry
+from nextview.cli.call_with_arguments import CONFIG, entry
 from nextview.cli.stand_ins import stand_ins
 
 

@@ -10,9 +10,9 @@ from rich.console import JustifyMethod
 from rich.table import Table
 from rich.text import Text
 
-from nextview.cli.ending import printable
+from nextview.cli.exit_status import printable
 from nextview.cli.progress import Terminal
-from nextview.session.recognition import Recognition
+from nextview.session.result import Recognition
 
 SHOWN_POSES = 5  # beside the likeliest
 

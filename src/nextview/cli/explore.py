@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Literal
 
 from nextview.checks import extras
+from nextview.cli.common_options import EpisodeOptions, Unit
 from nextview.cli.progress import console
-from nextview.cli.sources import Looking, Unit
 
 
 def explore(
     path: Path | None = None,
     /,
-    looking: Looking = Looking(),
+    looking: EpisodeOptions = EpisodeOptions(),
     compare: str | None = None,
     sensor: str | None = None,
     start: int | None = None,

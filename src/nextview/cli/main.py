@@ -8,7 +8,7 @@ from itertools import takewhile
 from nextview import __version__
 from nextview.checks import did_you_mean
 from nextview.cli.commands import COMMANDS, RESUMES
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.errors import MissingExtraError, UsageError
 
 ABOUT = "Active 3D object recognition: what an object is, and where to look next."
@@ -51,7 +51,7 @@ def _run(arguments: list[str]) -> None:
 
 
 def _call(name: str, arguments: list[str]) -> None:
-    from nextview.cli.call import call, find
+    from nextview.cli.call_with_arguments import call, find
     from nextview.cli.progress import console, track
 
     command = COMMANDS[name]

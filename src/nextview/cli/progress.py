@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Column
 from rich.text import Text
 
-from nextview.cli.ending import printable
+from nextview.cli.exit_status import printable
 
 EVERY = 30.0  # seconds between two lines where the output is no terminal
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from nextview.cli.common_options import EpisodeOptions, ObjectOptions, check_file
 from nextview.cli.episode_table import episode_as_json, print_episode
 from nextview.cli.progress import console
-from nextview.cli.sources import Looking, Source, check_file
 from nextview.errors import NextviewError, ObservationError, UsageError
 from nextview.files import new_file
 from nextview.session.system import System, load, simulated
@@ -36,8 +36,8 @@ def recognise(
     path: Path,
     more: tuple[Path, ...] = (),
     /,
-    source: Source = Source(),
-    looking: Looking = Looking(),
+    source: ObjectOptions = ObjectOptions(),
+    looking: EpisodeOptions = EpisodeOptions(),
     output: Output = Output(),
     start: int | None = None,
     seed: int = 0,

@@ -5,8 +5,8 @@ take them.
 from pathlib import Path
 from typing import Literal
 
+from nextview.cli.common_options import Unit
 from nextview.cli.progress import console, track
-from nextview.cli.sources import Unit
 from nextview.cli.stores import Split, Workers, track_all
 from nextview.data import scene_drawing
 from nextview.errors import DatasetError, UsageError
@@ -88,7 +88,7 @@ def capture(
         largest_part: leave out all that is not connected to the largest part of the mesh.
         overwrite: replace the files of an earlier capture.
     """
-    from nextview.simulation.capturing import write_capture
+    from nextview.captured.writing import write_capture
 
     check_new(out, overwrite, folder=True)
     loaded = load_mesh(mesh, up, unit, max_faces, largest_part)

@@ -18,8 +18,8 @@ from scipy import ndimage
 from scipy.linalg import block_diag
 from scipy.spatial import ConvexHull, QhullError
 
+from nextview.sensing.convex_pieces import Pieces
 from nextview.sensing.frame import Frame
-from nextview.sensing.pieces import Pieces
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -18,6 +18,7 @@ from nextview.geometry.observation import Observation, SceneView, pinhole
 from nextview.geometry.viewsphere import DISTANCE
 from nextview.sensing import clusters, plausibility, segmentation, support
 from nextview.sensing.clusters import Footprint
+from nextview.sensing.convex_pieces import STANDS, cut
 from nextview.sensing.facets import (
     ROWS,
     Facets,
@@ -32,7 +33,6 @@ from nextview.sensing.frame import Frame, within
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, ObjectFrame, enclose, three, upright_axes
 from nextview.sensing.outliers import without_outliers
-from nextview.sensing.pieces import STANDS, cut
 from nextview.sensing.plausibility import ViewWarning, check_frame, check_observation, check_views
 from nextview.sensing.segmentation import Plane, Samples, find_plane, sample
 from nextview.sensing.walls import before_walls, find_walls

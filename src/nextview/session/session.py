@@ -31,8 +31,8 @@ from nextview.session.limits import Limits, in_words
 from nextview.session.pose_frame import PoseFrame
 from nextview.session.ranked import RankedView, camera_poses, rank_views
 from nextview.session.reach import Reach, Reachable, TravelCost, as_reachable, as_travel_cost
-from nextview.session.recognition import SUSPICIOUS, Recognition
 from nextview.session.repeated import REPEATED, after_repeated, is_repeated
+from nextview.session.result import SUSPICIOUS, Recognition
 from nextview.session.surroundings import Surroundings
 from nextview.session.view import View
 from nextview.things.expected_views import Goal

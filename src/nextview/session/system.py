@@ -30,14 +30,14 @@ from nextview.recognition.own_recogniser import own_recogniser
 from nextview.recognition.own_stopping import Rule, own_stopping
 from nextview.recognition.protocol import Recogniser, tells_unknown
 from nextview.session.limits import Limits
-from nextview.session.recognition import Recognition
+from nextview.session.result import Recognition
 from nextview.session.session import FrameCamera, Session
 from nextview.things.recogniser import open_recogniser
 from nextview.things.several import SeveralRecognisers
 
 if TYPE_CHECKING:
+    from nextview.captured.camera import CapturedCamera
     from nextview.sensing.observed_object import ObservedObject
-    from nextview.simulation.captured_camera import CapturedCamera
     from nextview.simulation.sensor import Sensor
 
 MOST_THREADS = 1024
@@ -355,8 +355,8 @@ def _grid_of(network: MapNetwork, sphere: ViewSphere) -> ViewSphere:
 
 
 def _camera_of(folder: Path, up: str | tuple[float, float, float] | None) -> "CapturedCamera":
-    from nextview.simulation.captured import read_capture
-    from nextview.simulation.captured_camera import UP, CapturedCamera
+    from nextview.captured.camera import UP, CapturedCamera
+    from nextview.captured.folders import read_capture
 
     if isinstance(up, str) and up not in UP:
         raise UsageError(

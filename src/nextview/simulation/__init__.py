@@ -1,1 +1,1 @@
-"""The simulated camera, sensor models, cluttered scenes, captured folders."""
+"""The simulated camera, sensor models and cluttered scenes."""

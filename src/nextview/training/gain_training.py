@@ -18,17 +18,6 @@ from nextview.data.progress import Track, silently
 from nextview.data.scene_views import scenes_of
 from nextview.errors import ModelError, PredictionsError, UsageError
 from nextview.files import check_new, command, new_folder, sha256_of
-from nextview.learning.export import export_onnx
-from nextview.learning.fitting_set import hold_out, load_sensed
-from nextview.learning.recipes import GainRecipe
-from nextview.learning.rollout import (
-    ReplayTable,
-    Value,
-    candidate_values,
-    fit_travel_weight,
-    judge_all,
-    rollout,
-)
 from nextview.policies.base import Policy
 from nextview.policies.baselines import Random, RandomAll
 from nextview.policies.gain import (
@@ -47,6 +36,17 @@ from nextview.policies.learned_tables import cells_from
 from nextview.policies.policy_card import LearnedFrom, PolicyCard, write_policy_card
 from nextview.recognition.inference import open_onnx
 from nextview.recognition.map_names import in_order
+from nextview.training.export import export_onnx
+from nextview.training.fitting_set import hold_out, load_sensed
+from nextview.training.recipes import GainRecipe
+from nextview.training.rollout import (
+    ReplayTable,
+    Value,
+    candidate_values,
+    fit_travel_weight,
+    judge_all,
+    rollout,
+)
 
 with extras():
     import torch

@@ -17,10 +17,12 @@ from nextview.data.splits import check_any, deduplicate, split_training
 from nextview.data.store import ViewStore
 from nextview.errors import ModelError, PredictionsError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.learning.architectures import map_columns, map_network, orthogonality
-from nextview.learning.inputs import PackedViews, ready_inputs
-from nextview.learning.recipes import Hardware, MapRecipe
-from nextview.learning.runs import (
+from nextview.recognition.map_names import CONFIDENCE
+from nextview.recognition.network_input import cloud_input
+from nextview.training.architectures import map_columns, map_network, orthogonality
+from nextview.training.inputs import PackedViews, ready_inputs
+from nextview.training.recipes import Hardware, MapRecipe
+from nextview.training.runs import (
     OwnBatches,
     fit,
     new_run,
@@ -29,8 +31,6 @@ from nextview.learning.runs import (
     start_from,
     train_once,
 )
-from nextview.recognition.map_names import CONFIDENCE
-from nextview.recognition.network_input import cloud_input
 
 with extras():
     import lightning as L

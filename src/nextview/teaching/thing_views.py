@@ -14,6 +14,10 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from nextview.captured.camera import CapturedCamera
+from nextview.captured.check import summary
+from nextview.captured.folders import Capture, is_capture, read_capture
+from nextview.captured.turntable import read_turntable
 from nextview.checks import one_of, whole
 from nextview.errors import DatasetError, ObservationError
 from nextview.geometry.mesh import UNITS, Y_UP, Mesh, is_y_up, load_mesh, mesh_warnings
@@ -23,13 +27,9 @@ from nextview.geometry.viewsphere import ViewSphere, angle_between, direction_of
 from nextview.recognition.inference import Features
 from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import unit
-from nextview.simulation.captured import Capture, is_capture, read_capture
-from nextview.simulation.captured_camera import CapturedCamera
-from nextview.simulation.captured_check import summary
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.simulation.turntable import read_turntable
 from nextview.things.fusion import fuse
 from nextview.things.memory import AZIMUTHS, RINGS, joined
 from nextview.things.surface import FINEST_ERROR, Surface
@@ -55,7 +55,7 @@ Parts = Iterator[NDArray[np.float32]]  # of embeddings, (.., F) each, in order
 
 
 @dataclass(frozen=True)
-class How:
+class TeachingOptions:
     """How things are looked at.
 
     Attributes:
@@ -96,7 +96,7 @@ class How:
         one_of(self.turntable, (None, "ccw", "cw"), "the way that the turntable turned")
 
 
-def teach(path: Path, name: str, how: How, threads: int = 1) -> Arrays:
+def teach(path: Path, name: str, how: TeachingOptions, threads: int = 1) -> Arrays:
     """Look at one thing, and note what is to be remembered of it.
 
     Args:

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from nextview.learning.memory_fit import VIEWS, Fit
+from nextview.teaching.memory_fit import VIEWS, Fit
 
 PAGE_WIDTH = 11.0  # inches
 PICTURE_WIDTH = 1.05  # inches, and as high

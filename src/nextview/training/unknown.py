@@ -21,12 +21,12 @@ from nextview.errors import DatasetError, MeshError
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.observation import Camera
 from nextview.geometry.viewsphere import look_at_origin
-from nextview.learning.fitting_set import card_to_fit
-from nextview.learning.teaching import embeddings
 from nextview.recognition.novelty import Novelty, as_stored, novelty_path
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.teaching.thing_views import embeddings
+from nextview.training.fitting_set import card_to_fit
 
 Float32 = NDArray[np.float32]
 REMEMBERED_VIEWS = 3

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from nextview.captured.folders import NOTHING, pinhole_of
 from nextview.checks import number
 from nextview.errors import ResultsError, UsageError
 from nextview.files import new_folder
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.ray_caster import RayCaster, pixel_rays
 from nextview.geometry.viewsphere import DISTANCE, ViewSphere, look_at_origin
-from nextview.simulation.captured import NOTHING, pinhole_of
 from nextview.simulation.scene import square
 
 # a Kinect's as ROS has it by default; first pixel's centre at 0

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from nextview.data.predictions import Predictions
 from nextview.data.scene_views import SceneSight, scenes_of, sight_of
 from nextview.errors import PredictionsError
-from nextview.learning.card_fits import calibration_of
-from nextview.learning.fitting_set import for_fitting
 from nextview.policies.base import EpisodeState, Policy
 from nextview.policies.baselines import Random
 from nextview.policies.gain import Gain
 from nextview.recognition.belief import FixedLength, of_true_class
 from nextview.session.episode import run_episodes
+from nextview.training.card_fits import calibration_of
+from nextview.training.fitting_set import for_fitting
 
 Float = NDArray[np.float64]
 # belief in the truth, its logarithm, or whether the answer is right

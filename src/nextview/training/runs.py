@@ -31,8 +31,8 @@ from nextview.files import (
     sha256_of,
     write_record,
 )
-from nextview.learning.architectures import LiteNet, ResNet
-from nextview.learning.recipes import Hardware
+from nextview.training.architectures import LiteNet, ResNet
+from nextview.training.recipes import Hardware
 
 with extras():
     import lightning as L

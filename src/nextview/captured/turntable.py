@@ -8,10 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from nextview.errors import DatasetError, ObservationError
-from nextview.sensing import Frame, ObservedObject
-from nextview.sensing.object_frame import smallest_circle, upright_axes
-from nextview.simulation.captured import (
+from nextview.captured.folders import (
     INTRINSICS,
     MILLIMETRES,
     Capture,
@@ -20,6 +17,9 @@ from nextview.simulation.captured import (
     is_capture,
     read_table,
 )
+from nextview.errors import DatasetError, ObservationError
+from nextview.sensing import Frame, ObservedObject
+from nextview.sensing.object_frame import smallest_circle, upright_axes
 
 # of the fit; points of a frame; share of them that counts, the nearest
 ROUNDS = 40

@@ -15,10 +15,10 @@ from nextview.data.rendering import rotations
 from nextview.data.splits import check_any, deduplicate, split_training
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
-from nextview.learning.architectures import recogniser_network
-from nextview.learning.inputs import PackedViews, ready_inputs
-from nextview.learning.recipes import Hardware, RecogniserRecipe
-from nextview.learning.runs import OwnBatches, fit, new_run, optimiser, start_from, train_once
+from nextview.training.architectures import recogniser_network
+from nextview.training.inputs import PackedViews, ready_inputs
+from nextview.training.recipes import Hardware, RecogniserRecipe
+from nextview.training.runs import OwnBatches, fit, new_run, optimiser, start_from, train_once
 
 with extras():
     import lightning as L
@@ -31,7 +31,7 @@ Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Source:
+class StoredInputs:
     """Where views of the training objects come from: their own store or one of deformed copies.
 
     Attributes:
@@ -51,7 +51,11 @@ class Views(OwnBatches):
     """
 
     def __init__(
-        self, sources: list[Source], objects: Indices, labels: Indices, recipe: RecogniserRecipe
+        self,
+        sources: list[StoredInputs],
+        objects: Indices,
+        labels: Indices,
+        recipe: RecogniserRecipe,
     ) -> None:
         self.sources = sources
         self.objects = objects
@@ -216,7 +220,7 @@ class ValidationViews(OwnBatches):
 
 
 def fit_recogniser(
-    sources: list[Source],
+    sources: list[StoredInputs],
     labels: Indices,
     parts: tuple[Indices, Indices],
     recipe: RecogniserRecipe,
@@ -333,12 +337,12 @@ def _source(
     recipe: RecogniserRecipe,
     planes: Float | None,
     track: Track,
-) -> Source:
+) -> StoredInputs:
     """Inputs of a store, and the row of each object of ``views`` in them, -1 for none."""
     rows = store.rows_of(views.names)
     if (rows[needed] < 0).all():
         raise DatasetError(f"{store.path}: holds none of the training objects")
     inputs = ready_inputs(store.path, recipe.size, recipe.input, track)
-    return Source(
+    return StoredInputs(
         inputs, rows, None if planes is None else azimuth_bins(store, views.sphere.azimuths, planes)
     )

@@ -23,21 +23,6 @@ from nextview.data.pool import count as count_workers
 from nextview.data.progress import Track, silently
 from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.files import check_new, command, new_file, new_folder, only_one, sha256_of, unfinished
-from nextview.learning.learned_picture import draw_learned
-from nextview.learning.memory_fit import VIEWS, Fit, fit_memory, size_evidence
-from nextview.learning.sizes import check_sizes
-from nextview.learning.teaching import FACES, LEFT_OUT, SYMMETRIES, VERTICES, Arrays, How, teach
-from nextview.learning.things import Found, Source, find_things
-from nextview.learning.verification_fit import (
-    GROWTH,
-    Shown,
-    VerifiedFit,
-    class_of_things,
-    fit_verification,
-    show,
-    to_be_shown,
-    with_new_things,
-)
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import Features
 from nextview.recognition.model_card import (
@@ -54,6 +39,29 @@ from nextview.recognition.model_card import (
     read_card,
     write_card,
 )
+from nextview.teaching.learned_picture import draw_learned
+from nextview.teaching.memory_fit import VIEWS, Fit, fit_memory, size_evidence
+from nextview.teaching.sizes import check_sizes
+from nextview.teaching.thing_sources import Found, ThingSource, find_things
+from nextview.teaching.thing_views import (
+    FACES,
+    LEFT_OUT,
+    SYMMETRIES,
+    VERTICES,
+    Arrays,
+    TeachingOptions,
+    teach,
+)
+from nextview.teaching.verification_fit import (
+    GROWTH,
+    Shown,
+    VerifiedFit,
+    class_of_things,
+    fit_verification,
+    show,
+    to_be_shown,
+    with_new_things,
+)
 from nextview.things.memory import AZIMUTHS, Memory, TaughtRecogniser, check_features, open_memory
 from nextview.things.stored_surfaces import StoredSurfaces
 from nextview.things.surface import Surface
@@ -67,7 +75,7 @@ PICTURE = "learned.png"
 JUDGED = "judged"
 # the key of the things that a run that was stopped has taught, see ``files.unfinished``
 PARTS = "things"
-Pair = tuple[Source, Arrays]  # a thing, and what is remembered of it
+Pair = tuple[ThingSource, Arrays]  # a thing, and what is remembered of it
 
 
 @dataclass(frozen=True)
@@ -82,7 +90,7 @@ class Work:
         track: follows the work.
     """
 
-    how: How
+    how: TeachingOptions
     part: Path
     workers: int | None
     scheduler: str | None
@@ -148,17 +156,17 @@ def _percent(shares: Sequence[float]) -> str:
 
 
 def learn(folder: str | Path, out: str | Path, **options: Any) -> Learned:
-    """Teach the things in a folder; options are those of ``How`` and of ``learn_things``, which
-    says all.
-    """
-    how = {name: options.pop(name) for name in How.__dataclass_fields__ if name in options}
-    return learn_things(Path(folder), Path(out), How(**how), **options)
+    """Teach the things in a folder, with options of ``TeachingOptions`` and ``learn_things``."""
+    how = {
+        name: options.pop(name) for name in TeachingOptions.__dataclass_fields__ if name in options
+    }
+    return learn_things(Path(folder), Path(out), TeachingOptions(**how), **options)
 
 
 def learn_things(
     folder: Path,
     out: Path,
-    how: How = How(),
+    how: TeachingOptions = TeachingOptions(),
     add: bool = False,
     remove: tuple[str, ...] = (),
     workers: int | None = None,
@@ -248,7 +256,7 @@ def _before(out: Path, keeps: bool) -> tuple[ModelCard, Memory] | None:
     return card, memory
 
 
-def _check_names(things: Sequence[Source], taught: Sequence[Pair]) -> None:
+def _check_names(things: Sequence[ThingSource], taught: Sequence[Pair]) -> None:
     """Refuse things that are called as one that is known already."""
     names = {source.name for source, _ in taught}
     for thing in things:
@@ -284,7 +292,7 @@ def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]
                 FACES: surface.faces,
                 SYMMETRIES: symmetries.reshape(-1, 4),
             }
-        kept.append((Source(thing.name, label, Path(thing.source)), arrays))
+        kept.append((ThingSource(thing.name, label, Path(thing.source)), arrays))
     return kept
 
 
@@ -292,7 +300,7 @@ PER_THING = ("held_out", "held_out_views", "radii", "pictures")
 
 
 def _teach(
-    sources: Sequence[Source], work: Work, taught: list[Pair], left_out: list[str]
+    sources: Sequence[ThingSource], work: Work, taught: list[Pair], left_out: list[str]
 ) -> Iterator[int]:
     """Teach things side by side, each into a file of its own; what is there from a run that was
     stopped is taken.
@@ -322,7 +330,7 @@ def _teach(
         yield count
 
 
-def _without_phrase(source: Source, arrays: Arrays, left_out: list[str]) -> Arrays:
+def _without_phrase(source: ThingSource, arrays: Arrays, left_out: list[str]) -> Arrays:
     """The arrays of a thing; which of its frames were not used is told instead."""
     phrase = arrays.get(LEFT_OUT)
     if phrase is not None:
@@ -330,7 +338,7 @@ def _without_phrase(source: Source, arrays: Arrays, left_out: list[str]) -> Arra
     return {name: values for name, values in arrays.items() if name != LEFT_OUT}
 
 
-def _stamp(source: Source, how: How) -> str:
+def _stamp(source: ThingSource, how: TeachingOptions) -> str:
     """What the part of a thing was made from: it is made anew if any of this has changed.
 
     That is its path, the name, size and time of its file or of each file in its folder, the
@@ -366,7 +374,7 @@ def _files_of(path: Path) -> Iterator[Path]:
         yield from (Path(place, name) for name in sorted(names))
 
 
-def _part_of(part: Path, source: Source) -> Path:
+def _part_of(part: Path, source: ThingSource) -> Path:
     """Where what is remembered of a thing is kept until all are taught; names may be too long
     for a file's.
     """
@@ -388,7 +396,9 @@ def _finished(file: Path, stamp: str) -> Arrays | None:
     return arrays
 
 
-def _teach_one(how: How, part: Path, threads: int, item: tuple[Source, str]) -> Arrays | str:
+def _teach_one(
+    how: TeachingOptions, part: Path, threads: int, item: tuple[ThingSource, str]
+) -> Arrays | str:
     """What is to be remembered of one thing; a sentence where it cannot be taught."""
     source, stamp = item
     try:
@@ -559,7 +569,7 @@ def _fitted(taught: Sequence[Pair], label: NDArray[np.int64]) -> tuple[Memory, F
     return memory, fit
 
 
-def _surface_of(source: Source, arrays: Arrays) -> Surface | None:
+def _surface_of(source: ThingSource, arrays: Arrays) -> Surface | None:
     """The surface of a thing; None if its size is not known."""
     if VERTICES not in arrays:
         return None

@@ -23,11 +23,6 @@ from nextview.data.splits import deduplicate
 from nextview.data.store import ViewStore
 from nextview.errors import ModelError, UsageError
 from nextview.files import check_new, command, new_file, new_folder, sha256_of
-from nextview.learning.architectures import LiteNet, ResNet, map_network, recogniser_network
-from nextview.learning.inputs import load_inputs
-from nextview.learning.map_training import target_of
-from nextview.learning.recipes import MapRecipe, RecogniserRecipe
-from nextview.learning.runs import load_run, read_recipe, read_run
 from nextview.recognition.inference import (
     BINS_OUTPUT,
     FEATURES_OUTPUT,
@@ -37,6 +32,11 @@ from nextview.recognition.inference import (
 from nextview.recognition.map_names import CONFIDENCE, Good, map_name
 from nextview.recognition.model_card import ModelCard, Training, write_card
 from nextview.recognition.network_input import InputSpec, from_store
+from nextview.training.architectures import LiteNet, ResNet, map_network, recogniser_network
+from nextview.training.inputs import load_inputs
+from nextview.training.map_training import target_of
+from nextview.training.recipes import MapRecipe, RecogniserRecipe
+from nextview.training.runs import load_run, read_recipe, read_run
 
 with extras():
     import onnx

@@ -20,7 +20,7 @@ PICTURES = (".png", ".pdf", ".svg")
 
 
 @dataclass(frozen=True)
-class Looking:
+class EpisodeOptions:
     """Who looks, and when it ends.
 
     Attributes:
@@ -56,7 +56,7 @@ class Looking:
 
 
 @dataclass(frozen=True)
-class Source:
+class ObjectOptions:
     """What is looked at.
 
     Attributes:
@@ -109,9 +109,9 @@ class Source:
         return simulated(mesh, self.sensor, seed)
 
     def _captured(self, folder: Path) -> FrameCamera:
+        from nextview.captured.camera import UP, CapturedCamera
+        from nextview.captured.folders import read_box, read_capture
         from nextview.sensing.object_frame import Box, upright_axes
-        from nextview.simulation.captured import read_box, read_capture
-        from nextview.simulation.captured_camera import UP, CapturedCamera
 
         capture = read_capture(folder, self.intrinsics, self.object_id)
         console.print(f"{capture!r}")

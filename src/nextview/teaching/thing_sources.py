@@ -6,18 +6,18 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from nextview.captured.folders import is_capture
+from nextview.captured.turntable import is_turntable
 from nextview.checks import one_line
 from nextview.data.folders import Entry, left_out_phrases, read_folder
 from nextview.errors import DatasetError
 from nextview.geometry.mesh import FORMATS
-from nextview.simulation.captured import is_capture
-from nextview.simulation.turntable import is_turntable
 
 RESULT_FOLDER = "is where the result goes"
 
 
 @dataclass(frozen=True)
-class Source:
+class ThingSource:
     """One thing to be taught.
 
     Attributes:
@@ -41,7 +41,7 @@ class Found:
         notes: how the folder was understood, a sentence each.
     """
 
-    things: list[Source]
+    things: list[ThingSource]
     left_out: list[str]
     notes: tuple[str, ...] = ()
 
@@ -82,8 +82,8 @@ def find_things(folder: Path, out: Path | None = None, one_class: bool = False) 
         listing.left_out
         + [(e.path.relative_to(folder), f"of the split {e.split}") for e in other_splits]
     )
-    things = [Source(path.name, path.name, path) for path in captures]
-    things += [Source(entry.name, entry.label, entry.path) for entry in entries]
+    things = [ThingSource(path.name, path.name, path) for path in captures]
+    things += [ThingSource(entry.name, entry.label, entry.path) for entry in entries]
     if not things:
         text = (
             f"{folder}: holds no mesh ({', '.join(FORMATS)}) and no folder of depth frames with"
@@ -128,15 +128,15 @@ def _to_be_taught(entries: list[Entry]) -> tuple[list[Entry], list[Entry]]:
     return taught, [entry for entry in entries if entry.split not in ("train", "")]
 
 
-def _check_names(things: list[Source]) -> None:
-    first: dict[str, Source] = {}
+def _check_names(things: list[ThingSource]) -> None:
+    first: dict[str, ThingSource] = {}
     for thing in things:
         if first.setdefault(thing.name, thing) is not thing:
             both = f"{first[thing.name].path} and {thing.path}"
             raise DatasetError(f"{both} would both be called {thing.name}; rename one of them")
 
 
-def _check_classes(folder: Path, things: list[Source]) -> None:
+def _check_classes(folder: Path, things: list[ThingSource]) -> None:
     """Ask about several things that all lie in one class folder."""
     label = things[0].label
     if len(things) == 1 or any(thing.label != label for thing in things):

@@ -65,7 +65,7 @@ def ready_inputs(
 ) -> PackedViews:
     """The inputs of a store, (N, V, C, size, size) uint8, computed if they are not there."""
     # not above: the processes that compute inputs need no torch
-    from nextview.learning.runs import is_first
+    from nextview.training.runs import is_first
 
     target = inputs_path(path, size, kind)
     if is_first() and not target.exists():

@@ -4,8 +4,8 @@ a ResNet of maps.
 
 from nextview.checks import extras
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.learning.recipes import MapRecipe, RecogniserRecipe
 from nextview.recognition.network_input import CHANNELS_OF
+from nextview.training.recipes import MapRecipe, RecogniserRecipe
 
 with extras():
     import torch

@@ -18,7 +18,6 @@ from nextview.data.splits import deduplicated
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, PredictionsError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.learning.fitting_set import blind_walks, card_to_fit, for_fitting, load_sensed
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.baselines import Random, RandomAll
 from nextview.policies.maps import MapPeak
@@ -31,6 +30,7 @@ from nextview.recognition.belief import (
     of_true_class,
 )
 from nextview.recognition.model_card import ModelCard
+from nextview.training.fitting_set import blind_walks, card_to_fit, for_fitting, load_sensed
 
 Float = NDArray[np.float64]
 Floats = NDArray[np.floating]

@@ -7,19 +7,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nextview.errors import DatasetError, ObservationError
-from nextview.sensing.agreement import SHARP, Agreement, SurfaceView, compare, surface_view
-from nextview.sensing.frame import Frame
-from nextview.simulation.captured import Capture, CapturedFrame
-from nextview.simulation.captured_cameras import find_camera_mistake, find_offset
-from nextview.simulation.captured_shifts import Shift, find_shifts
-from nextview.simulation.pose_mistakes import (
+from nextview.captured.camera_mistakes import find_camera_mistake, find_offset
+from nextview.captured.folders import Capture, CapturedFrame
+from nextview.captured.pose_mistakes import (
     FEWEST_JUDGED,
     UNIT_NAMES,
     Posed,
     PoseMistake,
     find_mistake,
 )
+from nextview.captured.shifted_poses import Shift, find_shifts
+from nextview.errors import DatasetError, ObservationError
+from nextview.sensing.agreement import SHARP, Agreement, SurfaceView, compare, surface_view
+from nextview.sensing.frame import Frame
 
 MOST_COMPARED = 60  # frames of a capture that are compared with each other, evenly spread
 MOST_REFUSED = 0.1  # share of the frames that may be left out; a single one always may

@@ -1,0 +1,1 @@
+"""Folders of real depth frames with camera poses: readers, checks, turntables."""

@@ -1,1 +1,0 @@
-"""What is fitted to predictions and views; training and export."""

@@ -1,0 +1,1 @@
+"""Training of networks, fits to their predictions, and export: everything that needs torch."""

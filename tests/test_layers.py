@@ -1,0 +1,83 @@
+"""The rooms of the package: each imports only from rooms above it in CONTRIBUTING.md's table."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "src" / "nextview"
+SHELL = {"__init__", "__main__"}  # the package's own doors, which open onto every room
+
+
+def rooms_of_the_table() -> list[str]:
+    """The rooms in the order of the table; names that share a row have the same height."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    table = text.split("| room | what is in it |")[1].split("\n\n")[0]
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    return [name for row in rows for name in re.findall(r"`(\w+)`", row)]
+
+
+ROOMS = rooms_of_the_table()
+
+
+def modules_imported(path: Path) -> set[str]:
+    """Modules of the package that a file imports, at its top or inside a function."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: a relative import"
+            module = node.module or ""
+            found |= {f"{module}.{alias.name}" for alias in node.names}
+    return {name for name in found if name.startswith("nextview.")}
+
+
+def room_of(module: str) -> str:
+    return module.split(".")[1]
+
+
+def test_the_table_names_every_room() -> None:
+    entries = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or path.is_dir()}
+    assert {entry for entry in entries if entry.isidentifier()} - SHELL - {"__pycache__"} == set(
+        ROOMS
+    )
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_room_imports_from_rooms_above_it(room: str) -> None:
+    single = PACKAGE / f"{room}.py"
+    files = [single] if single.exists() else sorted((PACKAGE / room).rglob("*.py"))
+    assert files
+
+    height = ROOMS.index(room)
+    for path in files:
+        for module in modules_imported(path):
+            other = room_of(module)
+            if other in ROOMS:
+                assert ROOMS.index(other) <= height, f"{path} imports {module}"
+
+
+def test_no_two_modules_import_each_other_in_a_circle() -> None:
+    modules = {
+        ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts): path
+        for path in PACKAGE.rglob("*.py")
+    }
+    arrows = {
+        name: {
+            target
+            for found in modules_imported(path)
+            for target in (found, found.rsplit(".", 1)[0])
+            if target in modules and target != name
+        }
+        for name, path in modules.items()
+        if path.stem not in SHELL
+    }
+
+    done: set[str] = set()
+    while len(done) < len(arrows):
+        free = {name for name in arrows if name not in done and arrows[name] <= done}
+        assert free, f"a circle among {sorted(set(arrows) - done)}"
+        done |= free
