@@ -25,7 +25,7 @@ from nextview.benchmark.leaderboard import SIGNIFICANT, is_oracle
 from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
 
-WIDTH = 150
+WIDTH = 98
 """Columns of the page's prose."""
 
 THRESHOLD = 0.97
@@ -106,7 +106,7 @@ def recogniser(stage: Path) -> Iterator[str]:
         split: int(table.loc[table["label"] == "", "objects"].max())
         for split, table in tables.items()
     }
-    yield "Share of right answers. Of all views the logits are summed. `accuracy.csv`."
+    yield "Accuracy. Over several views the logits are summed. `accuracy.csv`."
     yield ""
     measures = {
         "accuracy": "all objects",
@@ -143,8 +143,8 @@ def recogniser(stage: Path) -> Iterator[str]:
 def calibration(stage: Path) -> Iterator[str]:
     """What the belief is worth after several views."""
     yield (
-        "Views of the test split in random order, fused as the recogniser's card says."
-        " `fusion.csv`."
+        "Views of the test split in random order, fused with the parameters on the recogniser's"
+        " card. `fusion.csv`."
     )
     yield ""
     table = pd.read_csv(stage / "test" / "fusion.csv")
@@ -174,8 +174,9 @@ def maps(stage: Path) -> Iterator[str]:
         "regret": "regret",
     }
     yield from wrap(
-        "Published: squared error over objects, peaks over classes (table 4). The mean maps come"
-        " from the true maps of these very objects: too good. `maps.csv`.",
+        "Published: squared error over objects, peaks over classes (table 4). The mean maps are"
+        " computed from the true maps of the same objects, so their rows are optimistic."
+        " `maps.csv`.",
         WIDTH,
     )
     yield ""
@@ -223,10 +224,10 @@ def comparison(stage: Path) -> Iterator[str]:
     tests = pd.read_csv(stage / "tests.csv")
     decay = settings["threshold_decay"]
     yield from wrap(
-        f"{settings['runs']} first views an object, the same for every policy. The threshold is"
-        f" {THRESHOLD} at the first view and comes down with the views (decay {decay:g}); at most"
-        f" {settings['max_views']} views. Travel is the mean over all episodes, those that never"
-        f" moved included. p: bootstrap test of the accuracy against `{settings['reference']}`,"
+        f"{settings['runs']} first views per object, the same for every policy. The threshold is"
+        f" {THRESHOLD} at the first view and decreases with every view (decay {decay:g}); at most"
+        f" {settings['max_views']} views. Travel is the mean over all episodes, including those"
+        f" that never moved. p: bootstrap test of the accuracy against `{settings['reference']}`,"
         " with Holm's correction over all policies and thresholds. `summary.csv`, `tests.csv`.",
         WIDTH,
     )
@@ -268,7 +269,8 @@ def comparison(stage: Path) -> Iterator[str]:
         yield from wrap(
             "**No policy that a robot could follow differs significantly from"
             f" {settings['reference']} in accuracy** at any threshold: every p after the correction"
-            f" is {SIGNIFICANT} or more. Policies called oracle or true know what a robot cannot.",
+            f" is {SIGNIFICANT} or more. Policies named oracle or true use information that a robot"
+            " does not have.",
             WIDTH,
         )
         yield ""
@@ -288,7 +290,7 @@ def fixed_views(stage: Path) -> Iterator[str]:
 
 def measures(stage: Path) -> Iterator[str]:
     """Which measure of a view serves recognition."""
-    yield "[measures.md](measures.md) says what each is. `measures.csv`."
+    yield "[measures.md](measures.md) defines the measures. `measures.csv`."
     yield ""
     yield (stage / "measures.md").read_text().rstrip()
     yield ""
@@ -304,8 +306,8 @@ def risk(stage: Path) -> Iterator[str]:
     settings = json.loads((stage / "benchmark.json").read_text())
     found = cells(pd.read_csv(stage / "summary.csv"), "policy", "threshold", "measure")
     yield from wrap(
-        "With `--risk` an episode stops at the lowest threshold at which, by the validation"
-        " objects, at most that share of the early stops is wrong. Test split:",
+        "With `--risk` an episode stops at the lowest threshold at which at most that share of"
+        " the early stops is wrong on the validation objects. Test split:",
         WIDTH,
     )
     yield ""
@@ -391,13 +393,13 @@ def page(stages: Iterable[str]) -> str:
         "# Results",
         "",
         *wrap(
-            "Measurements, each beside the commands that made it. `make reproduce` writes the"
-            f" page; nothing on it is typed in. Of ModelNet10's {OFFICIAL['test']:,} test meshes"
-            f" {objects('test.npz'):,} were there, and {training:,} of its {OFFICIAL['train']:,}"
-            f" training meshes. {objects('validation.npz'):,} of those, which no network was"
-            " trained on, validate: all choices are made on them, and the test split chooses"
-            " nothing. In brackets stand 95 % bootstrap intervals over objects. The networks'"
-            " predictions, from which most of it comes, are made by",
+            "Measurements, each beside the command that produced it. `make reproduce` writes this"
+            f" page. {objects('test.npz'):,} of ModelNet10's {OFFICIAL['test']:,} test meshes and"
+            f" {training:,} of its {OFFICIAL['train']:,} training meshes were available."
+            f" {objects('validation.npz'):,} training meshes that no network was trained on are"
+            " the validation set. All choices were made on them, and the test split chose"
+            " nothing. Brackets contain 95 % bootstrap intervals over objects. Most sections are"
+            " computed from the predictions of the networks, which are made with",
             WIDTH,
         ),
         "",
