@@ -19,7 +19,10 @@ ROOMS = {
     "Simulation": ["simulation"],
     "Policies": ["policies"],
     "Data": ["data"],
-    "Learning": ["learning"],
+    "Things": ["things"],
+    "Captured frames": ["captured"],
+    "Teaching": ["teaching"],
+    "Training": ["training"],
     "Benchmark": ["benchmark"],
     "Viewers": ["viewers"],
 }
