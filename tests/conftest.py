@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pipeline
 import pytest
+import trimesh
 from filelock import FileLock
 from hypothesis import settings
 
@@ -73,6 +74,30 @@ def taught(shared, scans) -> Path:
         shared("taught", lambda folder: learn(scans, folder / "mine", upright=True, workers=0))
         / "mine"
     )
+
+
+@pytest.fixture(scope="session")
+def knobs(shared) -> Path:
+    """Three things in metres: a box, the same with a knob, and a can."""
+
+    def make(folder: Path) -> None:
+        body = pipeline.box((0.08, 0.08, 0.1), (0, 0, 0.05))
+        body.export(folder / "plain.ply")
+        knob = pipeline.box((0.02, 0.02, 0.02), (0.05, 0, 0.06))
+        trimesh.util.concatenate([body, knob]).export(folder / "knob.ply")
+        trimesh.creation.cylinder(0.04, 0.12).export(folder / "can.ply")
+
+    return shared("knobs", make)
+
+
+@pytest.fixture(scope="session")
+def knobs_memory(shared, knobs) -> Path:
+    """A memory of them that knows their geometry."""
+
+    def make(folder: Path) -> None:
+        learn(knobs, folder / "mine", unit="m", upright=True, workers=0)
+
+    return shared("knobs_memory", make) / "mine"
 
 
 @pytest.fixture(scope="session")

@@ -48,25 +48,38 @@ WRITES = {
         "folder",
         "--split test --runs 1 --samples 10 --policies random",
     ),
+    "benchmark-things": (
+        "benchmark-things {knobs}",
+        "folder",
+        "--models {knobs_memory} --policies random --repeats 1 --views 1 2 --workers 0",
+    ),
     "report": ("report {results}/out", "r.html"),
     "train gain": ("train gain {training}", "g.json", f"{GAIN} --folds 2 --epochs 1"),
     "train recogniser": ("train recogniser {views}", "folder", SMALL),
     "train map": ("train map {views}", "folder", SMALL),
 }
 """Arguments before the output, the name of the output, and arguments after it."""
-OWN_ONLY = {"scenes", "render", "train recogniser", "train map"}
+OWN_ONLY = {"scenes", "render", "train recogniser", "train map", "benchmark-things"}
 """They go on with an unfinished output of their own, and replace no folder of anything else."""
 
 
 @pytest.fixture(scope="session")
-def made(furniture, views, models, predictions, results, tmp_path_factory):
+def made(furniture, views, models, predictions, results, knobs, knobs_memory, tmp_path_factory):
     """What the commands work on; the store is a copy."""
     folder = tmp_path_factory.mktemp("made")
     training, own = folder / "p.npz", folder / "views.zarr"
     Predictions.load(predictions).of_split("train").save(training)
     shutil.copytree(views, own)
-    names = "furniture", "views", "models", "predictions", "results", "training"
-    return dict(zip(names, (furniture, own, models, predictions, results, training), strict=True))
+    return {
+        "furniture": furniture,
+        "views": own,
+        "models": models,
+        "predictions": predictions,
+        "results": results,
+        "training": training,
+        "knobs": knobs,
+        "knobs_memory": knobs_memory,
+    }
 
 
 def contents(folder):

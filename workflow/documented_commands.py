@@ -95,7 +95,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
 }
 NEEDS = {  # what a command or a Python block needs besides the base installation, by what is in it
     r"nextview (train|export) ": "nextview[train]",
-    r"nextview (benchmark|evaluate|report) ": "nextview[benchmark]",
+    r"nextview (benchmark|benchmark-things|evaluate|report) ": "nextview[benchmark]",
     r"benchmarks/(ablations|things|views)\.py|research\.(measure_study|example_maps)": (
         "nextview[benchmark]"
     ),
@@ -116,6 +116,9 @@ SMALL = {  # options that make a command quick
     "nextview train gain": "--folds 2 --epochs 1 --episodes 1 --networks-per-fold 1",
     "nextview fit calibration": "--delta 0.2",
     "nextview benchmark": "--runs 2 --samples 100",
+    "nextview benchmark-things": (
+        "--views 1 2 --policies random geometry --repeats 1 --samples 100 --workers 1"
+    ),
     "python -m research.train_agent": "--steps 2000",
     "python -m research.measure": "--workers 1",
     "python -m research.plan": "--workers 1",

@@ -122,6 +122,12 @@ COMMANDS = {  # by name, in the order in which they are listed
         "next: nextview report {out}",
         f"{CLI}.leaderboard_table:print_results",
     ),
+    "benchmark-things": Command(
+        "nextview.benchmark.thing_benchmark:benchmark_things",
+        "compare where to look next at taught things",
+        "tables and figures are in {out}; one more policy: the same command with --policies",
+        f"{CLI}.things_table:print_things",
+    ),
     "report": Command(
         "nextview.benchmark.report:report",
         "write one HTML page of a benchmark's results",
@@ -129,4 +135,13 @@ COMMANDS = {  # by name, in the order in which they are listed
     ),
 }
 # resumable
-RESUMES = ("render", "measure", "predict", "train recogniser", "train map", "learn", "scenes")
+RESUMES = (
+    "render",
+    "measure",
+    "predict",
+    "train recogniser",
+    "train map",
+    "learn",
+    "scenes",
+    "benchmark-things",
+)

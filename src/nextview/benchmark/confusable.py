@@ -1,0 +1,70 @@
+"""Which things look most alike, by their surfaces alone: no answer of a recogniser counts."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from nextview.geometry.viewsphere import rotation_z
+from nextview.things.taught import TaughtThings
+
+Float = NDArray[np.float64]
+
+SURFACE_POINTS = 300  # by which two things are compared
+AZIMUTHS_TRIED = 16  # at which one is laid over the other
+RADII_APART = 1.25  # times as large as another, from which a thing is not like it
+
+
+@dataclass(frozen=True, eq=False)
+class Alikeness:
+    """How alike the things of a memory are.
+
+    Attributes:
+        names: of the things.
+        nearest: which thing is most like each, (T,) int64; itself where none is of about its size.
+        distance: mean distance of the two surfaces at the best azimuth, in radii of the thing, (T,)
+            float64; infinity where none is of about its size.
+    """
+
+    names: tuple[str, ...]
+    nearest: NDArray[np.int64]
+    distance: Float
+
+    @property
+    def confusable(self) -> NDArray[np.bool_]:
+        """The half of the things to which another one is most like, (T,) bool."""
+        rank = np.argsort(np.argsort(self.distance, kind="stable"), kind="stable")
+        return rank < len(self.names) // 2
+
+
+def how_alike(things: TaughtThings) -> Alikeness:
+    """Lay the surfaces of things over each other, as they stand in their files.
+
+    Args:
+        things: of known geometry.
+
+    Returns:
+        The nearest other thing of each.
+    """
+    surfaces = things.verifier.caster.surfaces
+    rng = np.random.default_rng(0)
+    points = [surface.sample(SURFACE_POINTS, rng) for surface in surfaces]
+    points = [cloud - (cloud.max(0) + cloud.min(0)) / 2 for cloud in points]
+    trees = [cKDTree(cloud) for cloud in points]
+    radii = np.array([surface.radius for surface in surfaces])
+    turns = rotation_z(2 * np.pi * np.arange(AZIMUTHS_TRIED) / AZIMUTHS_TRIED)
+
+    apart = np.full((len(surfaces), len(surfaces)), np.inf)
+    for first, second in zip(*np.triu_indices(len(surfaces), 1), strict=True):
+        larger = max(radii[first], radii[second])
+        if larger > RADII_APART * min(radii[first], radii[second]):
+            continue
+        turned = points[first] @ turns.swapaxes(1, 2)
+        there = np.asarray(trees[second].query(turned)[0]).mean(1)
+        back = np.asarray(trees[first].query(points[second] @ turns)[0]).mean(1)
+        apart[first, second] = apart[second, first] = ((there + back) / 2).min()
+    distance = apart.min(1) / radii
+    own = np.arange(len(surfaces))
+    nearest = np.where(np.isfinite(distance), apart.argmin(1), own)
+    return Alikeness(things.names, nearest, distance)

@@ -1,0 +1,415 @@
+"""Taught things that can be looked at from all viewpoints; what was computed once is kept.
+
+An episode is a thing at its true size on a table, alone or half hidden by boxes, before a sensor
+with errors of its own. Every view of it is sensed once, is looked at by the features once, and
+every set of views is verified once: exactly as ``Session`` would. All of it is kept in one file an
+episode, so that another policy is replayed without sensing anything again.
+"""
+
+import time
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from nextview.errors import ResultsError, UsageError
+from nextview.files import new_file
+from nextview.geometry.mesh import Mesh
+from nextview.geometry.observation import Observation, SceneView
+from nextview.geometry.resting import rotated
+from nextview.geometry.viewsphere import ViewSphere, rotation_z
+from nextview.policies.base import EpisodeState
+from nextview.recognition.evidence import Evidence
+from nextview.simulation.scene import boxes_around
+from nextview.simulation.sensed_camera import SensedCamera
+from nextview.simulation.sensor import sensor_named
+from nextview.simulation.simulated import SimulatedCamera
+from nextview.things.depth_view import depth_view
+from nextview.things.expected_views import Outlook
+from nextview.things.registration import FINE, align, start
+from nextview.things.taught import TaughtThings
+from nextview.things.verifier import FINE_SIDE, Verified
+
+Float = NDArray[np.float64]
+Occlusion = Literal["none", "half", "heavy"]
+
+SPHERE = ViewSphere.named("40")
+NEAREST_SURFACE = 0.25  # metres between the camera and the surface, at least
+USUAL_DISTANCE = 0.45  # metres between the camera and the centre, at most
+RADII_AWAY = 5.0  # of the camera from the centre, between these
+VISIBLE_SHARES = {"half": (0.45, 0.65), "heavy": (0.25, 0.45)}  # means over the viewpoints
+FEWEST_BOXES = 3  # around a thing that is partly hidden
+MOST_BOXES = 40
+LAYOUTS_TRIED = 60  # of boxes; then the one that comes nearest is taken
+SHARE_SIDE = 24  # rows and columns of the pictures by which a share is measured
+SHARE_EVERY = 3  # every so many viewpoints
+SURFACE_POINTS = 500  # by which the error of a pose is measured
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How things are shown.
+
+    Attributes:
+        sensor: NAME or NAME:STRENGTH of the sensor.
+        occlusion: "none" shows things alone, "half" and "heavy" among boxes that leave about half
+            and a third of them visible, in the mean over the viewpoints.
+        seed: decides how each thing is turned and what stands around it, the first view, and the
+            sensor's errors.
+    """
+
+    sensor: str = "wrist"
+    occlusion: Occlusion = "none"
+    seed: int = 0
+
+
+class ThingEpisode:
+    """A thing that can be looked at from all viewpoints."""
+
+    def __init__(
+        self,
+        things: TaughtThings,
+        mesh: Callable[[], Mesh],
+        thing: int,
+        draw: int,
+        setting: Setting,
+        file: Path | None = None,
+    ) -> None:
+        """Place the thing, or go on with what was kept of it.
+
+        Args:
+            things: that may be believed.
+            mesh: the mesh of the thing, which is asked for when a view has to be sensed.
+            thing: its number among them.
+            draw: number of the draw.
+            setting: how it is shown.
+            file: where all is kept; None for nowhere.
+        """
+        self.things = things
+        self.thing = thing
+        self._mesh = mesh
+        self._seed = (setting.seed, thing, draw)
+        self._setting = setting
+        self._file = file
+        self._kept: dict[str, NDArray[Any]] = {} if file is None else read_arrays(file)
+        self._changed = False
+        self._stage: _Stage | None = None
+        self._views: dict[int, Observation] = {}
+        self._verified: dict[frozenset[int], tuple[Verified, float]] = {}
+        if "start" not in self._kept:
+            self._keep("start", np.array(self._first_view()))
+        self.start = int(self._kept["start"])
+
+    def _keep(self, name: str, values: NDArray[Any]) -> None:
+        self._kept[name] = values
+        self._changed = True
+
+    def save(self) -> None:
+        """Write down what is new."""
+        if self._file is not None and self._changed:
+            write_arrays(self._file, self._kept)
+            self._changed = False
+
+    @property
+    def stage(self) -> "_Stage":
+        """The thing as it stands before the camera."""
+        if self._stage is None:
+            self._stage = _Stage.of(self._mesh(), self._setting, self._seed)
+        return self._stage
+
+    def _first_view(self) -> int:
+        """A view that shows the thing."""
+        rng = np.random.default_rng((*self._seed, 3))
+        for view in rng.permutation(len(SPHERE)):
+            if self.observation(int(view)).seen:
+                return int(view)
+        raise UsageError(f"{self.things.names[self.thing]}: shows from no viewpoint")
+
+    def observation(self, view: int) -> Observation:
+        """What one viewpoint shows: the same whoever asks for it, its noise belongs to it."""
+        if view not in self._views:
+            if f"{view}.depth" not in self._kept:
+                self._sense(view)
+            self._views[view] = _observation(self._kept, view)
+        return self._views[view]
+
+    def _sense(self, view: int) -> None:
+        """Look from one viewpoint."""
+        camera = self.stage.camera(view)
+        observation = camera.observe(SPHERE.poses[view])
+        for name, values in _arrays_of(observation).items():
+            self._keep(f"{view}.{name}", values)
+        in_camera = np.full((4, 4), np.nan)
+        if camera.true_pose is not None:
+            in_camera = np.linalg.inv(camera.true_pose) @ self.stage.in_truth
+        self._keep(f"{view}.in_camera", in_camera)
+        if "true_pose" not in self._kept:
+            self._keep("true_pose", self.stage.true_pose)
+
+    def log_evidence(self, view: int) -> NDArray[np.floating]:
+        """What the features say of a view that shows the thing."""
+        name = f"{view}.evidence"
+        if name not in self._kept:
+            self._keep(name, self.things.log_evidence([self.observation(view)])[0])
+        return self._kept[name]
+
+    def seen(self, views: Sequence[int]) -> list[int]:
+        """Those of some views that show the thing."""
+        return [view for view in views if self.observation(view).seen]
+
+    def verified(self, views: Sequence[int]) -> tuple[Verified, float]:
+        """What is found in some views, and the seconds of CPU that it took."""
+        used = frozenset(self.seen(views))
+        if used not in self._verified:
+            name = "-".join(map(str, sorted(used)))
+            if f"{name}.seconds" not in self._kept:
+                self._verify(name, sorted(used))
+            parts = {f.name: self._kept[f"{name}.{f.name}"] for f in fields(Verified)}
+            self._verified[used] = Verified(**parts), float(self._kept[f"{name}.seconds"])
+        return self._verified[used]
+
+    def _verify(self, name: str, views: list[int]) -> None:
+        observations = [self.observation(view) for view in views]
+        evidence = np.stack([self.log_evidence(view) for view in views])
+        begun = time.process_time()
+        found = self.things.verify(observations, evidence)
+        self._keep(f"{name}.seconds", np.array(time.process_time() - begun))
+        for part, values in vars(found).items():
+            self._keep(f"{name}.{part}", values)
+
+    def belief_in_truth(self, views: Sequence[int]) -> float:
+        """Belief in the true thing after some views."""
+        return float(self.verified(views)[0].belief[self.thing])
+
+    def pose_error(self, views: Sequence[int]) -> float | None:
+        """How far the surface is from where it is found (ADD-S), millimetres, in the last view.
+
+        Returns:
+            The mean distance of its points to the nearest of the true surface; None where the thing
+            is not named right.
+        """
+        found, _ = self.verified(views)
+        rows = np.flatnonzero(found.things == self.thing)
+        if int(found.belief.argmax()) != self.thing or not len(rows):
+            return None
+
+        seen = self.seen(views)
+        scene = self.observation(seen[-1]).scene
+        radius = self.observation(seen[-1]).radius
+        assert scene is not None
+        assert radius is not None
+        camera = scene.pose.copy()
+        camera[:3, 3] *= radius
+        pose = found.poses[rows[0]].copy()
+        pose[:3, 3] += found.cameras[rows[0], sorted(seen).index(seen[-1])]
+
+        surface = self.things.verifier.caster.surfaces[self.thing]
+        points = surface.sample(SURFACE_POINTS, np.random.default_rng(0))
+        true = self._kept[f"{seen[-1]}.in_camera"]
+        there, here = (
+            points @ each[:3, :3].T + each[:3, 3] for each in (true, np.linalg.inv(camera) @ pose)
+        )
+        return float(1000 * np.mean(cKDTree(there).query(here)[0]))
+
+    def aligned_truth(self, views: Sequence[int]) -> Float:
+        """The true pose, aligned with some views as the hypotheses are, (4, 4)."""
+        verifier = self.things.verifier
+        true_pose = self._kept["true_pose"]
+        found = [depth_view(self.observation(view), FINE_SIDE) for view in self.seen(views)]
+        shown = [view for view in found if view is not None]
+        truth = start(np.array([self.thing]), true_pose[None, :3, :3], len(shown))
+        centre = verifier.caster.centres[self.thing].astype(np.float64)
+        place = true_pose[:3, :3] @ centre + true_pose[:3, 3]
+        truth = replace(truth, centres=place[None])
+        return align(verifier.caster, truth, shown, FINE, verifier.prior).poses(verifier.caster)[0]
+
+    def state(self, views: Sequence[int], needs: Sequence[str]) -> EpisodeState:
+        """Where the episode stands, as a policy sees it.
+
+        Args:
+            views: that were taken, in order.
+            needs: what the policy asks for: "joint", "observations" and "outlook" are there.
+        """
+        seen = self.seen(views)
+        recogniser = self.things.recogniser
+        classes = len(recogniser.classes)
+        visited = np.zeros((1, len(SPHERE)), bool)
+        visited[0, list(views)] = True
+        joint = None
+        if "joint" in needs:
+            total = np.sum([self.log_evidence(view) for view in seen], axis=0)
+            here = SPHERE.azimuth[views[-1]]
+            joint = recogniser.calibration.joint(total, len(seen), classes, here)[None]
+        return EpisodeState(
+            current=np.array([views[-1]]),
+            visited=visited,
+            belief=self.verified(views)[0].belief[None],
+            evidence=Evidence(np.zeros((1, classes))),
+            step=len(views),
+            joint=joint,
+            observations=[[self.observation(view) for view in views]],
+            outlook=[self.outlook(views)] if "outlook" in needs else None,
+        )
+
+    def outlook(self, views: Sequence[int]) -> Outlook:
+        """What is known when the next view is to be chosen."""
+        observations = [self.observation(view) for view in self.seen(views)]
+        return Outlook.of(self.things.verifier, self.verified(views)[0], observations)
+
+
+@dataclass(frozen=True, eq=False)
+class _Stage:
+    """A thing on its table, as it is sensed.
+
+    Attributes:
+        standing: its mesh, turned.
+        around: the boxes around it; None for none.
+        sensor: what it is seen with.
+        seed: of the sensor's errors.
+        in_truth: from the file's frame into the true object frame, (4, 4), metres.
+    """
+
+    standing: Mesh
+    around: Mesh | None
+    sensor: Any
+    seed: tuple[int, ...]
+    in_truth: Float
+
+    @classmethod
+    def of(cls, mesh: Mesh, setting: Setting, seed: tuple[int, ...]) -> "_Stage":
+        """Turn a thing, draw its sensor and what stands around it."""
+        rng = np.random.default_rng(seed)
+        turn = rotation_z(rng.uniform(0, 2 * np.pi))
+        standing = rotated(mesh, turn)
+        radius = standing.metres
+        assert radius is not None  # the unit of its file is known
+        away = max(NEAREST_SURFACE + radius, min(USUAL_DISTANCE, RADII_AWAY * radius))
+        drawn = sensor_named(setting.sensor).draw(rng)
+        sensor = replace(drawn, radius=radius, distance=away, boxes=0.0)
+        in_truth = np.eye(4)
+        in_truth[:3, :3] = turn
+        in_truth[:3, 3] = -(turn @ mesh.centre + standing.centre)
+        around = None
+        if setting.occlusion != "none":
+            around = hiding_boxes(standing, VISIBLE_SHARES[setting.occlusion], (*seed, 2))
+        return cls(standing, around, sensor, (*seed, 7), in_truth)
+
+    def camera(self, view: int) -> SensedCamera:
+        """The camera, with the errors of the episode's setup and the noise of one view."""
+        rng = np.random.default_rng(self.seed)
+        camera = SensedCamera(self.standing, self.sensor, rng, around=self.around)
+        rng.spawn(view)
+        return camera
+
+    @property
+    def true_pose(self) -> Float:
+        """Of the file's frame in the object frame that the robot believes in, (4, 4), metres."""
+        frame = self.camera(0).object_frame
+        to_object = np.eye(4)
+        to_object[:3, :3] = frame.axes
+        to_object[:3, 3] = -frame.axes @ frame.centre
+        return np.asarray(to_object @ self.in_truth, np.float64)
+
+
+def hiding_boxes(standing: Mesh, wanted: tuple[float, float], seed: tuple[int, ...]) -> Mesh:
+    """Boxes around a thing that leave a wanted share of it visible.
+
+    Args:
+        standing: the thing.
+        wanted: least and largest share of its pixels that show, in the mean over the viewpoints.
+        seed: decides the boxes.
+
+    Returns:
+        The first layout in this range, or else the one that comes nearest to it.
+    """
+    rng = np.random.default_rng(seed)
+    poses = SPHERE.poses[::SHARE_EVERY]
+    alone = SimulatedCamera(standing, SHARE_SIDE)
+    own = [alone.observe(pose).depth for pose in poses]
+    found: list[tuple[float, Mesh]] = []
+    for _ in range(LAYOUTS_TRIED):
+        boxes = boxes_around(
+            standing.vertices, int(rng.integers(FEWEST_BOXES, MOST_BOXES + 1)), rng
+        )
+        before = SimulatedCamera(boxes, SHARE_SIDE)
+        shares = []
+        for pose, depth in zip(poses, own, strict=True):
+            boxed = before.observe(pose).depth
+            shows = depth > 0
+            hidden = shows & (boxed > 0) & (boxed < depth)
+            shares.append(1 - hidden.sum() / max(1, shows.sum()))
+        share = float(np.mean(shares))
+        found.append((max(wanted[0] - share, share - wanted[1]), boxes))
+        if found[-1][0] <= 0:
+            break
+    return min(found, key=lambda pair: pair[0])[1]
+
+
+def _arrays_of(observation: Observation) -> dict[str, NDArray[Any]]:
+    """An observation as arrays; "scene" holds nothing where it has none."""
+    scene = observation.scene
+    radius = np.nan if observation.radius is None else observation.radius
+    numbers = [observation.pose.ravel(), observation.intrinsics.ravel(), np.array([radius])]
+    arrays: dict[str, NDArray[Any]] = {"depth": observation.depth}
+    if scene is not None:
+        free = np.array([float(scene.background_free)])
+        numbers += [scene.pose.ravel(), scene.intrinsics.ravel(), free]
+        arrays |= {"scene": scene.depth, "target": scene.target}
+    return arrays | {"numbers": np.concatenate(numbers)}
+
+
+def _observation(kept: dict[str, NDArray[Any]], view: int) -> Observation:
+    """The observation that some arrays hold."""
+    numbers = kept[f"{view}.numbers"]
+    scene = None
+    if f"{view}.scene" in kept:
+        pose, intrinsics, (free,) = np.split(numbers[26:], (16, 25))
+        scene = SceneView(
+            kept[f"{view}.scene"],
+            kept[f"{view}.target"],
+            pose.reshape(4, 4),
+            intrinsics.reshape(3, 3),
+            bool(free),
+        )
+    pose, intrinsics, (radius,) = np.split(numbers[:26], (16, 25))
+    return Observation(
+        kept[f"{view}.depth"],
+        pose.reshape(4, 4),
+        intrinsics.reshape(3, 3),
+        None if np.isnan(radius) else float(radius),
+        scene=scene,
+    )
+
+
+def write_arrays(file: Path, arrays: dict[str, NDArray[Any]]) -> None:
+    """Write arrays into one file, whole or not at all, in the layout of ``numpy.savez``.
+
+    Depth images are mostly empty, so that the fastest compression is nearly as good as any.
+    """
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with new_file(file, overwrite=True) as part:
+        archive = zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
+        with archive:
+            for name, values in arrays.items():
+                with archive.open(f"{name}.npy", "w") as member:
+                    np.lib.format.write_array(member, np.asanyarray(values), allow_pickle=False)
+
+
+def read_arrays(file: Path) -> dict[str, NDArray[Any]]:
+    """What ``write_arrays`` wrote; nothing if there is no such file.
+
+    Raises:
+        ResultsError: the file is damaged.
+    """
+    if not file.exists():
+        return {}
+    try:
+        with file.open("rb") as content, np.load(content, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ResultsError(f"{file}: is damaged ({error}); remove it, and run again") from None

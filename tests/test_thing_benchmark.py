@@ -1,0 +1,297 @@
+"""The benchmark of next views of taught things: scans to tables, replays, statistics."""
+
+import re
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nextview.benchmark import thing_benchmark as stage
+from nextview.benchmark.confusable import Alikeness, how_alike
+from nextview.benchmark.thing_benchmark import ThingSettings, benchmark_things
+from nextview.benchmark.thing_episodes import (
+    SPHERE,
+    VISIBLE_SHARES,
+    Setting,
+    ThingEpisode,
+    hiding_boxes,
+    read_arrays,
+)
+from nextview.benchmark.thing_policies import FixedSequence, Foresight
+from nextview.benchmark.thing_replay import EpisodeRuns, ThingRun
+from nextview.benchmark.thing_results import latex, markdown
+from nextview.benchmark.thing_tables import Compared, summarise_things
+from nextview.cli.main import main
+from nextview.errors import NextviewError, ResultsError, UsageError
+from nextview.geometry.mesh import load_mesh
+from nextview.policies.base import EpisodeState
+from nextview.recognition.evidence import Evidence
+from nextview.simulation.sensed_camera import SensedCamera
+
+SETTINGS = ThingSettings(views=(1, 2), policies=("random", "geometry"), repeats=1, samples=200)
+
+
+class FarAzimuth:
+    """A policy of a user: goes to the free view that is farthest round, and looks at its inputs."""
+
+    needs = ("joint", "outlook")
+    seen = []  # noqa: RUF012  # what it was given, for the test
+
+    def __init__(self, viewpoints):
+        self.viewpoints = viewpoints
+
+    def next_views(self, state, rng):
+        self.seen.append((state.joint, state.outlook[0].hypotheses))
+        far = np.where(state.free[0], self.viewpoints.arc[state.current[0]], -1)
+        return np.array([far.argmax()])
+
+
+@pytest.fixture(scope="module")
+def settings(knobs_memory):
+    return replace(SETTINGS, models=str(knobs_memory))
+
+
+@pytest.fixture(scope="module")
+def made(shared, knobs, settings):
+    """A folder of results."""
+    return (
+        shared("knobs_results", lambda f: benchmark_things(knobs, f / "out", settings, workers=0))
+        / "out"
+    )
+
+
+@pytest.fixture
+def results(made, tmp_path):
+    """A copy of it."""
+    return shutil.copytree(made, tmp_path / "out")
+
+
+def episode_of(knobs_memory, knobs, thing, file=None, occlusion="none"):
+    things = stage.opened(str(knobs_memory))
+    mesh = load_mesh(knobs / f"{things.names[thing]}.ply", unit="m")
+    return ThingEpisode(things, lambda: mesh, thing, 0, Setting("wrist", occlusion), file)
+
+
+# From scans to tables
+
+
+def test_the_command_prints_and_writes_tables_of_all_policies(
+    knobs, knobs_memory, results, capsys, monkeypatch
+):
+    monkeypatch.setattr(stage, "work", lambda job: pytest.fail("nothing was left to do"))
+    line = ["benchmark-things", knobs, results, "--models", knobs_memory, "--views", 1, 2]
+    line += ["--policies", "random", "geometry", "--repeats", 1, "--workers", 0]
+    main([str(word) for word in line])
+    shown = capsys.readouterr().out
+    assert "geometry" in shown
+    assert "until sure" in shown
+    text = (results / "tables.md").read_text()
+    assert text.count("| geometry | ") == 2 + 2 * 3  # two tables; three tests for each
+    for name in ("measures.csv", "tests.csv", "things.csv", "table.tex", "accuracy.png"):
+        assert (results / name).stat().st_size > 100
+
+
+def test_a_view_is_sensed_once_and_another_policy_uses_what_is_there(
+    knobs, results, settings, monkeypatch
+):
+    sensed = []
+    observe = SensedCamera.observe
+    monkeypatch.setattr(
+        SensedCamera, "observe", lambda self, pose: sensed.append(1) or observe(self, pose)
+    )
+    before = {file: file.read_bytes() for file in (results / "runs").iterdir()}
+    benchmark_things(knobs, results, settings, workers=0)
+    assert not sensed
+    assert before == {file: file.read_bytes() for file in (results / "runs").iterdir()}
+
+    FarAzimuth.seen.clear()
+    own = f"{__name__}:FarAzimuth"
+    tables = benchmark_things(knobs, results, replace(settings, policies=(own,)), workers=0)
+    assert len(sensed) <= 3  # the second view of each episode
+    assert list(tables.measures["policy"].unique()) == ["random", "geometry", own]
+    joint, hypotheses = FarAzimuth.seen[0]
+    assert joint.ndim == 3
+    assert joint.sum() == pytest.approx(1)
+    assert hypotheses.belief.sum() == pytest.approx(1)
+    assert hypotheses.poses.shape == (len(hypotheses.things), 4, 4)
+    away = SPHERE.arc.max(1)
+    travel = tables.measures.query("policy == @own and measure == 'travel, rad' and views == 2")
+    assert travel["value"].iloc[0] == pytest.approx(away.mean(), abs=away.std() + 1e-9)
+
+
+def test_what_is_kept_is_what_the_recogniser_says_of_the_same_views(knobs_memory, knobs, tmp_path):
+    file = tmp_path / "episode.npz"
+    fresh = episode_of(knobs_memory, knobs, 0, file)
+    views = [fresh.start, (fresh.start + 3) % len(SPHERE)]
+    found, _ = fresh.verified(views)
+    direct = fresh.things([fresh.observation(view) for view in sorted(views)])
+    np.testing.assert_allclose(found.belief, direct.belief, rtol=1e-4, atol=1e-12)
+    np.testing.assert_allclose(found.poses, direct.poses, atol=1e-6)
+
+    fresh.save()
+    again = episode_of(knobs_memory, knobs, 0, file)
+    again._mesh = lambda: pytest.fail("it was sensed again")
+    assert again.start == fresh.start
+    for name, values in vars(again.verified(views)[0]).items():
+        np.testing.assert_array_equal(values, getattr(found, name))
+    kept, seen = again.observation(views[0]), fresh.observation(views[0])
+    np.testing.assert_array_equal(kept.scene.depth, seen.scene.depth)
+    assert kept.radius == seen.radius
+    # Within the errors of a sensor that is a few millimetres off, at half a metre.
+    assert again.pose_error(views) < 8
+
+
+def test_what_does_not_fit_is_refused_in_one_sentence(knobs, results, settings, tmp_path):
+    with pytest.raises(ResultsError, match=r"of another seed \(0, not 1\)"):
+        benchmark_things(knobs, results, replace(settings, seed=1), workers=0)
+    with pytest.raises(ResultsError, match="of another occlusion"):
+        benchmark_things(knobs, results, replace(settings, occlusion="half"), workers=0)
+    with pytest.raises(UsageError, match="no policy is called spreed"):
+        benchmark_things(knobs, results, replace(settings, policies=("spreed",)), workers=0)
+    with pytest.raises(UsageError, match="ascend"):
+        benchmark_things(knobs, results, replace(settings, views=(2, 1)), workers=0)
+    (tmp_path / "letters").mkdir()
+    (tmp_path / "letters/mine.txt").write_text("mine")
+    with pytest.raises(ResultsError, match=r"holds mine\.txt, and no results"):
+        benchmark_things(knobs, tmp_path / "letters", settings, workers=0)
+    (tmp_path / "scans").mkdir()
+    shutil.copy(knobs / "can.ply", tmp_path / "scans")
+    with pytest.raises(NextviewError, match="holds no scan of knob"):
+        benchmark_things(tmp_path / "scans", tmp_path / "new", settings, workers=0)
+    for damaged in (b"", b"PK\x03\x04 no archive"):
+        (results / "episodes/0000_00.npz").write_bytes(damaged)
+        with pytest.raises(ResultsError, match="is damaged"):
+            read_arrays(results / "episodes/0000_00.npz")
+
+
+def test_boxes_leave_the_share_visible_that_was_asked_for(knobs_memory, knobs):
+    episode = episode_of(knobs_memory, knobs, 0, occlusion="none")
+    standing = episode.stage.standing
+    for low, high in VISIBLE_SHARES.values():
+        boxes = hiding_boxes(standing, (low, high), (0, 1))
+        camera = SensedCamera(
+            standing, episode.stage.sensor, np.random.default_rng(0), around=boxes
+        )
+        shares = [camera.visible_share(pose) for pose in SPHERE.poses]
+        assert low - 0.08 < np.mean(shares) < high + 0.08
+
+
+def test_the_thing_that_is_most_alike_is_the_one_with_a_knob(knobs_memory):
+    alike = how_alike(stage.opened(str(knobs_memory)))
+    number = {name: k for k, name in enumerate(alike.names)}
+    assert alike.nearest[number["plain"]] == number["knob"]
+    assert alike.nearest[number["knob"]] == number["plain"]
+    assert alike.confusable.sum() == 1
+    assert not alike.confusable[number["can"]]
+
+
+# Policies
+
+
+def state_at(view, visited=()):
+    mask = np.zeros((1, len(SPHERE)), bool)
+    mask[0, [view, *visited]] = True
+    nothing = Evidence(np.zeros((1, 1)))
+    return EpisodeState(np.array([view]), mask, np.ones((1, 1)), nothing, len(visited) + 1)
+
+
+def test_the_fixed_sequence_comes_to_all_views_of_its_ring():
+    taken = [8]
+    for _ in range(7):
+        state = state_at(taken[-1], taken)
+        taken.append(int(FixedSequence(SPHERE).next_views(state, np.random.default_rng(0))[0]))
+    assert sorted(taken) == list(range(8, 16))
+    assert taken[1] == 11  # three steps of 45 degrees ahead
+    after = FixedSequence(SPHERE).next_views(state_at(taken[-1], taken), np.random.default_rng(0))
+    assert int(after[0]) not in taken
+
+
+def test_foresight_goes_where_the_truth_is_believed_most():
+    class Known:
+        def belief_in_truth(self, views):
+            return {1: 0.2, 7: 0.9}.get(views[-1], 0.5) if len(views) > 1 else 0.4
+
+    assert Foresight(Known()).next_views(state_at(1), np.random.default_rng(0))[0] == 7
+
+
+# Statistics
+
+
+def runs_of(thing, right, confidence, views, draw=0, policy="random"):
+    pose = [1.0 if each else None for each in right]
+    times = [0.01] * (len(views) - 1)
+    made = ThingRun(views, right, confidence, times, [0.1] * len(views), pose)
+    return EpisodeRuns(thing, draw, {policy: [made]})
+
+
+def both(thing, random, other):
+    """An episode with two policies, each (right, confidence, views)."""
+    runs = {}
+    for policy, given in (("random", random), ("spread", other)):
+        runs |= runs_of(thing, *given, policy=policy).runs
+    return EpisodeRuns(thing, 0, runs)
+
+
+def test_measures_are_those_of_a_hand_count():
+    wrong = ([False, False, True], [0.5, 0.98, 0.6], [0, 4, 1])
+    good = ([False, True, True], [0.5, 0.9, 0.99], [0, 4, 2])
+    episodes = [both("a_x", wrong, good), both("a_y", good, good), both("b_x", wrong, good)]
+    alike = Alikeness(("a_x", "a_y", "b_x"), np.array([1, 0, 0]), np.array([0.1, 0.2, 0.3]))
+    how = Compared(("random", "spread"), (1, 2, 3), 0.97, True, 2000)
+    tables = summarise_things(episodes, alike, how)
+    rows = tables.measures.set_index(["things", "policy", "measure", "views"])["value"]
+    random = rows["all", "random"]
+    assert random["accuracy", 2] == pytest.approx(1 / 3)
+    assert random["accuracy", 3] == 1
+    assert random["views until sure", 0] == pytest.approx((2 + 3 + 2) / 3)
+    assert random["sure", 0] == 1
+    assert random["wrong, of the sure", 0] == pytest.approx(2 / 3)
+    assert random["pose error, 95 %", 3] == 1
+    steps = np.pi / 4 * np.cos(SPHERE.elevation[0])
+    assert random["travel, rad", 2] == pytest.approx(np.pi * np.cos(SPHERE.elevation[0]), abs=0.2)
+    assert steps > 0
+    difference = tables.tests.query("things == 'all' and measure == 'accuracy' and views == 2")
+    assert difference["difference"].iloc[0] == pytest.approx(2 / 3)
+    # Two families: in a quarter of the samples both draws are the family b, and so on.
+    assert difference["low"].iloc[0] == pytest.approx(0.5)
+    assert difference["high"].iloc[0] == pytest.approx(1)
+    assert (rows["confusable half", "random"]["accuracy", 2]) == 0
+
+
+def test_no_difference_is_no_discovery_and_a_sure_one_is():
+    rng = np.random.default_rng(1)
+    names = tuple(f"t{k}" for k in range(60))
+    alike = Alikeness(names, np.zeros(60, int), np.arange(60.0))
+    how = Compared(("random", "spread"), (1, 2), 0.97, False, 2000)
+    found = []
+    for lead in (0.0, 0.5):
+        episodes = []
+        for name in names:
+            by_random, by_spread = rng.random(2) < (0.5, 0.5 + lead)
+            episodes.append(
+                both(
+                    name,
+                    ([False, bool(by_random)], [0.5, 0.6], [0, 1]),
+                    ([False, bool(by_spread)], [0.5, 0.6], [0, 1]),
+                )
+            )
+        tests = summarise_things(episodes, alike, how).tests
+        accuracy = tests[(tests["measure"] == "accuracy") & (tests["things"] == "all")]
+        found.append(float(accuracy["p_holm"].iloc[0]))
+    assert found[0] > 0.05
+    assert found[1] < 1e-3
+
+
+def test_the_latex_table_is_whole_and_names_are_escaped(results, knobs, settings):
+    own = f"{__name__}:FarAzimuth"
+    tables = benchmark_things(knobs, results, replace(settings, policies=(own,)), workers=0)
+    tables.measures["policy"] = tables.measures["policy"].replace(own, "my_module:Best_50%")
+    text = latex(tables)
+    assert r"Best\_50\%" in text
+    assert text.count("{") == text.count("}")
+    columns = re.search(r"tabular\}\{@\{\}(\w+)@", text).group(1)
+    bodies = [line for line in text.splitlines() if line.endswith(r"\\") and "&" in line]
+    assert len(bodies) == 1 + 2 * 3
+    assert all(len(re.findall(r"(?<!\\)&", line)) == len(columns) - 1 for line in bodies)
+    assert "| my_module:Best_50% |" in markdown(tables)
