@@ -64,6 +64,7 @@ __all__ = [
     "Recognition",
     "ResultsError",
     "RiskError",
+    "Scene",
     "Session",
     "SessionError",
     "SimulatedCamera",
@@ -81,7 +82,11 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """The simulated camera and ``learn``, imported when they are used: a robot does without."""
+    """``Scene``, the simulated camera and ``learn``, imported when they are used."""
+    if name == "Scene":
+        from nextview.scene.scene import Scene
+
+        return Scene
     if name == "SimulatedCamera":
         from nextview.simulation.simulated import SimulatedCamera
 

@@ -62,6 +62,10 @@ BELOW = 0.02
 AHEAD = 16  # half the width of the middle of the picture, as a part of the picture
 MASK_POINTS = 2000  # pixels of a mask that tell where its bottom is
 TOO_LITTLE = "too little is seen of the object"
+NO_SUPPORT = (
+    "no support plane is seen below the camera: give a mask or a box, or check the pose (inverse?"
+    " OpenGL axes?) and which way is up"
+)
 NO_PLANE = ViewWarning(
     "support",
     "no support plane is seen, so where the object ends below is guessed: support=False if it"
@@ -247,30 +251,13 @@ class ObservedObject:
         last = before.sightings[-1].frame if before.sightings else None
         self._refuse(frame, last)
 
-        few = slice(None, None, max(1, frame.shape[0] // ROWS))
-        noise = estimate_noise(frame.depth[few], frame.depth[few] > 0)
+        noise = noise_of(frame)
         seen = frame.depth > 0 if frame.mask is None else (frame.depth > 0) & ~frame.mask
         samples = sample(frame, seen, noise)
         plane, up, rng = self._support(frame, samples)
 
-        ahead = frame.camera_to_world[:3, 2]
-        down = frame.camera_to_world[:3, 1]
-        front = -ahead if abs(ahead @ up) < 0.99 else down  # from above the bottom of the image
-        axes = upright_axes(up, front) if before.frame is None else before.frame.axes
-
         sightings, cell, two = self._find(frame, upright_axes(up), plane, samples, noise)
-        latest = self._estimate(sightings, axes)
-        if before.frame is not None and _same(latest, before.frame):
-            latest = before.frame
-
-        made = list(before.observations)
-        for i, (sighting, old) in enumerate(zip(sightings, before.sightings, strict=False)):
-            if latest is not before.frame or sighting is not old:
-                made[i] = self._observe(sighting, latest)
-        revision = before.revision + any(
-            new is not old for new, old in zip(made, before.observations, strict=True)
-        )
-        made.append(self._observe(sightings[-1], latest))
+        latest, made, revision = self._seen_as(sightings, up)
 
         warnings = self._warnings(frame, latest, made, up, two)
         warnings += [NO_PLANE] * (self.support and plane is None and self.known is None)
@@ -287,6 +274,66 @@ class ObservedObject:
             cell,
             before.joins,
         )
+
+    def find_support(self, frame: Frame) -> Plane:
+        """Find the plane in a first frame on which the object would stand.
+
+        Args:
+            frame: the frame; it is not taken in.
+
+        Raises:
+            ObservationError: no support plane is seen.
+        """
+        plane, _, _ = self._support(frame, sample(frame, frame.depth > 0, noise_of(frame)))
+        if plane is None:
+            raise ObservationError(NO_SUPPORT)
+        return plane
+
+    def take_sightings(self, sightings: Sequence[Sighting], up: Float) -> None:
+        """Know the object by some sightings, whatever was known of it before.
+
+        Sightings that were known already keep their observations as long as the object frame stays
+        as it was.
+
+        Args:
+            sightings: at least one, see ``sighting_of``.
+            up: direction against gravity, (3,), world.
+
+        Raises:
+            ObservationError: what is seen of the object has no size.
+        """
+        before = self.state
+        latest, made, revision = self._seen_as(sightings, up)
+        warnings = check_observation(made[-1])
+        for view in made[-4:-1]:
+            warnings = warnings or check_views(view, made[-1])
+        self.state = replace(
+            before,
+            frame=latest,
+            sightings=tuple(sightings),
+            observations=tuple(made),
+            warnings=tuple(warnings),
+            revision=revision,
+        )
+
+    def _seen_as(
+        self, sightings: Sequence[Sighting], up: Float
+    ) -> tuple[ObjectFrame, list[Observation], int]:
+        """The object frame by some sightings, an observation of each, and the new revision."""
+        before = self.state
+        first = sightings[0].frame.camera_to_world
+        ahead = first[:3, 2]
+        front = -ahead if abs(ahead @ up) < 0.99 else first[:3, 1]  # from above: the bottom
+        axes = upright_axes(up, front) if before.frame is None else before.frame.axes
+
+        latest = self._estimate(sightings, axes)
+        if before.frame is not None and _same(latest, before.frame):
+            latest = before.frame
+        known = zip(before.sightings, before.observations, strict=True)
+        kept = {id(old): seen for old, seen in known if latest is before.frame}
+        made = [kept.get(id(one)) or self._observe(one, latest) for one in sightings]
+        changed = any(new is not old for new, old in zip(made, before.observations, strict=False))
+        return latest, made, before.revision + changed
 
     def _refuse(self, frame: Frame, last: Frame | None) -> None:
         """Refuse what is no frame, does not fit those before, or is too far from the object."""
@@ -470,13 +517,9 @@ class ObservedObject:
         elif plane is not None:
             return self._on_the_plane(frame, axes, plane, samples, noise)
         else:
-            what = (
-                "give a mask or a box, or check the pose (inverse? OpenGL axes?) and which way"
-                " is up"
-            )
-            raise ObservationError(f"no support plane is seen below the camera: {what}")
+            raise ObservationError(NO_SUPPORT)
         return (
-            [*self.state.sightings, self._sighting(frame, mask, plane, noise)],
+            [*self.state.sightings, self.sighting_of(frame, mask, plane, noise)],
             self.state.cell,
             False,
         )
@@ -525,7 +568,7 @@ class ObservedObject:
             )
 
         sightings = self._reconsidered(labels[:-1], target)
-        latest = replace(self._sighting(frame, mask, plane, noise), footprint=foot, chosen=chosen)
+        latest = replace(self.sighting_of(frame, mask, plane, noise), footprint=foot, chosen=chosen)
         return [*sightings, latest], cell, bool(two[target])
 
     def _distance(
@@ -564,7 +607,7 @@ class ObservedObject:
                     )
                     # what was taken for the object was what hid it
                     with suppress(ObservationError):
-                        mended = self._sighting(
+                        mended = self.sighting_of(
                             s.frame, s.footprint.pixels_of(now), s.plane, s.noise
                         )
                     s = replace(mended, footprint=s.footprint, chosen=now)
@@ -619,7 +662,18 @@ class ObservedObject:
             )
         return clusters.central(footprints[-1], labels[-1], ground, optical_axis)
 
-    def _sighting(self, frame: Frame, mask: Mask, plane: Plane | None, noise: Noise) -> Sighting:
+    def sighting_of(self, frame: Frame, mask: Mask, plane: Plane | None, noise: Noise) -> Sighting:
+        """What the pixels of the object show of it.
+
+        Args:
+            frame: the frame.
+            mask: the object's pixels, (H, W) bool.
+            plane: that the object stands on; None if it is not seen.
+            noise: of the frame's depth.
+
+        Raises:
+            ObservationError: too little is seen of the object.
+        """
         if mask.sum() < FEWEST:
             raise ObservationError(TOO_LITTLE)
         part = within(mask, 2)
@@ -681,6 +735,12 @@ def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
     k[:2, 2] += 0.5 - (step // 2 + 0.5) / step
     few = (slice(step // 2, None, step),) * 2
     return SceneView(sighting.frame.depth[few] / np.float32(radius), sighting.mask[few], pose, k)
+
+
+def noise_of(frame: Frame) -> Noise:
+    """The noise of all that a frame shows."""
+    few = slice(None, None, max(1, frame.shape[0] // ROWS))
+    return estimate_noise(frame.depth[few], frame.depth[few] > 0)
 
 
 def _ahead(frame: Frame) -> Float:

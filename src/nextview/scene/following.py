@@ -1,0 +1,211 @@
+"""The same objects in another frame: whose pixels are whose, what moved, and what is gone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
+
+from nextview.scene.tracks import Track, render_track
+from nextview.sensing.frame import Frame
+from nextview.sensing.object_frame import upright_axes
+from nextview.sensing.tabletop import TableTop
+
+Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+MARGIN = 0.012  # metres around an object, seen from above, within which pixels may be its own
+SAME_PLACE = 0.5  # share of a segment over an object, from which it is that object
+SECOND = 0.2  # share of a segment over another object, from which the segment is cut
+COMPARED = 400  # points of a segment that are looked at
+FEWEST_TESTED = 30  # pixels in which an object should show before it is called gone
+GONE = 0.6  # share of these through which something behind it is seen
+STEP_BEHIND = 0.02  # metres by which that lies behind it, at least
+THERE = 0.6  # share of the pixels in which it should show, from which an object is seen again
+FEWEST_AGAINST = 2  # objects that a frame with a wrong pose contradicts, at least
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """An object seen from above.
+
+    Attributes:
+        sides: lines a x + b y + c <= 0 inside, metres, (K, 3).
+        axes: x and y in the world, (2, 3).
+    """
+
+    sides: Float
+    axes: Float
+
+    @classmethod
+    def of(cls, track: Track, up: Float) -> Outline | None:
+        """That of an object: of its scan where it was named, else of what was seen of it."""
+        axes = upright_axes(up)[:2]
+        posed = track.posed
+        if posed is not None and posed.vertices is not None:
+            points = posed.vertices @ posed.pose[:3, :3].T + posed.pose[:3, 3]
+        else:
+            points = np.concatenate([sighting.hull for sighting in track.thing.sightings])
+        flat = points @ axes.T
+        around = MARGIN / 4 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1.0]])
+        with suppress(QhullError):
+            hull = ConvexHull((flat[:, None] + around).reshape(-1, 2))
+            return cls(hull.equations, axes)
+        return None
+
+    def holds(self, points: Float) -> Mask:
+        """Which points, (N, 3), lie inside of it or beside it, seen from above, (N,) bool."""
+        flat = points @ self.axes.T
+        return np.asarray((flat @ self.sides[:, :2].T + self.sides[:, 2] <= MARGIN).all(1))
+
+
+def assign(
+    segments: Sequence[Mask], tracks: Sequence[Track], top: TableTop
+) -> tuple[dict[int, Mask], list[Mask]]:
+    """Tell whose pixels the segments of a frame are.
+
+    Args:
+        segments: of the frame, (H, W) bool each.
+        tracks: the objects known so far.
+        top: what the frame shows.
+
+    Returns:
+        The pixels of each object that the frame shows, by its row; and the segments of no object.
+    """
+    outlines = [Outline.of(track, top.up) for track in tracks]
+    own: dict[int, Mask] = {}
+    new = []
+    for segment in segments:
+        points = _points(segment, top.frame)
+        shares = np.array(
+            [0.0 if one is None else float(one.holds(points).mean()) for one in outlines]
+        )
+        rows = np.flatnonzero(shares >= SECOND)
+        best = int(shares.argmax()) if len(shares) else -1
+        if best < 0 or shares[best] < SAME_PLACE:
+            new.append(segment)
+        elif len(rows) == 1:
+            own[best] = own.get(best, np.zeros_like(segment)) | segment
+        else:
+            for row, mask in _divided(segment, rows, tracks, outlines, top).items():
+                own[row] = own.get(row, np.zeros_like(segment)) | mask
+    return own, new
+
+
+def _points(mask: Mask, frame: Frame) -> Float:
+    """Some points that pixels show, (N, 3), world, metres."""
+    rows, columns = np.nonzero(mask & (frame.depth > 0))
+    few = slice(None, None, max(1, len(rows) // COMPARED))
+    return frame.positions(rows[few], columns[few])
+
+
+def _divided(
+    segment: Mask,
+    rows: NDArray[np.int64],
+    tracks: Sequence[Track],
+    outlines: Sequence[Outline | None],
+    top: TableTop,
+) -> dict[int, Mask]:
+    """Divide the pixels of a segment among several objects: each to what explains it, or to the
+    nearest that does.
+    """
+    label = np.zeros(segment.shape, np.int64)
+    for row in rows:
+        outline = outlines[row]
+        rendered = render_track(tracks[row], top, -1, tracks[row].posed)
+        if rendered is not None:
+            explained = rendered.explained(segment.shape) & segment
+        else:
+            assert outline is not None
+            at = np.nonzero(segment)
+            explained = np.zeros_like(segment)
+            explained[at] = outline.holds(top.frame.positions(*at))
+        label[explained & (label == 0)] = row + 1
+    if not label.any():
+        return {int(rows[0]): segment}
+    nearest = ndimage.distance_transform_edt(
+        label == 0, return_distances=False, return_indices=True
+    )
+    label = np.where(segment, label[tuple(nearest)], 0)
+    return {int(row): label == row + 1 for row in rows if (label == row + 1).any()}
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How a frame agrees with an object that it may show.
+
+    Attributes:
+        tested: pixels in which the object would show if it stood alone, and a depth was measured.
+        seen: share of them in which it is.
+        through: share of them in which something behind it is seen.
+    """
+
+    tested: int
+    seen: float
+    through: float
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the object cannot be where it was."""
+        return self.tested >= FEWEST_TESTED and self.through >= GONE
+
+    @property
+    def confirms(self) -> bool:
+        """Whether the object is where it was."""
+        return self.tested >= FEWEST_TESTED and self.seen >= THERE
+
+
+def agreement(track: Track, top: TableTop) -> Agreement:
+    """How a frame, which was not taken in yet, agrees with an object.
+
+    Args:
+        track: the object.
+        top: what the frame shows.
+    """
+    rendered = render_track(track, top, -1, track.posed)
+    if rendered is None:
+        return _agreement_of_points(track, top.frame)
+    tested = rendered.agrees | rendered.hidden | rendered.through
+    inner = tested & ndimage.binary_erosion(np.isfinite(rendered.depth), iterations=2)
+    count = int(np.count_nonzero(inner))
+    if not count:
+        return Agreement(0, 0.0, 0.0)
+    return Agreement(
+        count,
+        float((rendered.agrees & inner).sum() / count),
+        float((rendered.through & inner).sum() / count),
+    )
+
+
+def _agreement_of_points(track: Track, frame: Frame) -> Agreement:
+    """The same for an object of unknown shape, by the points of it that were seen last."""
+    last = track.thing.sightings[-1]
+    few = slice(None, None, max(1, len(last.facets.planes) // COMPARED))
+    pose = last.frame.camera_to_world
+    points = last.facets.some(few).points @ pose[:3, :3].T + pose[:3, 3]
+    now = frame.camera_to_world
+    in_camera = (points - now[:3, 3]) @ now[:3, :3]
+    in_camera = in_camera[in_camera[:, 2] > 0.01]
+    at = in_camera[:, :2] / in_camera[:, 2:] * frame.intrinsics[[0, 1], [0, 1]]
+    column, row = np.floor(at + frame.intrinsics[:2, 2]).astype(np.int64).T
+    inside = (row >= 0) & (row < frame.shape[0]) & (column >= 0) & (column < frame.shape[1])
+    depth = frame.depth[row[inside], column[inside]]
+    off = (depth - in_camera[inside, 2])[depth > 0]
+    if not len(off):
+        return Agreement(0, 0.0, 0.0)
+    return Agreement(
+        len(off),
+        float((np.abs(off) < STEP_BEHIND).mean()),
+        float((off > STEP_BEHIND).mean()),
+    )
+
+
+def contradicted(found: Sequence[Agreement]) -> bool:
+    """Whether a frame contradicts so many objects that its pose is wrong, not that they moved."""
+    against = sum(one.contradicts for one in found)
+    return against >= FEWEST_AGAINST and against >= sum(one.confirms for one in found)

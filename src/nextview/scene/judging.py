@@ -1,0 +1,157 @@
+"""What each of several objects is, by all views of it. Networks judge all of them at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.geometry.observation import Observation
+from nextview.geometry.viewsphere import azimuth_of, direction_of
+from nextview.recognition.belief import MUCH, log_evidence_of
+from nextview.recognition.evidence import Evidence
+from nextview.recognition.novelty import ViewScore
+from nextview.recognition.protocol import JointBelief, JudgesTogether
+from nextview.sensing.observed_object import ObservedObject
+from nextview.session.pose_frame import PoseFrame
+from nextview.session.recognition import SUSPICIOUS, Recognition
+from nextview.session.session import THING_SIZE
+from nextview.session.system import System
+from nextview.session.view import View
+
+Float = NDArray[np.float64]
+
+
+class Judge:
+    """Says what objects are, by all views of each.
+
+    It keeps what the networks said of an observation as long as that is in use.
+    """
+
+    def __init__(self, system: System, threads: int) -> None:
+        """Take over the recogniser and the rules of a system.
+
+        Args:
+            system: with the models, the stopping rule, and the share of unknown objects.
+            threads: objects that are judged at the same time.
+        """
+        self.system = system
+        self._threads = threads
+        self._said: WeakKeyDictionary[Observation, Evidence] = WeakKeyDictionary()
+
+    def __call__(self, things: Sequence[ObservedObject]) -> list[Recognition]:
+        """Judge some objects.
+
+        Args:
+            things: each with one view at least.
+
+        Returns:
+            What each is, in their order.
+        """
+        self._ask([seen for thing in things for seen in thing.observations])
+        if len(things) < 2 or self._threads < 2:
+            return [self._judged(thing) for thing in things]
+        with ThreadPoolExecutor(self._threads) as pool:
+            return list(pool.map(self._judged, things))
+
+    def _ask(self, observations: Sequence[Observation]) -> None:
+        """Run the networks on observations that they have not seen."""
+        new = [seen for seen in observations if seen.seen and seen not in self._said]
+        if not new:
+            return
+        found = self.system.models.recogniser(new)
+        for row, seen in enumerate(new):
+            self._said[seen] = found.select([row])
+
+    def _judged(self, thing: ObservedObject) -> Recognition:
+        """What one object is, by all of its views."""
+        system = self.system
+        recogniser = system.models.recogniser
+        seen = [one for one in thing.observations if one.seen]
+        joint = None
+        views = self._views(thing.observations)
+        if seen and isinstance(recogniser, JudgesTogether):
+            total = np.sum([self._log_evidence(one) for one in seen], axis=0)
+            joint = recogniser.together(seen, total, len(seen))
+            views[-1] = replace(views[-1], belief=joint.belief, joint=joint)
+
+        result = Recognition(
+            tuple(views),
+            system.classes,
+            False,
+            system.sphere,
+            system.stopping,
+            score=recogniser.novelty,
+            unknown_rate=system.unknown,
+            impossible=self._impossible(thing),
+            poses_in=PoseFrame.of(thing),
+        )
+        return replace(result, confident=self._confident(result, joint))
+
+    def _log_evidence(self, seen: Observation) -> NDArray[np.floating]:
+        """What the networks say of a view, in a form that can be summed over views, (D,)."""
+        found = self._said[seen]
+        azimuth = azimuth_of(direction_of(seen.pose)[None])
+        return np.asarray(log_evidence_of(found.logits, found.azimuth_bins, azimuth)[0])
+
+    def _views(self, observations: Sequence[Observation]) -> list[View]:
+        """The views of an object, each with what it says alone and with those before it."""
+        calibration = self.system.models.recogniser.calibration
+        sphere = self.system.sphere
+        classes = len(self.system.classes)
+        even = np.full(classes, 1 / classes)
+        total: NDArray[np.floating] = np.zeros(())
+        counted = 0
+        belief = even
+        views = []
+        for seen in observations:
+            alone = even
+            score: ViewScore | None = None
+            if seen.seen:
+                own = self._log_evidence(seen)
+                total = total + own
+                counted += 1
+                alone = calibration.belief(own, 1, classes)
+                belief = calibration.belief(total, counted, classes)
+                novelty = self._said[seen].novelty
+                score = None if novelty is None else novelty[0]
+            direction = direction_of(seen.pose)
+            view = View(
+                sphere.nearest(direction)[0],
+                seen,
+                alone=alone,
+                belief=belief,
+                maps={},
+                next_view=None,
+                travel=0.0,
+                arc=0.0,
+                direction=direction,
+                score=score,
+            )
+            views.append(view)
+        return views
+
+    def _impossible(self, thing: ObservedObject) -> tuple[str, ...]:
+        """Classes whose objects have not the size of this one."""
+        recogniser = self.system.models.recogniser
+        card = getattr(recogniser, "card", None)  # a recogniser of your own has none
+        radius = thing.observations[-1].radius
+        if card is None or card.size is None or radius is None:
+            return ()
+        things = bool(recogniser.calibration.hypotheses)
+        wrong = card.size.impossible(radius, THING_SIZE if things else MUCH)
+        return tuple(name for name, off in zip(self.system.classes, wrong, strict=True) if off)
+
+    def _confident(self, result: Recognition, joint: JointBelief | None) -> bool:
+        """Whether the belief is high enough, and the object fits what it is taken for."""
+        system = self.system
+        if not result.seen or result.unknown:
+            return False
+        counted = sum(view.observation.seen for view in result.views)
+        if not bool(system.stopping.reached(result.views[-1].belief, counted)):
+            return False
+        return result.novelty is None or result.novelty >= SUSPICIOUS * system.unknown

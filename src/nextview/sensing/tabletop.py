@@ -1,0 +1,195 @@
+"""All things that stand on the support plane of one frame, each with its pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from nextview.sensing import clusters, segmentation
+from nextview.sensing.clusters import Joins
+from nextview.sensing.facets import Noise
+from nextview.sensing.frame import Frame, within
+from nextview.sensing.mask_edges import trimmed
+from nextview.sensing.object_frame import Box, upright_axes
+from nextview.sensing.observed_object import FEWEST, ObservedObject, noise_of
+from nextview.sensing.pieces import STANDS, Pieces, cut
+from nextview.sensing.segmentation import Plane, Samples, sample
+from nextview.sensing.walls import before_walls, find_walls
+
+Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LOWEST_TOP = 0.008  # metres above the plane that a thing reaches, at least: else it is a stain
+LOWEST_SHARE = 0.012  # the same as a part of its distance, where the depth is less exact
+TOP_SHARE = 0.9  # share of a thing's pixels that are below its top, flying pixels left out
+SMALLEST_AREA = 1.5e-4  # square metres that are seen of a thing, at least: of a die a little more
+THINNEST = 0.006  # metres across a thing at its thickest, at least: scraps of edges are thinner
+NEAR_PLANE = 0.015  # metres from the plane within which what is seen is likely to be the plane's
+UNEVEN = 3.0  # deviations of the plane's own pixels above which something stands on it
+MEDIAN_DEVIATION = 1.4826  # of a Gaussian, by the median of what it deviates
+TOUCHING = 4  # pixels between two things in the picture, at most, if they may be one
+TOUCHING_STEP = 0.015  # metres between their depths there, at most
+BESIDE_POINTS = 200  # pixels at a border that are compared
+
+
+@dataclass(frozen=True, eq=False)
+class TableTop:
+    """What one frame shows on its support plane.
+
+    Attributes:
+        frame: the frame.
+        noise: of its depth.
+        plane: that things stand on.
+        up: direction against gravity, (3,), world.
+        above: pixels above the plane, before all walls and inside the region, (H, W) bool.
+        free: pixels before all walls, (H, W) bool; None where there is no wall.
+        height: of each pixel over the plane, (H, W) float32, metres.
+    """
+
+    frame: Frame
+    noise: Noise
+    plane: Plane
+    up: Float
+    above: Mask
+    free: Mask | None
+    height: NDArray[np.float32]
+
+    @classmethod
+    def of(
+        cls,
+        frame: Frame,
+        up: Float | None,
+        earlier: Plane | None = None,
+        known: Sequence[tuple[Float, float]] = (),
+        region: Box | None = None,
+    ) -> TableTop:
+        """Find the support plane of a frame, and what is above it.
+
+        Args:
+            frame: of a depth camera; a mask, if it has one, says where is looked.
+            up: direction against gravity, (3,), world; None: the normal of the plane.
+            earlier: the plane as an earlier frame shows it.
+            known: centres, (3,), and radii of things that stand on it, metres.
+            region: what is outside of this upright box is left out.
+
+        Raises:
+            ObservationError: no support plane is seen.
+        """
+        noise = noise_of(frame)
+        samples = sample(frame, frame.depth > 0, noise)
+        if earlier is None:
+            plane = ObservedObject(up if frame.pose is not None else None).find_support(frame)
+        else:
+            plane = segmentation.find_again(earlier, samples, _near(samples, known))
+
+        above = segmentation.above_plane(frame, plane, noise)
+        walls = find_walls(samples, plane, np.random.default_rng(0))
+        free = before_walls(frame, walls, noise) if walls else None
+        if free is not None:
+            above &= free
+        if frame.mask is not None:
+            above &= frame.mask
+        if region is not None:
+            above &= segmentation.inside_box(frame, region)
+        height = frame.along(plane.normal, plane.offset)
+        above &= height > UNEVEN * _unevenness(frame, height)
+        upwards = plane.normal if up is None or frame.pose is None else up
+        return cls(frame, noise, plane, upwards, above, free, height)
+
+    def segments(self, pixels: Mask | None = None, joins: Joins = "by their border") -> list[Mask]:
+        """Cut what is above the plane into things, by their edges and how they lie from above.
+
+        Args:
+            pixels: which of those above the plane are looked at, (H, W) bool; all by default.
+            joins: whether what touches is one thing, see ``clusters.clusters``.
+
+        Returns:
+            The pixels of each thing, (H, W) bool each, those with most pixels first. Stains and
+            scraps of edges are left out.
+        """
+        above = self.above if pixels is None else self.above & pixels
+        if np.count_nonzero(above) < FEWEST:
+            return []
+        frame = self.frame
+        pieces = cut(frame.depth, above, self.height, self.noise, self.free)
+        axes = upright_axes(self.up)
+        away = float(np.median(frame.depth[above]))
+        cell = clusters.CELL * away
+        rows, columns = np.nonzero(above)
+        few = slice(None, None, max(1, len(rows) // 1000))
+        middle = np.median(frame.positions(rows[few], columns[few]), axis=0) @ axes[:2].T
+        foot = clusters.footprint(frame, pieces, axes, cell, middle / cell)
+        (labels,), _ = clusters.clusters([foot], joins)
+
+        of_piece = _clusters_of_pieces(foot.piece, labels, pieces)
+        found = []
+        for label in range(1, int(of_piece.max(initial=0)) + 1):
+            mask = (of_piece == label)[pieces.grown]
+            if np.count_nonzero(mask) >= FEWEST:
+                mask = trimmed(frame.depth, mask, self.noise, self.height > STANDS * frame.depth)
+            if self.is_thing(mask):
+                found.append(mask)
+        return sorted(found, key=lambda mask: -np.count_nonzero(mask))
+
+    def is_thing(self, mask: Mask) -> bool:
+        """Whether some pixels, (H, W) bool, are enough, and high enough, to be a thing."""
+        part = within(mask)
+        own = mask[part] & (self.frame.depth[part] > 0)
+        count = np.count_nonzero(own)
+        if count < FEWEST:
+            return False
+        away = float(np.median(self.frame.depth[part][own]))
+        top = float(np.quantile(self.height[part][own], TOP_SHARE))
+        focal = self.frame.intrinsics[0, 0] * self.frame.intrinsics[1, 1]
+        area = count * away**2 / focal
+        if top < max(LOWEST_TOP, LOWEST_SHARE * away) or area < SMALLEST_AREA:
+            return False
+        half = round(float(np.sqrt(focal)) * THINNEST / 2 / away)
+        filled = ndimage.binary_closing(np.pad(mask[part], 1))
+        return bool(ndimage.binary_erosion(filled, np.ones((3, 3), bool), max(half, 1)).any())
+
+    def touching(self, one: Mask, other: Mask) -> bool:
+        """Whether two things, (H, W) bool each, meet in the picture and in depth."""
+        near = within(one, TOUCHING + 1)
+        if not other[near].any():
+            return False
+        away, nearest = ndimage.distance_transform_edt(~one[near], return_indices=True)
+        beside = np.nonzero(other[near] & (away <= TOUCHING))
+        if not len(beside[0]):
+            return False
+        few = slice(None, None, max(1, len(beside[0]) // BESIDE_POINTS))
+        rows, columns = beside[0][few], beside[1][few]
+        depth = self.frame.depth[near]
+        own = depth[nearest[0][rows, columns], nearest[1][rows, columns]]
+        its = depth[rows, columns]
+        known = (own > 0) & (its > 0)
+        step = np.abs(own - its)[known]
+        return bool(len(step)) and float(np.median(step)) < TOUCHING_STEP
+
+
+def _unevenness(frame: Frame, height: NDArray[np.float32]) -> float:
+    """How far the plane's own pixels deviate from it, metres: noise that they have in common."""
+    few = (slice(None, None, 4), slice(None, None, 4))
+    seen = height[few][(frame.depth[few] > 0) & (np.abs(height[few]) < NEAR_PLANE)]
+    return MEDIAN_DEVIATION * float(np.median(np.abs(seen))) if len(seen) else 0.0
+
+
+def _near(samples: Samples, known: Sequence[tuple[Float, float]]) -> Mask:
+    """Which samples lie in one of some spheres, (N,) bool."""
+    near = np.zeros(len(samples.points), bool)
+    for centre, radius in known:
+        near |= np.linalg.norm(samples.points - centre, axis=1) < radius
+    return near
+
+
+def _clusters_of_pieces(
+    piece: NDArray[np.int64], labels: NDArray[np.int64], pieces: Pieces
+) -> NDArray[np.int64]:
+    """The cluster of each piece, (pieces + 1,), 0 for none."""
+    found = np.zeros(len(pieces.stands), np.int64)
+    found[piece] = labels
+    return found

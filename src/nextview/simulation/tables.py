@@ -1,0 +1,220 @@
+"""Simulated tables with several things on them, at true size, and a depth camera over them.
+
+Things stand or lie on a table in one of their resting poses, side by side with gaps of up to some
+centimetres. A camera in the robot's world looks at them through a sensor with its errors: those of
+the depth, of the camera's pose, and of the robot's vertical. Everything is in metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from nextview.errors import ObservationError, UsageError
+from nextview.geometry.mesh import UNITS, Mesh
+from nextview.geometry.ray_caster import RayCaster, Triangles, pixel_rays
+from nextview.geometry.resting import resting_poses
+from nextview.geometry.viewsphere import look_at_origin, rotation_z
+from nextview.sensing.frame import Frame
+from nextview.simulation.scene import footprint, separation, upright_boxes
+from nextview.simulation.sensor import Sensor
+
+Float = NDArray[np.float64]
+
+WIDEST_GAP = 0.10  # metres between neighbours, at most
+TABLE_SIDES = (1.5, 1.1)  # metres
+TABLE_THICKNESS = 0.03  # metres
+TABLE_HEIGHT = 0.75  # metres above the floor
+FLOOR_SIDE = 8.0  # metres
+STEP_OUTWARDS = 0.005  # metres by which a thing is moved outwards until it fits
+MOST_STEPS = 200
+TRIES = 100
+REACH = 0.36  # metres from the middle of the table within which things stand
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedThing:
+    """A thing on a table.
+
+    Attributes:
+        name: what it is called.
+        vertices: in the frame of its file, (V, 3) float64, metres.
+        faces: triangles, (F, 3) int32.
+        pose: from the frame of its file into that of the table, (4, 4) float64, metres.
+    """
+
+    name: str
+    vertices: Float
+    faces: NDArray[np.int32]
+    pose: Float
+
+    @property
+    def placed(self) -> Float:
+        """The vertices in the frame of the table, (V, 3), metres."""
+        return self.vertices @ self.pose[:3, :3].T + self.pose[:3, 3]
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedTable:
+    """Things on a table whose top is the plane z = 0, its middle at the origin.
+
+    Attributes:
+        things: what stands on it.
+    """
+
+    things: tuple[PlacedThing, ...]
+
+    @classmethod
+    def draw(
+        cls, meshes: Sequence[Mesh], rng: np.random.Generator, gap: float = WIDEST_GAP
+    ) -> SimulatedTable:
+        """Put meshes on a table, each in one of its resting poses and turned at random.
+
+        The first stands near the middle. Each further one is moved outwards from one of those that
+        stand already, until it is as far from all of them as was drawn.
+
+        Args:
+            meshes: of known unit.
+            rng: draws poses, places and gaps.
+            gap: metres between neighbours, at most; down to 0.
+
+        Raises:
+            UsageError: the unit of a mesh is not known, or the things do not fit on the table.
+        """
+        things: list[PlacedThing] = []
+        outlines: list[Float] = []
+        for mesh in meshes:
+            if mesh.unit is None:
+                raise UsageError(f"{mesh.name}: the unit of length is not known")
+            metres = (mesh.vertices * mesh.radius + mesh.centre) * UNITS[mesh.unit]
+            poses = resting_poses(mesh)
+            turn = rotation_z(rng.uniform(0, 2 * np.pi)) @ poses[rng.integers(len(poses))]
+            turned = metres @ turn.T
+            middle = (turned.min(0) + turned.max(0)) / 2
+            start = np.array([middle[0], middle[1], turned[:, 2].min()])
+
+            outline = footprint(turned - start)
+            place = _free_place(outline, outlines, rng, gap)
+            outlines.append(outline + place)
+            pose = np.eye(4)
+            pose[:3, :3] = turn
+            pose[:3, 3] = np.append(place, 0.0) - start
+            things.append(PlacedThing(mesh.name, metres, mesh.faces, pose))
+        return cls(tuple(things))
+
+
+def _free_place(
+    outline: Float, others: Sequence[Float], rng: np.random.Generator, gap: float
+) -> Float:
+    """Where a thing with an outline, (K, 2), about the origin has a gap to all others, (2,)."""
+    if not others:
+        return rng.uniform(-0.05, 0.05, 2)
+    for _ in range(TRIES):
+        wanted = rng.uniform(0, gap)
+        beside = others[int(rng.integers(len(others)))].mean(0)
+        angle = rng.uniform(0, 2 * np.pi)
+        way = np.array([np.cos(angle), np.sin(angle)])
+        for step in range(MOST_STEPS):
+            place = beside + step * STEP_OUTWARDS * way
+            if min(separation(outline + place, other) for other in others) >= wanted:
+                break
+        if np.linalg.norm(place) < REACH:
+            return place
+    raise UsageError("the things do not fit on the table: take fewer, or smaller ones")
+
+
+class TableCamera:
+    """A depth camera in a robot's world, over a simulated table.
+
+    The robot's world is the frame of the table but for a lean by the error of the vertical. Poses
+    that the camera is brought to are those that the robot believes in.
+
+    Attributes:
+        sensor: its errors.
+        lean: from the frame of the table into the robot's world, (4, 4) float64.
+        shown: how many pixels of the last frame show each thing, (things,) int64.
+        owner: thing that each pixel of the last frame shows, -1 for none, (H, W) int64.
+    """
+
+    def __init__(self, table: SimulatedTable, sensor: Sensor, rng: np.random.Generator) -> None:
+        """Set a camera up over a table.
+
+        Args:
+            table: with the things.
+            sensor: its noise, and the errors of its setup.
+            rng: draws the errors.
+        """
+        self.sensor = sensor
+        self._rng = rng
+        angles = [*rng.normal(0, sensor.tilt, 2), 0]
+        self.lean = np.eye(4)
+        self.lean[:3, :3] = Rotation.from_rotvec(angles, degrees=True).as_matrix()
+        self._count = 0
+        self.change(table)
+        self._rays = pixel_rays(sensor.intrinsics, sensor.shape).reshape(-1, 3)
+
+    def change(self, table: SimulatedTable) -> None:
+        """Put another table in the place of the one so far: somebody moved a thing."""
+        self.table = table
+        self._count = len(table.things)
+        things: list[Triangles] = [(thing.placed, thing.faces) for thing in table.things]
+        size = np.array([[*TABLE_SIDES, TABLE_THICKNESS], [FLOOR_SIDE, FLOOR_SIDE, 0.01]])
+        for box, height in zip(size, (-TABLE_THICKNESS, -TABLE_HEIGHT), strict=True):
+            mesh = upright_boxes(box[None], np.zeros(1), np.zeros((1, 2)), height)
+            things.append((mesh.vertices, mesh.faces))
+        self._caster = RayCaster(things)
+
+    @property
+    def truth(self) -> dict[str, Float]:
+        """Pose of each thing's file in the robot's world, (4, 4), metres, by its name."""
+        return {thing.name: self.lean @ thing.pose for thing in self.table.things}
+
+    def frame(self, pose: Float) -> Frame:
+        """Look from a pose in the robot's world.
+
+        Args:
+            pose: camera-to-world, (4, 4), metres, OpenCV axes.
+
+        Raises:
+            ObservationError: nothing is seen from there.
+        """
+        rng = self._rng.spawn(1)[0]
+        true = np.linalg.inv(self.lean) @ pose
+        turn = rng.normal(0, self.sensor.turned, 3)
+        true[:3, :3] = true[:3, :3] @ Rotation.from_rotvec(turn, degrees=True).as_matrix()
+        true[:3, 3] += rng.normal(0, self.sensor.moved, 3)
+
+        depth, owner = self._caster.cast(true[:3, 3], self._rays @ true[:3, :3].T)
+        seen = np.isfinite(depth)
+        if not seen.any():
+            raise ObservationError("nothing is seen: the camera looks past the table and the floor")
+        clean = np.where(seen, depth, 0).reshape(self.sensor.shape).astype(np.float32)
+        measured, source = self.sensor.measure(clean, rng)
+        owner = np.where((owner >= 0) & (owner < self._count), owner, -1)
+        self.owner = np.where(source >= 0, owner[np.maximum(source, 0)], -1)
+        self.owner[measured == 0] = -1
+        self.shown = np.bincount(self.owner[self.owner >= 0], minlength=self._count)
+        return Frame(measured, self.sensor.intrinsics, pose, pixel_centre=0.5)
+
+
+def poses_around(
+    azimuths: NDArray[np.floating], elevation: float, distance: float, centre: Float
+) -> Float:
+    """Level cameras around a place, that look at it.
+
+    Args:
+        azimuths: radians, (V,).
+        elevation: radians.
+        distance: metres.
+        centre: what they look at, (3,), metres.
+
+    Returns:
+        Camera-to-world poses, (V, 4, 4), metres, OpenCV axes.
+    """
+    poses = look_at_origin(np.full(len(azimuths), elevation), np.asarray(azimuths), distance)
+    poses[:, :3, 3] += centre
+    return poses
