@@ -18,7 +18,7 @@ from nextview.recognition.novelty import ViewScore
 from nextview.recognition.protocol import JointBelief, JudgesTogether
 from nextview.sensing.observed_object import ObservedObject
 from nextview.session.pose_frame import PoseFrame
-from nextview.session.recognition import SUSPICIOUS, Recognition
+from nextview.session.result import SUSPICIOUS, Recognition
 from nextview.session.session import THING_SIZE
 from nextview.session.system import System
 from nextview.session.view import View

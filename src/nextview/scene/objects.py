@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from nextview.recognition.poses import PoseCandidate, PoseUncertainty, place_in_words
 from nextview.scene.tracks import Track
 from nextview.sensing.plausibility import ViewWarning
-from nextview.session.recognition import Recognition
+from nextview.session.result import Recognition
 
 Float = NDArray[np.float64]
 UNKNOWN = "unknown"

@@ -15,7 +15,7 @@ from nextview.recognition.poses import PoseCandidate
 from nextview.sensing.frame import Part, spans
 from nextview.sensing.observed_object import ObservedObject, Sighting
 from nextview.sensing.tabletop import TableTop
-from nextview.session.recognition import Recognition
+from nextview.session.result import Recognition
 from nextview.things.surface import Surface, SurfaceCaster
 
 Float = NDArray[np.float64]

@@ -11,12 +11,12 @@ from scipy import ndimage
 
 from nextview.sensing import clusters, segmentation
 from nextview.sensing.clusters import Joins
+from nextview.sensing.convex_pieces import STANDS, Pieces, cut
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, upright_axes
 from nextview.sensing.observed_object import FEWEST, ObservedObject, noise_of
-from nextview.sensing.pieces import STANDS, Pieces, cut
 from nextview.sensing.segmentation import Plane, Samples, sample
 from nextview.sensing.walls import before_walls, find_walls
 
