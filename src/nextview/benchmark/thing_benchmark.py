@@ -26,12 +26,12 @@ from nextview.data.progress import Track, silently
 from nextview.errors import DatasetError, ResultsError, UsageError
 from nextview.files import check_new, command, only_one, read_record, write_record
 from nextview.geometry.mesh import UNITS, Mesh, load_mesh
-from nextview.learning.learn import learn_things
-from nextview.learning.teaching import How
-from nextview.learning.things import find_things
 from nextview.policies.base import Policy
 from nextview.recognition.model_card import find_models
 from nextview.simulation.sensor import sensor_named
+from nextview.teaching.learn import learn_things
+from nextview.teaching.thing_sources import find_things
+from nextview.teaching.thing_views import TeachingOptions
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.taught import TaughtThings
 
@@ -217,7 +217,7 @@ def _taught(
         return settings.models
     memory = out / MEMORY
     if not memory.exists():
-        how = How(unit=settings.unit, sensor=settings.sensor)  # type: ignore[arg-type]
+        how = TeachingOptions(unit=settings.unit, sensor=settings.sensor)  # type: ignore[arg-type]
         learn_things(scans, memory, how, workers=workers, track=track)
     return str(memory)
 
