@@ -39,11 +39,22 @@ ARCHIVES = {
 
 
 def download(archive: Archive, destination: Path, timeout: float = 60, bar: Any = False) -> Path:
-    """Fetch an archive and unpack it as ``destination / archive.folder``; nothing to do if that is
-    there.
+    """Fetch and verify an archive and unpack it below a folder.
 
-    ``timeout`` is of a silent connection, seconds; ``bar`` shows the progress. DatasetError if it
-    cannot be fetched, is not the published file, or cannot be unpacked.
+    Nothing is done if the unpacked folder is already there.
+
+    Args:
+        archive: what to fetch.
+        destination: folder in which ``archive.folder`` is created.
+        timeout: of a silent connection, seconds.
+        bar: whether to show the progress.
+
+    Returns:
+        The unpacked folder.
+
+    Raises:
+        DatasetError: the archive cannot be fetched, is not the published file, or cannot be
+            unpacked.
     """
     import pooch
     import requests

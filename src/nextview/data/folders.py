@@ -163,7 +163,18 @@ def left_out_phrases(left_out: Iterable[tuple[Path, str]]) -> list[str]:
 
 
 def list_dataset(root: str | Path, loose: bool = False) -> list[Entry]:
-    """All meshes of a dataset folder, see ``scan_dataset``; what is left out is logged."""
+    """List all meshes of a dataset folder and log what was left out; see ``scan_dataset``.
+
+    Args:
+        root: the folder.
+        loose: whether meshes outside of class folders are listed too.
+
+    Returns:
+        The meshes.
+
+    Raises:
+        DatasetError: there is no such folder, or no mesh in it.
+    """
     listing = scan_dataset(root, loose=loose)
     for phrase in left_out_phrases(listing.left_out):
         _log.warning("%s: left out: %s", root, phrase)
@@ -173,10 +184,18 @@ def list_dataset(root: str | Path, loose: bool = False) -> list[Entry]:
 def scan_dataset(
     root: str | Path, suffixes: tuple[str, ...] = FORMATS, loose: bool = False
 ) -> Listing:
-    """List the objects of a dataset folder, and what was left out; see ``read_folder``.
+    """List the objects of a dataset folder and what was left out; see ``read_folder``.
+
+    Args:
+        root: the folder.
+        suffixes: of the files that count.
+        loose: whether files outside of class folders are listed too.
+
+    Returns:
+        The objects and what was left out.
 
     Raises:
-        DatasetError: there is no such folder, it holds no object, or two of them would have one
+        DatasetError: there is no such folder, it holds no object, or two objects would have one
             name.
     """
     listing = read_folder(Path(root), suffixes, loose)
@@ -247,8 +266,20 @@ def read_folder(
 def select(
     entries: list[Entry], dataset: Path, split: str | None, held_out: str | Path | None
 ) -> list[Entry]:
-    """Those of one split, and those (meshes, or scenes by their target) that a card calls held
-    out of its training.
+    """Select objects by their split and by a card's list of held-out objects.
+
+    Args:
+        entries: of the folder.
+        dataset: the folder, for messages.
+        split: name of the split; None for all.
+        held_out: name or path of a card, of which the held-out objects are kept (scenes by their
+            target); None for all.
+
+    Returns:
+        The selected objects.
+
+    Raises:
+        DatasetError: none is left.
     """
     entries = [entry for entry in entries if split in (None, entry.split)]
     if not entries:

@@ -119,7 +119,18 @@ def find_measure(name: str) -> Measure:
 
 
 def names_of(names: Sequence[str], meshes: bool) -> tuple[str, ...]:
-    """The measures that are meant."""
+    """Return the measures that a user means.
+
+    Args:
+        names: of measures, or "all"; empty for all that can be computed.
+        meshes: whether the meshes are at hand.
+
+    Returns:
+        Names of the measures, each once.
+
+    Raises:
+        MeasureError: a name is unknown, or a measure needs the meshes.
+    """
     if not names:
         return tuple(
             name for name, measure in all_measures().items() if meshes or measure.needs == "depth"
@@ -162,8 +173,17 @@ def normalise_per_object(values: NDArray[np.floating]) -> NDArray[np.float32]:
 def confidence_maps(
     logits: NDArray[np.floating], labels: NDArray[np.integer]
 ) -> NDArray[np.float32]:
-    """Confidence in each view alone where it is right, the first of equal classes counting, else
-    0: (N, V) float32.
+    """Return the confidence in the true class of each single view.
+
+    It is the highest probability where the view is right, the first of equal classes counting, else
+    0.
+
+    Args:
+        logits: (N, V, C).
+        labels: true classes, (N,).
+
+    Returns:
+        Confidence, (N, V) float32.
     """
     from scipy.special import softmax
 
@@ -173,7 +193,15 @@ def confidence_maps(
 
 
 def depth_views(store: ViewStore, i: int) -> Iterator[MeasuredView]:
-    """Object i of a store as measures see it, from all its views."""
+    """Iterate over the views of a stored object as measures take them.
+
+    Args:
+        store: the view store.
+        i: row of the object.
+
+    Yields:
+        Each view.
+    """
     for depth, pose in zip(store.read("depth", i), store.sphere.poses, strict=True):
         # float64, as when it was rendered
         yield MeasuredView(depth * DEPTH_UNIT, pose, store.intrinsics)
@@ -188,12 +216,21 @@ def measure(
     overwrite: bool = False,
     views: Views = depth_views,
 ) -> Iterator[tuple[int, int]]:
-    """Put view measures of rendered objects, or of some rows, into a store: ``measures/NAME`` (N,
-    V) float32.
+    """Compute measures of rendered views and add them to their store.
 
-    ``names`` as ``find_measure`` takes them, or "all"; by default all that can be had from what
-    ``views`` hands them. ``workers`` and ``scheduler`` as of ``pool.each``; ``overwrite`` measures
-    anew what is there. Yields objects done so far, and how many there are.
+    They are written to ``measures/NAME``, (N, V) float32.
+
+    Args:
+        path: of the store.
+        names: of the measures, see ``find_measure``, or "all"; empty for all that ``views`` allows.
+        workers: number of processes; None for one on each core, 0 for this process.
+        scheduler: address of a dask.distributed scheduler to use instead.
+        objects: rows of the objects, (n,) int64; None for all.
+        overwrite: whether to compute existing values again.
+        views: returns what the measures take of an object.
+
+    Yields:
+        Number of objects done so far, and the number of all.
     """
     names = names_of(names, views is not depth_views)
     ViewStore.open(path).array("depth")  # says if it is missing, before anything is begun
@@ -240,8 +277,19 @@ def keep(
     objects: NDArray[np.int64] | None = None,
     overwrite: bool = False,
 ) -> Iterator[tuple[int, int]]:
-    """Call ``function(store, i)`` for the objects that lack values in the arrays, and keep what
-    it returns.
+    """Compute arrays for the objects that lack them and write them to the store.
+
+    Args:
+        path: of the store.
+        names: of the arrays.
+        function: called with the store and a row; returns the values of the arrays.
+        workers: number of processes; None for one on each core, 0 for this process.
+        scheduler: address of a dask.distributed scheduler to use instead.
+        objects: rows of the objects, (n,) int64; None for all.
+        overwrite: whether to compute existing values again.
+
+    Yields:
+        Number of objects done so far, and the number of all.
     """
     with writing(path):
         store = ViewStore.open(Path(path).absolute())

@@ -9,16 +9,31 @@ Float = NDArray[np.float64]
 
 
 def ratio(top: Float, bottom: Float, weights: Float) -> Float:
-    """Ratios (S, M) of sums over objects: ``top``, ``bottom`` (N, M), ``weights`` (S, N); NaN
-    where bottom is empty.
+    """Return ratios of weighted sums over objects.
+
+    Args:
+        top: numerators, (N, M).
+        bottom: denominators, (N, M).
+        weights: of the objects in each sample, (S, N).
+
+    Returns:
+        Ratios, (S, M) float64; NaN where the denominator is 0.
     """
     with np.errstate(invalid="ignore"):
         return (weights @ top) / (weights @ bottom)
 
 
 def class_mean(top: Float, bottom: Float, labels: NDArray[np.int64], weights: Float) -> Float:
-    """The same ratio in each class, then the mean over the classes (those in which there is
-    anything), (S, M).
+    """Return ratios of weighted sums in each class, averaged over the classes.
+
+    Args:
+        top: numerators, (N, M).
+        bottom: denominators, (N, M).
+        labels: class of each object, (N,) int64.
+        weights: of the objects in each sample, (S, N).
+
+    Returns:
+        Mean ratios, (S, M) float64, over the classes that are not empty.
     """
     total = np.zeros((len(weights), top.shape[1]))
     classes = np.zeros((len(weights), top.shape[1]))
@@ -32,14 +47,28 @@ def class_mean(top: Float, bottom: Float, labels: NDArray[np.int64], weights: Fl
 
 
 def mean_over_classes(values: NDArray, labels: NDArray[np.int64]) -> float:
-    """The mean of values (...,) in each class, then the mean over the classes that there are."""
+    """Average values in each class, then over the classes.
+
+    Args:
+        values: any shape.
+        labels: class of each value, the same shape.
+
+    Returns:
+        The mean over the classes that occur.
+    """
     top = np.asarray(values, np.float64).reshape(-1, 1)
     return float(class_mean(top, np.ones_like(top), labels.ravel(), np.ones((1, len(top))))[0, 0])
 
 
 def accuracy(answers: NDArray[np.int64], labels: NDArray[np.int64]) -> dict[str, float]:
-    """Share of right answers (...,) over all ("instance") and as the mean over classes
-    ("class").
+    """Return the accuracy over all answers and as the mean over classes.
+
+    Args:
+        answers: classes, any shape.
+        labels: true classes, the same shape.
+
+    Returns:
+        "instance": over all; "class": mean over classes. Both rounded to four digits.
     """
     right = answers == labels
     return {
@@ -51,8 +80,14 @@ def accuracy(answers: NDArray[np.int64], labels: NDArray[np.int64]) -> dict[str,
 def recogniser_scores(
     logits: NDArray[np.floating], labels: NDArray[np.int64]
 ) -> dict[str, dict[str, float]]:
-    """Accuracy from one view, over all views, and with all views' logits (N, V, classes) of an
-    object summed.
+    """Return the accuracy from single views and with the logits of all views summed.
+
+    Args:
+        logits: (N, V, classes).
+        labels: true classes, (N,) int64.
+
+    Returns:
+        "single_view" and "all_views_fused", see ``accuracy``.
     """
     spread = np.broadcast_to(labels[:, None], logits.shape[:2])
     fused = accuracy(logits.sum(1).argmax(1), labels)
@@ -62,10 +97,17 @@ def recogniser_scores(
 def reliability(
     confidence: Float, right: NDArray[np.bool_], bins: int = 15
 ) -> tuple[Float, Float, NDArray[np.int64]]:
-    """Mean confidence and share of right answers in bins of equal width, and how many fall in each,
-    (bins,) each.
+    """Return the confidence and the accuracy in bins of equal width.
 
     Guo et al., On calibration of modern neural networks (2017), section 2. Empty bins are 0.
+
+    Args:
+        confidence: of each answer, (N,), 0 to 1.
+        right: whether each answer is right, (N,) bool.
+        bins: number of bins.
+
+    Returns:
+        Mean confidence, accuracy and number of answers of each bin, (bins,) each.
     """
     at = np.clip((confidence * bins).astype(np.int64), 0, bins - 1)
     count = np.bincount(at, minlength=bins)
@@ -74,8 +116,16 @@ def reliability(
 
 
 def calibration_error(confidence: Float, right: NDArray[np.bool_]) -> float:
-    """Expected calibration error: the mean gap between confidence and accuracy over the bins of
-    ``reliability``.
+    """Return the expected calibration error.
+
+    It is the mean gap between confidence and accuracy over the bins of ``reliability``.
+
+    Args:
+        confidence: of each answer, (N,), 0 to 1.
+        right: whether each answer is right, (N,) bool.
+
+    Returns:
+        The error, 0 to 1.
     """
     sure, accuracy, count = reliability(confidence, right)
     return float((count * np.abs(sure - accuracy)).sum() / max(1, count.sum()))
@@ -88,13 +138,18 @@ MAP_DIGITS = {"mse": 5, "d0": 4, "d_le_1": 4, "d_lt_2": 4, "regret": 4}
 def map_errors(
     predicted: NDArray[np.floating], true: NDArray[np.floating]
 ) -> dict[str, NDArray[np.float64]]:
-    """How well each of M local maps (M, rings, 3) is predicted (thesis, section 5.3 and table 4);
-    each (M,).
+    """Return how well local maps are predicted (thesis, section 5.3 and table 4).
 
-    The mean squared error; whether the predicted highest cell is d = 0, d <= 1, d < 2 cells from
-    the true one; the
-    regret: true highest value minus the true value at the predicted highest cell. Of equal cells
-        the first counts.
+    The errors are the mean squared error ("mse"); whether the predicted highest cell is at d = 0, d
+    <= 1 and d < 2 cells from the true one; and the regret, the true highest value minus the true
+    value at the predicted highest cell. Of equal cells the first counts.
+
+    Args:
+        predicted: (M, rings, 3).
+        true: (M, rings, 3).
+
+    Returns:
+        The errors of each map by their names, (M,) float64 each.
     """
     m, _, columns = true.shape
     p = predicted.reshape(m, -1).astype(np.float64)
@@ -113,7 +168,15 @@ def map_errors(
 
 
 def map_scores(predicted: NDArray[np.floating], true: NDArray[np.floating]) -> dict[str, float]:
-    """The means of ``map_errors`` over all maps, rounded for a card."""
+    """Return the means of ``map_errors`` over all maps, rounded for a card.
+
+    Args:
+        predicted: (M, rings, 3).
+        true: (M, rings, 3).
+
+    Returns:
+        The means by their names.
+    """
     return {
         name: round(float(v.mean()), MAP_DIGITS[name])
         for name, v in map_errors(predicted, true).items()

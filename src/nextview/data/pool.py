@@ -57,14 +57,21 @@ def each(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> Iterator[tuple[Item, Result | WorkerDied]]:
-    """Call ``function(item)`` for every item, side by side; yields (item, result) as they come, in
-    any order.
+    """Call a function for every item in parallel.
 
-    Function and items are picklable, items hashable. A script that hands in functions or classes of
-    its own has to guard what it does by ``if __name__ == "__main__"``; any other need not. A
-    process that dies costs its item, if it dies again with that alone. What the function raises
-    ends the run. ``workers`` are processes, one for each core by default, 0 to work in this one;
-    ``scheduler`` is the address of a dask.distributed scheduler to use instead.
+    Function and items must be picklable, items hashable. A script whose functions or classes are
+    passed in has to guard its code by ``if __name__ == "__main__"``; no other script has to. If a
+    process dies, its item is tried once more alone, and costs only its own result if the process
+    dies again. What the function raises ends the run.
+
+    Args:
+        function: called with an item.
+        items: the items.
+        workers: number of processes; None for one on each core, 0 for this process.
+        scheduler: address of a dask.distributed scheduler to use instead.
+
+    Yields:
+        Each item and its result, in any order.
     """
     if scheduler is not None:
         yield from _on_cluster(function, items, scheduler)
@@ -102,8 +109,18 @@ def counted(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> Iterator[tuple[int, int]]:
-    """Call a function for the items left of ``total``, see ``each``; yields how many are done,
-    and the total.
+    """Call a function for the remaining items and count; see ``each``.
+
+    Args:
+        function: called with an item.
+        items: those that are left.
+        total: number of all items, with those done before.
+        name: returns the name of an item, for messages.
+        workers: number of processes; None for one on each core, 0 for this process.
+        scheduler: address of a dask.distributed scheduler to use instead.
+
+    Yields:
+        Number of items done so far, and the total.
     """
     before = total - len(items)
     yield before, total

@@ -39,16 +39,29 @@ def predict(
     scheduler: str | None = None,
     overwrite: bool = False,
 ) -> Iterator[tuple[int, int]]:
-    """Write the predictions of a store's rendered objects into an .npz file; options as of
-    ``nextview predict``.
+    """Predict all views of a store's objects and write the predictions.
 
-    ``size`` lets the recogniser know how large the objects are, where store and card tell. What is
-    done is kept beside
-    ``out``: a run that was killed goes on from there. Yields objects done so far, and how many
-        there are.
-    DatasetError: no such objects, a class that the recogniser does not know, or an object that
-        kills its process.
-    ResultsError: ``out`` exists, or cannot be written.
+    Finished parts are kept beside the output until it is complete, so an interrupted run resumes.
+
+    Args:
+        path: of the view store.
+        out: .npz file to write.
+        recogniser: card of the recogniser.
+        maps: cards of the map networks by the names of their maps.
+        split: name of the split; None for all objects.
+        held_out: card, or its name or path, whose held-out objects are predicted; None for all.
+        size: whether to use the size of the objects where store and card know it.
+        workers: number of processes; None for one on each core, 0 for this process.
+        scheduler: address of a dask.distributed scheduler to use instead.
+        overwrite: whether to replace an existing file.
+
+    Yields:
+        Number of objects done so far, and the number of all.
+
+    Raises:
+        DatasetError: there are no such objects, the recogniser does not know a class, or an object
+            kills its process.
+        ResultsError: the file exists or cannot be written.
     """
     path = Path(path)
     out = Path(out)

@@ -151,7 +151,15 @@ class Predictions:
         return len(self) / ((count > 0).sum() * count[self.labels])
 
     def evidence(self, objects: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
-        """What the models say of objects (rows), (B,), each seen from one view, (B,)."""
+        """Return the outputs of the models for single views.
+
+        Args:
+            objects: rows of the objects, (B,) int64.
+            views: view of each, (B,) int64.
+
+        Returns:
+            Evidence of B views.
+        """
         return Evidence(
             self.logits[objects, views],
             {name: values[objects, views] for name, values in self.maps.items()},
@@ -245,7 +253,19 @@ class Predictions:
     def of_objects_in(
         cls, store: ViewStore, objects: NDArray[np.int64], classes: Sequence[str]
     ) -> "Predictions":
-        """What a store says of objects, by index; all logits are 0."""
+        """Create empty predictions of objects in a store; all logits are 0.
+
+        Args:
+            store: the view store.
+            objects: rows of the objects, (N,) int64.
+            classes: names of the recogniser's classes.
+
+        Returns:
+            The predictions.
+
+        Raises:
+            DatasetError: the recogniser does not know a class of the store.
+        """
         labels = [store.classes[label] for label in store.labels[objects]]
         if unknown := sorted(set(labels) - set(classes)):
             raise DatasetError(
@@ -271,7 +291,15 @@ class Predictions:
         )
 
     def save(self, path: Path, overwrite: bool = False) -> None:
-        """Write one .npz file, whole or not at all; ResultsError if that cannot be."""
+        """Write the predictions to an .npz file, complete or not at all.
+
+        Args:
+            path: of the file.
+            overwrite: whether to replace an existing file.
+
+        Raises:
+            ResultsError: the file cannot be written.
+        """
         arrays: dict[str, Any] = self._arrays()
         arrays |= {f"map/{name}": values for name, values in self.maps.items()}
         arrays |= {

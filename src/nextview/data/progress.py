@@ -11,5 +11,11 @@ Track = Callable[[Iterable[int], int, str], None]
 
 
 def silently(done: Iterable[int], total: int, what: str, /) -> None:
-    """Do the work and tell nobody."""
+    """Do the work without showing progress.
+
+    Args:
+        done: growing counts.
+        total: number that is reached at the end.
+        what: name of the work.
+    """
     deque(done, maxlen=0)

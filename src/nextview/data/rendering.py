@@ -73,8 +73,15 @@ class Deform:
     rotated: bool = False
 
     def draw(self, seed: int, name: str) -> tuple[NDArray[np.float64], float]:
-        """The factors of the three axes, (3,), and the angle, radians, of the object of that
-        name.
+        """Draw the deformation of an object.
+
+        Args:
+            seed: of the store.
+            name: of the object.
+
+        Returns:
+            The factors along the three axes, (3,) float64, and the rotation about the vertical,
+            radians.
         """
         rng = np.random.default_rng([seed, *name.encode()])
         reach = np.log1p(self.stretch)
@@ -90,7 +97,16 @@ class Deform:
 
 
 def render_object(camera: Camera, sphere: ViewSphere, size: int) -> dict[str, np.ndarray]:
-    """All views of one object as the store keeps them: image, depth, points and depth-entropy."""
+    """Render all views of an object as the store keeps them.
+
+    Args:
+        camera: in front of the object.
+        sphere: the viewpoints.
+        size: side of the images, pixels.
+
+    Returns:
+        The arrays "image", "depth", "points" and "measures/depth_entropy" of all V views.
+    """
     image = np.empty((len(sphere), size, size), np.uint8)
     depth = np.empty((len(sphere), size, size), np.uint16)
     points = np.empty((len(sphere), POINTS, 3), np.float32)
@@ -150,14 +166,27 @@ def render(
     scheduler: str | None = None,
     overwrite: bool = False,
 ) -> Iterator[tuple[str, str | None]]:
-    """Render every mesh, or the target of every scene, that the store lacks; one that failed before
-    is tried again.
+    """Render all meshes, or the targets of all scenes, that a store lacks.
 
-    It may end at any moment, by a kill or a full disk; the next run goes on. ``size`` is the side
-    of the images, pixels; ``overwrite`` replaces a store of other objects or settings; workers as
-    of ``pool.each`` see the same files. Yields (name, None) for each object done, (name, reason)
-    for one that cannot be rendered. DatasetError: dataset or store cannot be used, or another run
-    is writing it. UsageError: a setting that makes no sense.
+    An object that failed before is tried again. A run may be killed at any moment; the next one
+    continues.
+
+    Args:
+        dataset: folder of meshes or scenes.
+        path: of the view store.
+        sphere: the viewpoints.
+        size: side of the images, pixels.
+        options: what to render and how.
+        workers: number of processes; None for one on each core, 0 for this process.
+        scheduler: address of a dask.distributed scheduler to use instead.
+        overwrite: whether to replace a store of other objects or settings.
+
+    Yields:
+        The name of each object and None, or the reason why it cannot be rendered.
+
+    Raises:
+        DatasetError: the folder or the store cannot be used, or another run is writing to it.
+        UsageError: a setting is not valid.
     """
     dataset = Path(dataset).absolute()
     path = Path(path).absolute()
@@ -248,8 +277,17 @@ def _check(path: Path, sphere: ViewSphere, size: int, options: RenderOptions) ->
 
 
 def listing(dataset: Path, options: RenderOptions) -> Listing:
-    """The meshes, or the scenes, of a dataset folder that are asked for, and what is left out
-    beside them.
+    """List the meshes or scenes to render and what was left out.
+
+    Args:
+        dataset: the folder.
+        options: which of them are wanted.
+
+    Returns:
+        The objects and what was left out.
+
+    Raises:
+        DatasetError: nothing is left to render.
     """
     try:
         found = scan_dataset(dataset, FORMATS if options.meshes is None else (SUFFIX,))
@@ -271,7 +309,16 @@ def rotations(store: ViewStore) -> NDArray[np.float64]:
 
 
 def deformed(store: ViewStore, mesh: Mesh, name: str) -> Mesh:
-    """A mesh as it is deformed when a store's object of that name is rendered."""
+    """Return a mesh as it was deformed for a store.
+
+    Args:
+        store: the view store.
+        mesh: the mesh of the object.
+        name: of the object, from which its deformation is drawn.
+
+    Returns:
+        The deformed mesh; the mesh itself if the store deforms none.
+    """
     deform = Deform(store.attributes.stretch, store.attributes.rotated)
     return mesh if deform == Deform() else deform(mesh, store.attributes.seed, name)
 

@@ -61,7 +61,15 @@ def sample_mesh(name: str) -> Mesh:
 
 
 def boxes_mesh(boxes: list[Box], name: str) -> Mesh:
-    """A mesh of axis-aligned boxes, each closed by twelve triangles."""
+    """Create a mesh of axis-aligned boxes, each closed by twelve triangles.
+
+    Args:
+        boxes: two opposite corners of each box.
+        name: of the mesh.
+
+    Returns:
+        The mesh.
+    """
     corner = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
     sides = np.array(
         [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]

@@ -106,13 +106,27 @@ def draw_scenes(
     scheduler: str | None = None,
     held_out: str | Path | None = None,
 ) -> Iterator[tuple[str, str | None]]:
-    """Draw the scenes that are not in the folder yet. Which they are depends on the seed alone.
+    """Draw scenes around the objects of a dataset folder and write their files.
 
-    The objects of each split are taken in an order that the seed draws, each once before any is
-    taken again, the same at all levels. What stands around an object is of its own split. Files are
-    CLASS/SPLIT/NAME@LEVEL-NUMBER.json, or CLASS/NAME@LEVEL-NUMBER.json where the dataset has no
-    splits. Options as of ``nextview scenes`` and ``pool.each``. Yields (name, None) for each scene
-    that is there, (name, reason) for one that cannot be drawn.
+    Scenes that are already in the folder are kept; which scenes there are depends on the seed
+    alone. The objects of each split are taken in an order that the seed draws, the same at all
+    levels, each once before any is taken again. The things around an object are of its own split.
+    Files are CLASS/SPLIT/NAME@LEVEL-NUMBER.json, or CLASS/NAME@LEVEL-NUMBER.json where the dataset
+    has no splits.
+
+    Args:
+        dataset: folder of meshes.
+        out: folder of the scenes.
+        levels: names of the levels of clutter.
+        scenes: number of scenes at each level; None for one around each object.
+        seed: of all that is random.
+        split: name of the split; None for all.
+        workers: number of processes; None for one on each core, 0 for this process.
+        scheduler: address of a dask.distributed scheduler to use instead.
+        held_out: name or path of a card, whose held-out objects are the targets; None for all.
+
+    Yields:
+        The name of each scene and None, or the reason why it cannot be drawn.
     """
     dataset = Path(dataset)
     out = Path(out)
@@ -148,7 +162,23 @@ def tasks(
     split: str | None,
     held_out: str | Path | None = None,
 ) -> list[Task]:
-    """All scenes that are asked for, see ``draw_scenes``."""
+    """List all scenes that are to be drawn, see ``draw_scenes``.
+
+    Args:
+        dataset: folder of meshes.
+        out: folder of the scenes.
+        levels: names of the levels of clutter.
+        scenes: number of scenes at each level; None for one around each object.
+        seed: of all that is random.
+        split: name of the split; None for all.
+        held_out: name or path of a card, whose held-out objects are the targets; None for all.
+
+    Returns:
+        The scenes to draw.
+
+    Raises:
+        UsageError: a level, the number of scenes or the seed is not valid.
+    """
     unknown = [level for level in levels if level not in LEVELS]
     if unknown or not levels:
         raise UsageError(
@@ -183,11 +213,21 @@ def _draw(meshes: dict[str, Meshes], seed: int, task: Task) -> str | None:
 
 
 def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) -> SceneLayout:
-    """A scene of some level around a target, a mesh file of the folder; seed and name decide all
-    that is random.
+    """Draw a scene around a target.
 
-    MeshError if the target cannot be used; DatasetError if no layout shows as much of it as the
-    level wants.
+    Args:
+        target: mesh file of the target, in the folder of the meshes.
+        meshes: the folder and its files.
+        level: of clutter.
+        seed: of all that is random, together with the name.
+        name: of the scene.
+
+    Returns:
+        The scene.
+
+    Raises:
+        MeshError: the target cannot be used.
+        DatasetError: no layout shows as much of the target as the level wants.
     """
     rng = np.random.default_rng([seed, *name.encode()])
     mesh = cached_mesh(meshes.folder / target)
@@ -243,7 +283,15 @@ class _Hiding:
         self.whole = np.maximum(np.bincount(self.views, minlength=len(GRID)), 1)
 
     def by(self, item: Item, still: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which of the rays that are still free end on something first, (R,)."""
+        """Return the rays that an item blocks.
+
+        Args:
+            item: the item.
+            still: the rays that nothing else blocks, (R,) bool.
+
+        Returns:
+            Whether each ray is blocked by the item, (R,) bool.
+        """
         length, _ = RayCaster([(item.vertices, item.faces)]).cast(
             self.eyes[still], self.rays[still]
         )

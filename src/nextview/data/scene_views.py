@@ -34,16 +34,30 @@ SHARE_SIZE = 112
 
 
 def scene_intrinsics(distance: float, side: int = SIDE) -> NDArray[np.float64]:
-    """Pinhole matrix of the pictures of a scene, (3, 3), pixels; the first pixel's centre is at
-    0.5.
+    """Return the pinhole matrix of the images of a scene.
+
+    Args:
+        distance: of the cameras from the target, object radii.
+        side: of the images, pixels.
+
+    Returns:
+        Matrix, (3, 3) float64, pixels; the centre of the first pixel is at 0.5.
     """
     focal = side / 2 * distance / HALF
     return np.array([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1.0]])
 
 
 def render_scene(scene: Scene, sphere: ViewSphere) -> dict[str, NDArray]:
-    """All that is kept of a scene beside its target's views, without errors of a sensor, by the
-    names of the arrays.
+    """Render what is kept of a scene besides the views of its target.
+
+    The images contain no sensor errors.
+
+    Args:
+        scene: the scene.
+        sphere: the viewpoints.
+
+    Returns:
+        The arrays by their names in the store.
     """
     camera = SceneCamera(scene, scene_intrinsics(sphere.distance), (SIDE, SIDE))
     looks = [camera.look(pose) for pose in sphere.poses]
@@ -87,7 +101,18 @@ class SceneViews:
 
 
 def scene_views(store: ViewStore, i: int) -> SceneViews:
-    """Scene i of a store that was rendered of scenes."""
+    """Read a scene from a store.
+
+    Args:
+        store: the view store.
+        i: row of the scene.
+
+    Returns:
+        The views of the scene.
+
+    Raises:
+        DatasetError: the store holds single objects.
+    """
     if store.attributes.scene is None:
         raise DatasetError(
             f"{store.path}: holds single objects, no scenes; nextview scenes draws some"
@@ -107,7 +132,16 @@ Constrain = Callable[[EpisodeState], EpisodeState]
 
 
 def sight_of(scenes: "SceneSight | None", objects: NDArray[np.int64]) -> tuple[Constrain, Visible]:
-    """What ``run_episodes`` needs of scenes: where cameras can be, and what is expected to show."""
+    """Return what ``run_episodes`` needs of scenes.
+
+    Args:
+        scenes: the scenes; None for single objects.
+        objects: scene of each episode, (E,) int64.
+
+    Returns:
+        A function that marks the reachable views of a state, and one that returns the expected
+        visible shares.
+    """
     if scenes is None:
         return unconstrained, lambda state: np.ones(state.visited.shape)
     return (
@@ -150,7 +184,18 @@ class SceneSight:
 
     @classmethod
     def of(cls, store: ViewStore, names: Sequence[str]) -> "SceneSight | None":
-        """Of some of a store's objects; None if it holds no scenes."""
+        """Prepare the scenes of some of a store's objects.
+
+        Args:
+            store: the view store.
+            names: of the objects.
+
+        Returns:
+            The scenes; None if the store holds single objects.
+
+        Raises:
+            DatasetError: the store lacks an object.
+        """
         if store.attributes.scene is None:
             return None
         rows = store.rows_of(names)
@@ -165,7 +210,15 @@ class SceneSight:
     def visibility(
         self, scenes: NDArray[np.int64], visited: NDArray[np.bool_]
     ) -> NDArray[np.float64]:
-        """Share of the target that is expected to show from each view."""
+        """Return the share of the target that is expected to be visible from each view.
+
+        Args:
+            scenes: which scene, (B,) int64.
+            visited: views taken so far, (B, V) bool.
+
+        Returns:
+            Shares, (B, V) float64.
+        """
         keys = [
             (int(self.rows[scene]), np.packbits(row).tobytes())
             for scene, row in zip(scenes, visited, strict=True)

@@ -24,7 +24,15 @@ def duplicate_groups(measured: Floats) -> Indices:
 
 
 def deduplicated(labels: Indices, measured: Floats) -> Indices:
-    """One object of each shape and label, the first: indices, sorted."""
+    """Return one object, the first, of each shape and label.
+
+    Args:
+        labels: class of each object, (N,).
+        measured: depth entropy of the views, (N, V), by which copies are found.
+
+    Returns:
+        Indices, ascending.
+    """
     _, first = np.unique(
         np.stack([duplicate_groups(measured), labels], 1), axis=0, return_index=True
     )
@@ -32,8 +40,16 @@ def deduplicated(labels: Indices, measured: Floats) -> Indices:
 
 
 def divide(labels: Indices, measured: Floats, share: float, seed: int) -> tuple[Indices, Indices]:
-    """Indices of objects that train, and of the share of every class that validates; their
-    copies follow them.
+    """Divide objects into a training and a validation part; copies stay together.
+
+    Args:
+        labels: class of each object, (N,).
+        measured: depth entropy of the views, (N, V), by which copies are found.
+        share: of each class for validation.
+        seed: of the draw.
+
+    Returns:
+        Indices of the training and of the validation objects.
     """
     group = duplicate_groups(measured)
     rng = np.random.default_rng(seed)
@@ -46,8 +62,18 @@ def divide(labels: Indices, measured: Floats, share: float, seed: int) -> tuple[
 
 
 def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple[Indices, Indices]:
-    """Divide the rendered objects of the training split (all objects of a store without splits),
-    see ``divide``.
+    """Divide the rendered objects of the training split; see ``divide``.
+
+    Args:
+        store: the view store; without splits all of its objects are divided.
+        share: of each class for validation.
+        seed: of the draw.
+
+    Returns:
+        Rows of the training and of the validation objects.
+
+    Raises:
+        DatasetError: the store holds no rendered object of the training split.
     """
     usable = np.flatnonzero(store.done & np.isin(store.splits, ("train", "")))
     if len(usable) == 0:
@@ -57,8 +83,16 @@ def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple
 
 
 def check_any(store: ViewStore, training: Indices, validation: Indices, lacking: str = "") -> None:
-    """Refuse to train on no object, or to validate with none; ``lacking`` says why some may be
-    missing.
+    """Check that there are objects for training and for validation.
+
+    Args:
+        store: the view store, for messages.
+        training: rows of the training objects.
+        validation: rows of the validation objects.
+        lacking: why some may be missing, for messages.
+
+    Raises:
+        DatasetError: one of the parts is empty.
     """
     for objects, what in (
         (training, "to train on"),
@@ -69,12 +103,28 @@ def check_any(store: ViewStore, training: Indices, validation: Indices, lacking:
 
 
 def deduplicate(store: ViewStore, objects: Indices) -> Indices:
-    """One object of each shape and label among some of a store, see ``deduplicated``."""
+    """Return one of each shape and label among objects of a store; see ``deduplicated``.
+
+    Args:
+        store: the view store.
+        objects: rows of the objects.
+
+    Returns:
+        Rows, in the order given.
+    """
     return objects[deduplicated(store.labels[objects], store.measure()[objects])]
 
 
 def sample(objects: Indices, count: int | None = None) -> Indices:
-    """So many of some objects, in even steps from the first; all if there are no more."""
+    """Select objects in even steps from the first.
+
+    Args:
+        objects: indices.
+        count: how many; None for all.
+
+    Returns:
+        The selected indices; all if there are no more.
+    """
     if count is not None:
         whole(count, "the number of objects", 1)
     n = len(objects)
@@ -87,7 +137,21 @@ def some_objects(
     held_out: ModelCard | str | Path | None = None,
     count: int | None = None,
 ) -> Indices:
-    """Indices of the rendered objects of a store that are asked for, sorted."""
+    """Return the rendered objects of a store that a user wants.
+
+    Args:
+        store: the view store.
+        split: name of the split; None for all.
+        held_out: card, or its name or path, whose held-out objects are wanted (scenes by their
+            target); None for all.
+        count: how many, in even steps; None for all.
+
+    Returns:
+        Rows, ascending.
+
+    Raises:
+        DatasetError: there is no such object.
+    """
     chosen = store.done & (True if split is None else store.splits == split)
     of = "" if split is None else f" of the split {split!r}"
     if held_out is not None:

@@ -77,7 +77,17 @@ class Attributes(msgspec.Struct, omit_defaults=True):
 def describe(
     entries: Sequence[Entry], sphere: ViewSphere, size: int, recipe: Mapping[str, Any]
 ) -> Attributes:
-    """The attributes of a store of these objects and views."""
+    """Return the attributes of a new store.
+
+    Args:
+        entries: its objects.
+        sphere: its viewpoints.
+        size: side of the images, pixels.
+        recipe: all other attributes by their names.
+
+    Returns:
+        The attributes.
+    """
     return Attributes(
         format=2,
         names=[e.name for e in entries],
@@ -109,8 +119,15 @@ class ViewStore:
 
     @classmethod
     def create(cls, path: Path, attributes: Attributes, overwrite: bool = False) -> "ViewStore":
-        """Make an empty store, whole or not at all; with ``overwrite`` it replaces the store at
-        ``path``.
+        """Create an empty store, complete or not at all.
+
+        Args:
+            path: of the store.
+            attributes: of the store.
+            overwrite: whether to replace an existing store.
+
+        Returns:
+            The store.
         """
         with new_folder(path, overwrite, last="zarr.json") as part:
             store = cls(part, zarr.open_group(part, mode="w"), attributes)
@@ -246,7 +263,15 @@ class ViewStore:
         )
 
     def has(self, name: str, i: int) -> bool:
-        """Whether an array holds values of object i."""
+        """Return whether an array holds values of an object.
+
+        Args:
+            name: of the array.
+            i: row of the object.
+
+        Returns:
+            True if the values are there.
+        """
         return self._chunk(self.array(name), i).exists()
 
     def held(self, name: str) -> NDArray[np.bool_]:
@@ -255,7 +280,18 @@ class ViewStore:
         return np.array([self._chunk(array, i).exists() for i in range(len(self))])
 
     def read(self, name: str, i: int) -> NDArray:
-        """The values of object i in an array, as they are stored."""
+        """Read the values of an object as they are stored.
+
+        Args:
+            name: of the array.
+            i: row of the object.
+
+        Returns:
+            The values.
+
+        Raises:
+            DatasetError: they are missing or damaged.
+        """
         array = self.array(name)
         what = f"{name} of {self.names[i]}"
         if not self._chunk(array, i).exists():
@@ -287,9 +323,11 @@ class ViewStore:
         return values
 
     def write(self, i: int, arrays: Mapping[str, NDArray]) -> None:
-        """Set the values of object i in some arrays, in this order.
+        """Write the values of an object, each array complete or not at all.
 
-        Each is written whole or not at all.
+        Args:
+            i: row of the object.
+            arrays: values by the names of their arrays, written in this order.
         """
         # zeros too: what has no chunk is missing
         with zarr.config.set({"array.write_empty_chunks": True}):
@@ -419,8 +457,15 @@ def writing(path: Path) -> Iterator[None]:
 def check(
     path: Path, workers: int | None = None, scheduler: str | None = None
 ) -> Iterator[tuple[str, str | None]]:
-    """Read all arrays of all rendered objects, by their checksums; yields (name, None) or (name,
-    what is wrong).
+    """Read all arrays of all rendered objects and compare their checksums.
+
+    Args:
+        path: of the store.
+        workers: number of processes; None for one on each core, 0 for this process.
+        scheduler: address of a dask.distributed scheduler to use instead.
+
+    Yields:
+        The name of each object and None, or what is wrong with it.
     """
     store = ViewStore.open(path)
     for name in store.rendered:

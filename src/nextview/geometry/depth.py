@@ -24,8 +24,17 @@ def object_depth(depth: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def slope(before: NDArray, here: NDArray, after: NDArray) -> NDArray[np.float32]:
-    """Change of depth per pixel, from the side where it is smaller: the one on the same surface.
-    0 if alone.
+    """Return the change of depth per pixel along one axis of an image.
+
+    Of the two one-sided differences the smaller one is taken, which is the one on the same surface.
+
+    Args:
+        before: depth of the previous pixel, any shape; 0 where there is no object.
+        here: depth of the pixel itself, the same shape.
+        after: depth of the next pixel, the same shape.
+
+    Returns:
+        The slope, the same shape, float32; 0 where both neighbours are empty.
     """
     back = np.where(before > 0, here - before, np.inf)
     forth = np.where(after > 0, after - here, np.inf)
@@ -34,8 +43,14 @@ def slope(before: NDArray, here: NDArray, after: NDArray) -> NDArray[np.float32]
 
 
 def headlight(depth: NDArray[np.float32], intrinsics: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """The surface as lit by a lamp at the camera, (H, W) uint8: as bright as the cosine of ray
-    and surface normal.
+    """Shade a depth image as if it were lit by a lamp at the camera.
+
+    Args:
+        depth: (H, W) float32; 0 where there is no object.
+        intrinsics: pinhole matrix, (3, 3), pixels.
+
+    Returns:
+        Brightness, (H, W) uint8: the cosine between the ray and the surface normal.
     """
     height, width = depth.shape
     padded = np.pad(depth, 1)
@@ -52,8 +67,14 @@ def headlight(depth: NDArray[np.float32], intrinsics: NDArray[np.float64]) -> ND
 
 @lru_cache(maxsize=8)
 def pixel_order(pixels: int, seed: int) -> NDArray[np.int32]:
-    """A fixed shuffle of an image's pixels, (pixels,) int32; earlier ones are preferred when
-    points are drawn.
+    """Return a fixed shuffle of an image's pixels, by which points are drawn.
+
+    Args:
+        pixels: number of pixels of the image.
+        seed: of the shuffle.
+
+    Returns:
+        Indices of the pixels, (pixels,) int32; earlier ones are preferred.
     """
     return np.random.default_rng(seed).permutation(pixels).astype(np.int32)
 
@@ -64,11 +85,19 @@ def visible_points(
     intrinsics: NDArray[np.float64],
     seed: int = 0,
 ) -> NDArray[np.float32]:
-    """Points on the visible surface, (1024, 3) float32, object frame; all zero if nothing is
-    visible.
+    """Draw points on the visible surface.
 
-    A uniform draw from the pixels that show the object, by the seed and these pixels alone; few
-    pixels repeat.
+    The draw is uniform over the pixels that show the object. It depends on the seed and these
+    pixels alone, and few pixels repeat.
+
+    Args:
+        depth: (H, W) float32; 0 where there is no object.
+        pose: camera-to-world, (4, 4), OpenCV axes, in the unit of the depth.
+        intrinsics: pinhole matrix, (3, 3), pixels.
+        seed: of the draw.
+
+    Returns:
+        Points, (1024, 3) float32, object frame; all zero if nothing is visible.
     """
     flat = object_depth(depth).ravel()
     order = pixel_order(flat.size, seed)

@@ -66,12 +66,23 @@ def make_mesh(
     name: str = "mesh",
     unit: str | None = None,
 ) -> Mesh:
-    """Check raw vertices, (V, 3), any unit, and faces, (F, 3), and normalise them.
+    """Check raw vertices and faces and normalise them to the object frame.
 
-    Returns the mesh in the object frame, without the vertices that no face uses, and each triangle
-    once: copies in the same place show nothing new, and a great many of them take a minute a view.
-    MeshError: no faces, not triangles, an index out of range, a position that is not finite, no
-    extent, or no area.
+    Vertices that no face uses are dropped. Of triangles in the same place one is kept: copies show
+    nothing new, and very many of them slow down the ray caster.
+
+    Args:
+        vertices: (V, 3), any unit.
+        faces: indices of vertices, (F, 3).
+        name: of the mesh, for messages.
+        unit: of the vertices ("mm", "cm", "inch", "foot", "m"); None if it is not known.
+
+    Returns:
+        The mesh in the object frame.
+
+    Raises:
+        MeshError: the mesh has no faces, faces that are not triangles, an index out of range, a
+            position that is not finite, no extent, or no area.
     """
     vertices = np.asarray(vertices, np.float64)
     faces = np.asarray(faces)
@@ -145,8 +156,14 @@ def mesh_warnings(mesh: Mesh) -> tuple[str, ...]:
 
 
 def is_y_up(path: Path, up: str | None = None) -> bool:
-    """Whether the y axis of a mesh file points up: as ``up`` says, or as the standard of its
-    format does.
+    """Return whether the y axis of a mesh file points up.
+
+    Args:
+        path: of the mesh file.
+        up: "y" or "z"; None for the standard of the format (y for GLB, z for all others).
+
+    Returns:
+        True if y points up.
     """
     return (up or ("y" if path.suffix.lower() == ".glb" else "z")) == "y"
 

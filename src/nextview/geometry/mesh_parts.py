@@ -46,9 +46,16 @@ class Parts:
 
     @classmethod
     def of(cls, vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> "Parts":
-        """Find the parts of a mesh.
+        """Find the connected parts of a mesh.
 
-        Vertices in the same place count as one, as in an STL file they have to.
+        Vertices in the same place count as one, as STL files require.
+
+        Args:
+            vertices: (V, 3) float64.
+            faces: indices of vertices, (F, 3).
+
+        Returns:
+            The parts of the mesh.
         """
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components

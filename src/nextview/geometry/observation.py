@@ -196,8 +196,17 @@ def checked_pose(pose: Any) -> NDArray[np.float64]:
 
 
 def checked_intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """A pinhole matrix, (3, 3) float64, pixels, of an image of some shape; ObservationError if
-    no camera has it.
+    """Check the pinhole matrix of an image.
+
+    Args:
+        intrinsics: the matrix, (3, 3), pixels.
+        shape: rows and columns of the image.
+
+    Returns:
+        The matrix, (3, 3) float64.
+
+    Raises:
+        ObservationError: no camera has this matrix.
     """
     intrinsics = numbers(intrinsics, "the matrix of intrinsics").astype(np.float64, copy=False)
     if intrinsics.shape != (3, 3):
@@ -219,7 +228,18 @@ def checked_intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.fl
 
 
 def numbers(values: Any, what: str) -> NDArray[Any]:
-    """An array of real numbers; ObservationError if it is none: ``what`` names it there."""
+    """Convert values to an array of real numbers.
+
+    Args:
+        values: anything that NumPy takes for an array.
+        what: name of the values in the error message.
+
+    Returns:
+        The array, of an integer or floating type.
+
+    Raises:
+        ObservationError: the values are not an array of real numbers.
+    """
     array = array_of(values, what)
     if array.dtype.kind not in "fiu":
         raise ObservationError(f"{what} is an array of numbers, not of {array.dtype}")
@@ -227,10 +247,19 @@ def numbers(values: Any, what: str) -> NDArray[Any]:
 
 
 def array_of(values: Any, what: str) -> NDArray[Any]:
-    """An array of anything, in the byte order of this machine; ObservationError if it cannot become
-    one.
+    """Convert values to an array in the byte order of this machine.
 
-    What a masked array hides becomes 0: nothing was measured there.
+    Masked elements of a masked array become 0: nothing was measured there.
+
+    Args:
+        values: anything that NumPy takes for an array.
+        what: name of the values in the error message.
+
+    Returns:
+        The array, of any type.
+
+    Raises:
+        ObservationError: the values cannot become an array.
     """
     try:
         array = (
@@ -285,11 +314,17 @@ def _image(image: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
 
 
 def pinhole(size: int, distance: float) -> NDArray[np.float64]:
-    """Pinhole matrix, (3, 3) float64, of a square image that just holds the unit sphere seen from a
-    distance.
+    """Return the pinhole matrix of a square image that just contains the unit sphere.
 
-    ``size`` is its side, pixels; the distance is from the centre, object radii. ObservationError if
-    that is inside.
+    Args:
+        size: side of the image, pixels.
+        distance: of the camera from the centre of the sphere, object radii.
+
+    Returns:
+        The matrix, (3, 3) float64, pixels.
+
+    Raises:
+        ObservationError: the camera is inside the sphere.
     """
     distance = number(distance, "the distance")
     if not 1 < distance < LARGEST:

@@ -28,10 +28,15 @@ class RayCaster:
         self._scene = embree_scene(things)
 
     def cast(self, origins: Floats, rays: Floats) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """Where rays, (N, 3), of any length, end first, from (N, 3) points or one for all, (3,).
+        """Find where rays first meet a surface.
 
-        How many times its length each goes, (N,), infinity if it ends nowhere; and on which thing,
-        -1 for none.
+        Args:
+            origins: starts of the rays, (N, 3), or one for all, (3,).
+            rays: directions, (N, 3), of any length.
+
+        Returns:
+            Distance along each ray as a multiple of its length, (N,) float32, infinity if it meets
+            nothing; and the index of the thing that it meets, (N,) int64, -1 for none.
         """
         origins = np.ascontiguousarray(np.broadcast_to(origins, rays.shape), np.float32)
         hits = self._scene.run(origins, np.ascontiguousarray(rays, np.float32), output=1)
@@ -42,8 +47,14 @@ class RayCaster:
 
 
 def pixel_rays(intrinsics: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Rays through the pixels of a pinhole camera, camera frame, (H, W, 3), z = 1: their lengths
-    are depths.
+    """Return the rays through the pixels of a pinhole camera.
+
+    Args:
+        intrinsics: pinhole matrix, (3, 3), pixels.
+        shape: rows and columns of the image.
+
+    Returns:
+        Rays, (H, W, 3) float32, camera frame, with z = 1, so that multiples of a ray are depths.
     """
     (height, width), (fx, _, cx), (_, fy, cy) = shape, *intrinsics[:2]
     x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)

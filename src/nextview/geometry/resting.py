@@ -130,10 +130,17 @@ class _SelfComparison:
         return cls(surface, _points_on(mesh, COMPARED_POINTS, rng))
 
     def look_alike(self, first_up: Vectors, second_up: Vectors) -> bool:
-        """Whether a turn about the vertical makes the one pose look like the other.
+        """Return whether a rotation about the vertical maps one resting pose onto the other.
 
-        The best of many turns is fitted closer by iterative closest points (Besl and McKay, PAMI
+        The best of many rotations is refined by iterative closest points (Besl and McKay, PAMI
         1992).
+
+        Args:
+            first_up: direction that points up in the first pose, (3,), mesh axes.
+            second_up: direction that points up in the second pose, (3,), mesh axes.
+
+        Returns:
+            True if the poses look alike.
         """
         from scipy.spatial.transform import Rotation
 

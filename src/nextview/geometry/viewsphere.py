@@ -42,12 +42,15 @@ def rotation_z(angle: ArrayLike) -> Float:
 
 
 def look_at_origin(elevation: ArrayLike, azimuth: ArrayLike, distance: float = DISTANCE) -> Float:
-    """Camera-to-world poses, (..., 4, 4) float64, of cameras that look at the origin with the
-    horizon level.
+    """Return the poses of cameras that look at the origin with a level horizon.
 
-    Camera axes are OpenCV's: x right, y down, z forward. Elevation above the horizontal plane and
-    azimuth about +z, counter-clockwise from +x, are radians, (...); the distance is from the
-    origin, object radii.
+    Args:
+        elevation: above the horizontal plane, radians, (...).
+        azimuth: about +z, counter-clockwise from +x, radians, (...).
+        distance: from the origin, object radii.
+
+    Returns:
+        Camera-to-world poses, (..., 4, 4) float64, OpenCV axes: x right, y down, z forward.
     """
     elevation, azimuth = np.broadcast_arrays(
         np.asarray(elevation, float), np.asarray(azimuth, float)
@@ -67,15 +70,28 @@ def look_at_origin(elevation: ArrayLike, azimuth: ArrayLike, distance: float = D
 
 
 def level_pose(direction: Float, distance: float = DISTANCE) -> Float:
-    """The level pose of a camera in some direction from the origin, (3,), that looks at it, (4,
-    4).
+    """Return the pose of a level camera that looks at the origin from a direction.
+
+    Args:
+        direction: from the origin to the camera, (3,), of any length.
+        distance: from the origin, object radii.
+
+    Returns:
+        Camera-to-world pose, (4, 4) float64, OpenCV axes.
     """
     return look_at_origin(elevation_of(direction), azimuth_of(direction), distance)
 
 
 def great_circle(a: Float, b: Float, n: int = 25) -> Float:
-    """Unit vectors from one to another, (3,) each, on the circle through both, (n, 3); opposite
-    ones over the top.
+    """Interpolate between two directions on the great circle through both.
+
+    Args:
+        a: first unit vector, (3,).
+        b: second unit vector, (3,); if it is opposite to ``a``, the path leads over the top.
+        n: number of directions, both ends included.
+
+    Returns:
+        Unit vectors, (n, 3) float64.
     """
     angle = angle_between(a, b)
     side = b - (a @ b) * a
@@ -91,7 +107,15 @@ def _fixed(array: NDArray) -> NDArray:
 
 
 def angle_between(a: Float, b: Float) -> Float:
-    """Great-circle angle between unit vectors, (..., 3) each, radians, (...)."""
+    """Return the great-circle angle between unit vectors.
+
+    Args:
+        a: unit vectors, (..., 3).
+        b: unit vectors, (..., 3).
+
+    Returns:
+        Angles, radians, (...) float64.
+    """
     # arctan2 keeps its precision for equal and for opposite directions, where arccos loses half the
     # digits.
     return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1))
@@ -170,8 +194,14 @@ class Viewpoints:
         return elevation_of(directions) / CELL[0], azimuth_of(directions) / CELL[1]
 
     def travel_between(self, a: Float, b: Float) -> Float:
-        """Distance between any directions, (..., 3) each, in grid cells: Euclidean over row and
-        column, (...).
+        """Return the distance between directions in cells of the view grid.
+
+        Args:
+            a: directions, (..., 3).
+            b: directions, (..., 3).
+
+        Returns:
+            Euclidean distance over rows and columns, (...) float64, grid cells.
         """
         (row_a, column_a), (row_b, column_b) = self.cells(a), self.cells(b)
         steps = np.abs(column_a - column_b)

@@ -95,8 +95,14 @@ class Policy(Protocol):
         """
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        """The next view of each episode, (B,) int64: one of ``state.free``, of which each
-        episode has at least one.
+        """Choose the next view of each episode.
+
+        Args:
+            state: the state of B episodes with V candidate views; each has at least one free view.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64: one of ``state.free``.
         """
 
 
@@ -127,7 +133,15 @@ class ScoresViews(Protocol):
 
 
 def travel_from(sphere: Viewpoints, state: EpisodeState) -> Float:
-    """What it costs to go from where the camera is to each view, grid cells, (B, V)."""
+    """Return the cost of moving from the camera to each view.
+
+    Args:
+        sphere: the candidate views.
+        state: the state of B episodes.
+
+    Returns:
+        Cost in grid cells, (B, V) float64; the robot's own cost where the state has one.
+    """
     return sphere.travel[state.current] if state.travel is None else state.travel
 
 
@@ -147,8 +161,15 @@ def check_weight(travel_weight: float) -> None:
 
 
 def in_window(sphere: ViewSphere, state: EpisodeState, values: NDArray[np.floating]) -> Float:
-    """Values of the local window's cells, (B, rings, 3), where they lie on the sphere, (B, V);
-    NaN elsewhere.
+    """Place the values of the local window's cells on the whole sphere.
+
+    Args:
+        sphere: the candidate views.
+        state: the state of B episodes.
+        values: of the cells of the local window, (B, rings, 3).
+
+    Returns:
+        Values of all views, (B, V) float64; NaN outside of the window.
     """
     found = np.full(state.visited.shape, np.nan)
     np.put_along_axis(
@@ -163,12 +184,31 @@ def in_window(sphere: ViewSphere, state: EpisodeState, values: NDArray[np.floati
 def window_of(
     sphere: ViewSphere, state: EpisodeState, values: NDArray[np.floating]
 ) -> NDArray[np.floating]:
-    """Of values of all views, (B, V), those of the local window's cells, (B, rings, 3)."""
+    """Select the values of the local window's cells.
+
+    Args:
+        sphere: the candidate views.
+        state: the state of B episodes.
+        values: of all views, (B, V).
+
+    Returns:
+        Values of the window, (B, rings, 3).
+    """
     return values[np.arange(len(values))[:, None, None], sphere.windows[state.current]]
 
 
 def considered(sphere: ViewSphere, state: EpisodeState, values: Float, scope: Scope) -> Float:
-    """Values of the views, (B, V), where a policy of this scope may go; NaN elsewhere."""
+    """Return the values of the views that a policy may choose.
+
+    Args:
+        sphere: the candidate views.
+        state: the state of B episodes.
+        values: of all views, (B, V).
+        scope: "global" for all views, "local" for the local window.
+
+    Returns:
+        Values, (B, V); NaN outside of the scope.
+    """
     return (
         values if scope == "global" else in_window(sphere, state, window_of(sphere, state, values))
     )
@@ -177,8 +217,16 @@ def considered(sphere: ViewSphere, state: EpisodeState, values: Float, scope: Sc
 def best_view(
     sphere: Viewpoints, state: EpisodeState, values: NDArray[np.floating], scope: Scope = "global"
 ) -> NDArray[np.int64]:
-    """The free view with the highest value, (B, V): of all views, or of the local window; (B,)
-    int64.
+    """Return the free view with the highest value.
+
+    Args:
+        sphere: the candidate views.
+        state: the state of B episodes.
+        values: of all views, (B, V).
+        scope: "global" for all views, "local" for the local window.
+
+    Returns:
+        The view of each episode, (B,) int64.
     """
     if scope == "global":
         return np.where(state.free, values, -np.inf).argmax(1)
@@ -189,10 +237,18 @@ def best_view(
 def best_in_window(
     sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.floating]
 ) -> NDArray[np.int64]:
-    """The free view of the local window with the highest of finite scores, (B, rings, 3).
+    """Return the free view of the local window with the highest score.
 
-    With none free there, the free view with the shortest travel; with none at all, the window's
-    best.
+    If no view of the window is free, it is the free view with the shortest travel; if no view is
+    free at all, the best one of the window.
+
+    Args:
+        sphere: the candidate views.
+        state: the state of B episodes.
+        scores: of the cells of the window, (B, rings, 3), finite.
+
+    Returns:
+        The view of each episode, (B,) int64.
     """
     b = len(state.current)
     rows = np.arange(b)

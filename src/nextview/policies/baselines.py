@@ -39,6 +39,15 @@ class Random(Baseline):
     """Any unvisited view of the local window, with equal chance."""
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Draw a free view of the local window.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         return best_in_window(
             self.sphere, state, rng.random((len(state.current), self.sphere.rings, 3))
         )
@@ -50,6 +59,15 @@ class RandomAll(Baseline):
     """
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Draw any free view.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         return best_view(self.sphere, state, rng.random(state.visited.shape))
 
 
@@ -59,6 +77,15 @@ class Furthest(Baseline):
     """
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Choose the view of the local window with the longest travel; ties are drawn.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         distance = self.sphere.travel[
             state.current[:, None, None], self.sphere.windows[state.current]
         ]
@@ -69,6 +96,15 @@ class Unidirectional(Baseline):
     """The next unvisited azimuth on the same ring, always the same way round."""
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Choose the next free view round the ring; a local view once the ring is complete.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         n = self.sphere.azimuths
         ring, azimuth = np.divmod(state.current, n)
         ahead = ring[:, None] * n + (azimuth[:, None] + np.arange(1, n)) % n
@@ -92,6 +128,15 @@ class Spread:
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Choose the view whose nearest visited view is farthest away; ties are drawn.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         nearest = np.full(state.visited.shape, np.inf)
         # one at a time, so that the memory does not grow with V squared
         for view in range(len(self.sphere)):
@@ -118,6 +163,15 @@ class Visibility:
         return visibility_of(state) - self.travel_weight * travel_from(self.sphere, state)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Choose the view with the highest expected visible share, less its travel; ties are drawn.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         return best_view(
             self.sphere, state, self.view_values(state) + 1e-6 * rng.random(state.visited.shape)
         )
@@ -135,14 +189,35 @@ class ViewList:
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Take the next view of the list.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+
+        Raises:
+            PolicyError: the list is exhausted.
+        """
         if state.step >= self.views.shape[1]:
             raise PolicyError(f"only {self.views.shape[1]} views are listed")
         return self.views[state.episodes, state.step]
 
 
 def orbit(sphere: ViewSphere, starts: NDArray[np.int64], k: int) -> NDArray[np.int64]:
-    """The next k views round the ring of each start, (E,), then round the ring above; the lowest
-    follows the top.
+    """Return the next views round the ring of each start, then round the ring above.
+
+    The lowest ring follows the top one.
+
+    Args:
+        sphere: the candidate views.
+        starts: first view of each episode, (E,) int64.
+        k: number of views.
+
+    Returns:
+        The views in order, (E, k) int64.
     """
     n = sphere.azimuths
     step = np.arange(k)
@@ -151,7 +226,13 @@ def orbit(sphere: ViewSphere, starts: NDArray[np.int64], k: int) -> NDArray[np.i
 
 
 def ranked(values: NDArray[np.floating], k: int) -> NDArray[np.int64]:
-    """The k views with the highest values, (E, V), highest first, equal ones in their order: (E,
-    k) int64.
+    """Return the views with the highest values.
+
+    Args:
+        values: of all views, (E, V).
+        k: number of views.
+
+    Returns:
+        The views, highest value first, equal ones in their order, (E, k) int64.
     """
     return np.argsort(-values, axis=1, kind="stable")[:, :k]

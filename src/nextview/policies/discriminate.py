@@ -70,8 +70,18 @@ class Discriminate:
     def from_card(
         cls, path: Path, viewpoints: Viewpoints, classes: tuple[str, ...] | None = None
     ) -> "Discriminate":
-        """For the things of a memory, by its card; OtherUseError if ``classes`` are not those of
-        its things.
+        """Create the policy for the things of a memory.
+
+        Args:
+            path: of the memory's card.
+            viewpoints: the candidate views.
+            classes: of the recogniser in use; None to skip the check.
+
+        Returns:
+            The policy.
+
+        Raises:
+            OtherUseError: the memory knows other classes.
         """
         card, memory = open_memory(path)
         if classes is not None and card.classes != tuple(classes):
@@ -81,6 +91,15 @@ class Discriminate:
         return cls(viewpoints, memory.views, np.array(card.calibration.hypotheses))
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Choose the view from which the leading things look least alike; ties are drawn.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         values = self.view_values(state)
         return best_view(self.viewpoints, state, values + 1e-9 * rng.random(values.shape))
 
@@ -133,10 +152,14 @@ class Discriminate:
         return ring, (azimuth[:, None] + ahead) % AZIMUTHS
 
     def rivals(self, joint: Float, here: float) -> Rivals | None:
-        """The two classes believed most, as remembered from every view; None if all hypotheses are
-        of one class.
+        """Return the two most likely classes as they are remembered from every view.
 
-        From the belief (H, azimuths) seen from an azimuth, radians.
+        Args:
+            joint: belief in each hypothesis and azimuth bin, (H, azimuths).
+            here: azimuth of the camera, radians.
+
+        Returns:
+            The two classes; None if all hypotheses are of one class.
         """
         of_class = np.bincount(self.classes, joint.sum(1))
         if len(of_class) < 2:

@@ -40,7 +40,15 @@ class DiscriminateGeometry:
         check_weight(self.travel_weight)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        """The free view with the highest value, of each episode, (B,) int64."""
+        """Choose the free view with the highest value; ties are drawn.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         values = self.view_values(state)
         values = np.where(np.isnan(values), -np.inf, values)
         return best_view(self.viewpoints, state, values + 1e-9 * rng.random(values.shape))

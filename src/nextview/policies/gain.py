@@ -72,7 +72,16 @@ def mirrored(sphere: ViewSphere) -> Index:
 
 
 def origin(sphere: ViewSphere, state: EpisodeState, frame: Frame) -> Index:
-    """The view from which the cells of each episode are counted, (B,) int64."""
+    """Return the view from which the cells of each episode are counted.
+
+    Args:
+        sphere: the candidate views.
+        state: the state of B episodes.
+        frame: "camera" for the current view; "object" for the estimated azimuth bin 0.
+
+    Returns:
+        The view, (B,) int64.
+    """
     if frame == "camera":
         return state.current
     azimuth_bin = _most_believed(state.belief, _bin_belief(sphere, state)).argmax(1)
@@ -99,7 +108,19 @@ def _most_believed(belief: Float, azimuth_bins: Float) -> Float:
 def features(
     sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], frame: Frame = "camera"
 ) -> Float:
-    """What a network takes of B episodes, none of it depending on the absolute azimuth."""
+    """Compute the input of the gain network from the state of episodes.
+
+    No number depends on the absolute azimuth, which a robot does not know.
+
+    Args:
+        sphere: the candidate views.
+        state: the state of B episodes.
+        inputs: names of the parts, such as "belief", "view", "place", "azimuth_bin" and maps.
+        frame: in which cells are counted, "camera" or "object".
+
+    Returns:
+        Features, (B, D) float32.
+    """
     n = sphere.azimuths
     start = origin(sphere, state, frame)
     ahead = (sphere.azimuth_index[state.current] - sphere.azimuth_index[start]) % n
@@ -145,8 +166,16 @@ def _facets(belief: Float) -> list[Float]:
 def mirrored_features(
     sphere: ViewSphere, classes: int, inputs: Sequence[str], frame: Frame = "camera"
 ) -> Index:
-    """Which of the numbers of ``features`` stands in each place for the mirror image of an
-    object, (D,) int64.
+    """Return the place of each feature for the mirror image of an object.
+
+    Args:
+        sphere: the candidate views.
+        classes: number of classes.
+        inputs: names of the parts, as for ``features``.
+        frame: in which cells are counted, "camera" or "object".
+
+    Returns:
+        Index of the feature that stands in each place, (D,) int64.
     """
     n = sphere.azimuths
     facets = 2 * classes + min(3, classes)
@@ -244,6 +273,15 @@ class Gain:
         return considered(self.sphere, state, self.gains(state), self.scope)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
+        """Choose the view with the highest predicted gain, less its travel.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         return best_view(self.sphere, state, self.view_values(state), self.scope)
 
 
@@ -284,6 +322,15 @@ class VisibleGain:
         return self.scores(state) - self.travel_weight * travel_from(self.sphere, state)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
+        """Choose the view with the highest product of visible share and predicted gain.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         return best_view(self.sphere, state, self.view_values(state))
 
 
@@ -306,7 +353,21 @@ def _cells(weights: Path, session: OnnxFile, features: NDArray[np.float32]) -> N
 def read_gain(
     sphere: ViewSphere, table: GainTable, scope: Scope, weights: Path, sha256: str
 ) -> Gain:
-    """The policy that a card describes."""
+    """Open the gain policy that a card describes.
+
+    Args:
+        sphere: the candidate views.
+        table: the policy's part of the card.
+        scope: "global" for all views, "local" for the local window.
+        weights: path of the ONNX file.
+        sha256: that its content must have.
+
+    Returns:
+        The policy.
+
+    Raises:
+        ModelError: the file is missing, has another hash, or does not agree with the card.
+    """
     session = open_onnx(weights, sha256, threads=1)
     score = partial(_cells, weights, session)
     policy = Gain(

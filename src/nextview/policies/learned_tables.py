@@ -59,6 +59,15 @@ class FixedSequence:
         return np.stack(views, 1)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Follow the path of the first view; where that is not possible, choose as ``Spread`` does.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         chosen = Spread(self.sphere, self.scope).next_views(state, rng)
         if state.step >= self.paths.shape[1]:
             return chosen
@@ -92,6 +101,15 @@ class FixedRing:
             raise PolicyError(f"there is no ring {self.ring} to be walked in steps of {self.steps}")
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Choose the next free view of the ring; as ``Spread`` does once the ring is complete.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         n = self.sphere.azimuths
         rows = np.arange(len(state.current))
         order = np.concatenate([[0], np.arange(1, n) * self.steps, np.arange(1, n)])
@@ -129,6 +147,15 @@ class ClassTable:
             )
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Choose the view with the highest value for the believed classes.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         return best_view(self.sphere, state, self._looked_up(state), self.scope)
 
     travel_weight = 0.0

@@ -71,6 +71,15 @@ class MapPeak:
         return in_window(self.sphere, state, self._climbed(state))
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Choose the highest peak, or the deepest valley, of the predicted local map.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         return best_in_window(self.sphere, state, self._climbed(state))
 
     def _climbed(self, state: EpisodeState) -> NDArray[np.float64]:
@@ -116,6 +125,15 @@ class SpherePeak:
         return self._on_sphere(state, sphere_peaks(state.evidence.maps[self.map_name]))
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Choose the highest peak of the predicted map of the whole sphere.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         return best_view(self.sphere, state, self.scores(state))
 
     def _on_sphere(self, state: EpisodeState, maps: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -24,8 +24,14 @@ Float = NDArray[np.float64]
 
 
 def anywhere(policy: Policy, sphere: Viewpoints) -> Policy:
-    """A policy for some viewpoints and for cameras that stand beside them: itself, if it knows
-    its way already.
+    """Adapt a policy to any viewpoints, and to cameras that stand between them.
+
+    Args:
+        policy: of a grid of views, or one that works anywhere.
+        sphere: the candidate views.
+
+    Returns:
+        The policy itself if it already suits them, else an adapter.
     """
     grid = getattr(policy, "sphere", None)
     if not isinstance(grid, ViewSphere):
@@ -53,6 +59,15 @@ class OffGrid:
         return self.policy.needs
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Ask the policy on its own grid and interpolate between its cells.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         if self._on_grid(state):
             return self.policy.next_views(state, rng)
         turned, ahead = self._turned(state)

@@ -32,6 +32,15 @@ class OracleValley:
         return (self.map_name,)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Choose the valley of the map if the true class asks for it, else the peak.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         maps = np.asarray(state.evidence.maps[self.map_name], np.float64)
         valley = np.isin(self.labels[state.episodes], self.valley_classes)
         return best_in_window(
@@ -62,6 +71,15 @@ class OracleMeasure:
         return np.asarray(self.values[state.episodes], np.float64)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Choose the highest value, or the highest peak, of the true measure.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         values = self.view_values(state)
         if self.peaks:
             values = sphere_peaks(
@@ -91,6 +109,15 @@ class OracleGain:
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Choose the view that raises the belief in the true class most.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         b = len(state.current)
         parts = np.split(np.arange(b), range(500, b, 500))  # all at once would fill the memory
         gain = np.concatenate([self._gains(state, rows) for rows in parts])

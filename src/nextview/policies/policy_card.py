@@ -68,7 +68,18 @@ class PolicyCard(
     sha256: Sha256 = ""  # of the ONNX file; "" if there is none
 
     def make(self, sphere: ViewSphere, weights: Path) -> Policy:
-        """The policy that it describes."""
+        """Create the policy that the card describes.
+
+        Args:
+            sphere: the candidate views.
+            weights: path of its ONNX file; used by gain policies only.
+
+        Returns:
+            The policy.
+
+        Raises:
+            ModelError: the card's table or the file is not valid.
+        """
         table: Any = decode_record(self.table, TABLES[self.kind], "the table", ModelError)
         found = getattr(table, "values", getattr(table, "classes", self.classes))
         classes = found if isinstance(found, int) else len(found)
@@ -92,7 +103,13 @@ def bundled_policies() -> dict[str, Path]:
 
 
 def write_policy_card(path: Path, card: PolicyCard, overwrite: bool = False) -> None:
-    """Write a card, whole or not at all."""
+    """Write the card of a policy.
+
+    Args:
+        path: of the card.
+        card: its content.
+        overwrite: whether to replace an existing card.
+    """
     write_record(path, card, overwrite)
 
 
@@ -105,10 +122,19 @@ def read_policy_card(path: Path) -> PolicyCard:
 
 
 def read_policy(path: Path, sphere: Viewpoints, classes: Sequence[str] | None = None) -> Policy:
-    """Make the policy that a card describes.
+    """Open the policy that a card describes.
 
-    OtherUseError: it was learned for other viewpoints or classes. PolicyError: there is no such
-        card, or it is damaged.
+    Args:
+        path: of the card.
+        sphere: the candidate views.
+        classes: of the recogniser in use; None to skip the check.
+
+    Returns:
+        The policy.
+
+    Raises:
+        OtherUseError: it was learned for other viewpoints or classes.
+        PolicyError: there is no such card, or it is damaged.
     """
     card = read_policy_card(path)
     weights = path.with_suffix(".onnx")

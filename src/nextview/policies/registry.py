@@ -50,16 +50,30 @@ def make_policy(
     classes: Sequence[str] | None = None,
     maps: Collection[str] = (),
 ) -> Policy:
-    """A policy by name; PolicyError if there is no such policy, or it cannot be made.
+    """Create a policy by name.
 
-    ``name`` is one of POLICIES; one by a map ("lem", "lem-peak", "lem-sphere-peak", see
-    ``map_policy``); a learned one that is bundled; the path of a learned one's card (.json); a gain
-    policy with "visible-" before its name; one that an installed package adds; or "MODULE:CLASS"
-    for one of your own, which is called with the viewpoints alone. NAME@WEIGHT sets the travel
-    weight of one that weighs travel. ``sphere`` is a ``ViewSphere`` but for those of ANYWHERE and
-    your own; ``valley_classes`` are indices of those whose believers go to the map's valley;
-    ``classes`` names those of the recogniser: a learned policy for others is refused; ``maps`` are
-    predicted beside those of the bundled networks.
+    The name is one of POLICIES; the name of a map ("lem", "lem-peak", "lem-sphere-peak", see
+    ``map_policy``); a bundled learned policy; the path of a learned policy's card (.json); a gain
+    policy with "visible-" before its name; a policy of an installed package; or "MODULE:CLASS" for
+    one of your own, which is called with the viewpoints alone. NAME@WEIGHT sets the travel weight.
+
+    Args:
+        name: of the policy.
+        sphere: the candidate views; a ``ViewSphere`` except for policies in ANYWHERE and your own.
+        valley_classes: indices of the classes for which a map policy goes to the valley.
+        classes: names of the recogniser's classes; a learned policy for others is refused. None to
+            skip the check.
+        maps: names of maps that are predicted besides those of the bundled networks.
+
+    Returns:
+        The policy.
+
+    Raises:
+        PolicyError: there is no such policy, or it cannot be made.
+
+    Example:
+        >>> make_policy("random-all", ViewSphere.named("40")).needs
+        ()
     """
     if "@" in name and ":" not in name:
         plain, _, travel_weight = name.partition("@")
@@ -110,7 +124,21 @@ def make_policy_anywhere(
     classes: Sequence[str] | None = None,
     maps: Collection[str] = (),
 ) -> Policy:
-    """A policy by name for live use, whatever the viewpoints: see ``policies.off_grid``."""
+    """Create a policy by name for live use with any viewpoints; see ``policies.off_grid``.
+
+    Args:
+        name: of the policy, as for ``make_policy``.
+        viewpoints: the candidate views.
+        valley_classes: indices of the classes for which a map policy goes to the valley.
+        classes: names of the recogniser's classes; None to skip the check.
+        maps: names of maps that are predicted besides those of the bundled networks.
+
+    Returns:
+        The policy.
+
+    Raises:
+        PolicyError: there is no such policy, or it cannot be made.
+    """
     card = _card(name.partition("@")[0])
     if card is not None and not is_memory(card):
         about = read_policy_card(card)
@@ -141,7 +169,17 @@ def _on_grid(name: str, maps: Collection[str]) -> bool:
 def map_policy(
     name: str, sphere: Any, valley_classes: Sequence[int], maps: Collection[str]
 ) -> Policy | None:
-    """The policy that climbs a predicted map; None if the name is not that of one."""
+    """Create the policy that climbs a predicted map.
+
+    Args:
+        name: "MAP", "MAP-peak" or "MAP-sphere-peak".
+        sphere: the candidate views.
+        valley_classes: indices of the classes for which it goes to the valley.
+        maps: names of maps that are predicted besides those of the bundled networks.
+
+    Returns:
+        The policy; None if the name is not that of a map policy.
+    """
     of = name.removesuffix("-peak")
     window = of.removesuffix(SPHERE)
     always = of != name
@@ -161,8 +199,16 @@ def map_policy_names(maps: Collection[str]) -> list[str]:
 
 
 def with_cards(name: str, cards: Mapping[str, Path]) -> str:
-    """The name, or what it means where it is that of one of these cards: also after "visible-"
-    and before "@WEIGHT".
+    """Replace the name of a policy by the path of its card.
+
+    The name may have "visible-" before it and "@WEIGHT" after it.
+
+    Args:
+        name: of a policy.
+        cards: paths of cards by the name of their policy.
+
+    Returns:
+        The name with the path in it; the name itself if it is not among the cards.
     """
     policy, weighted, travel_weight = name.partition("@")
     if policy in cards:

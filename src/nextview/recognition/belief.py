@@ -16,8 +16,17 @@ Floating = NDArray[np.floating]
 
 
 def fuse(logits: Floating, temperature: float = 1.0) -> Float:
-    """Belief, (..., classes), by logits (..., views, classes): softmax of their sum (thesis,
-    section 4.4).
+    """Fuse the logits of several views by a plain sum (thesis, section 4.4).
+
+    Args:
+        logits: (..., views, classes).
+        temperature: by which the sum is divided.
+
+    Returns:
+        Belief, (..., classes) float64: the softmax of the sum.
+
+    Raises:
+        ModelError: a logit is not finite.
     """
     logits = np.asarray(logits, np.float64)
     if not np.isfinite(logits).all():
@@ -31,13 +40,18 @@ def _softmax(logs: Floating) -> Float:
 
 
 def reorient(azimuth_bins: Floating, azimuth: Floating) -> Floating:
-    """Log-evidence of the bins seen from an azimuth as log-evidence of the azimuths to which bin 0
-    points; or back.
+    """Convert log-evidence of seen azimuth bins to log-evidence of directions of bin 0, or back.
 
-    From azimuth a, bin s is seen if bin 0 points to a - s: the same sum turns either into the
-    other. Between two steps the likelihoods are interpolated, not their logarithms, so that they
-    sum to the same over all azimuths. From (..., classes, azimuth bins), in even steps of azimuth,
-    and azimuths of the views, radians, (...).
+    From azimuth a, bin s is seen if bin 0 points to a - s, so the same sum converts either into the
+    other. Between two steps the likelihoods are interpolated, not their logarithms, so that their
+    sum over all azimuths stays the same.
+
+    Args:
+        azimuth_bins: log-evidence, (..., classes, azimuth bins), in even steps of azimuth.
+        azimuth: of the views, radians, (...).
+
+    Returns:
+        Log-evidence, (..., classes, azimuth bins).
     """
     n = azimuth_bins.shape[-1]
     steps = np.asarray(azimuth, np.float64)[..., None, None] / (2 * np.pi) * n
@@ -58,13 +72,21 @@ def reorient(azimuth_bins: Floating, azimuth: Floating) -> Floating:
 
 
 def log_evidence_of(logits: Floating, azimuth_bins: Floating | None, azimuth: Floating) -> Floating:
-    """Log-evidence of views in a form that can be summed over views: see ``Calibration.belief``.
+    """Combine the outputs for views into log-evidence that can be summed over views.
 
-    From logits (..., classes), log-likelihoods of the azimuth bins seen, (..., hypotheses, azimuth
-    bins), or None, and azimuths, radians, (...): the logits, then for each azimuth the log-evidence
-    that azimuth bin 0 points there, given each hypothesis, (..., classes + azimuth bins *
-    hypotheses). The hypotheses are the classes, or see ``Calibration.hypotheses``. The logits alone
-    without azimuth bins.
+    ``Calibration.belief`` takes the sum.
+
+    Args:
+        logits: (..., classes).
+        azimuth_bins: log-likelihoods of the azimuth bins seen, (..., hypotheses, azimuth bins);
+            None without azimuth bins. The hypotheses are the classes, or see
+            ``Calibration.hypotheses``.
+        azimuth: of the views, radians, (...).
+
+    Returns:
+        (..., classes + azimuth bins * hypotheses): the logits, then for each azimuth the
+        log-evidence that bin 0 points there, given each hypothesis. Without azimuth bins the logits
+        alone.
     """
     if azimuth_bins is None:
         return logits
@@ -73,8 +95,14 @@ def log_evidence_of(logits: Floating, azimuth_bins: Floating | None, azimuth: Fl
 
 
 def of_true_class(logs: Float, labels: NDArray[np.int64]) -> Float:
-    """Log-belief in the true class, (N, ...), from logits (N, ..., C) up to a constant and
-    labels (N,).
+    """Return the log-belief in the true class.
+
+    Args:
+        logs: logits up to a constant, (N, ..., C).
+        labels: true classes, (N,) int64.
+
+    Returns:
+        Log-belief, (N, ...) float64.
     """
     top = logs.max(-1)
     of_truth = logs[np.arange(len(labels)), ..., labels]
@@ -102,8 +130,17 @@ class RiskBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             )
 
     def threshold(self, risk: float, max_views: int) -> float:
-        """The lowest threshold that promises an error rate of at most ``risk``; RiskError if
-        none does.
+        """Return the lowest threshold that guarantees an error rate.
+
+        Args:
+            risk: largest share of wrong answers among the episodes that stop early, 0 to 1.
+            max_views: largest number of views of an episode.
+
+        Returns:
+            Threshold of the belief.
+
+        Raises:
+            RiskError: the risk is not between 0 and 1, or cannot be guaranteed for so many views.
         """
         if not 0 < risk < 1:
             raise RiskError(f"the risk is an error rate between 0 and 1, not {risk}")
@@ -171,8 +208,18 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         return self.temperature * (1 + self.correlation * (n_views - 1))
 
     def log_belief(self, total: Floating, n_views: NDArray | int, classes: int) -> Float:
-        """Log-belief in each class up to a constant, (..., classes), by a sum of
-        ``log_evidence_of`` so many views.
+        """Return the log-belief in each class, up to a constant.
+
+        Args:
+            total: sum of ``log_evidence_of`` over the views, (..., D).
+            n_views: number of views in the sum, (...).
+            classes: number of classes.
+
+        Returns:
+            Log-belief, (..., classes) float64.
+
+        Raises:
+            ModelError: the evidence is not finite.
         """
         if not np.isfinite(total).all():
             raise ModelError("the recogniser said something that is not a finite number")
@@ -207,8 +254,16 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
     def joint(
         self, total: Floating, n_views: NDArray | int, classes: int, azimuth: Floating
     ) -> Float:
-        """Belief in each hypothesis seen from each azimuth bin, jointly, (..., hypotheses,
-        azimuth bins), sums to 1.
+        """Return the joint belief in hypotheses and the azimuth bins from which they are seen.
+
+        Args:
+            total: sum of ``log_evidence_of`` over the views, (..., D).
+            n_views: number of views in the sum, (...).
+            classes: number of classes.
+            azimuth: from which the bins are counted, radians, (...).
+
+        Returns:
+            Belief, (..., hypotheses, azimuth bins) float64; sums to 1 over both.
         """
         total = np.asarray(total, np.float64)
         logs = reorient(self._pointing(total, n_views, classes).swapaxes(-1, -2), azimuth)
@@ -220,24 +275,52 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         return _softmax(logs.reshape(*logs.shape[:-2], -1)).reshape(logs.shape)
 
     def belief(self, total: Floating, n_views: NDArray | int, classes: int) -> Float:
-        """Belief in each class, (..., classes) float64, sums to 1; arguments as for
-        ``log_belief``.
+        """Return the belief in each class.
+
+        Args:
+            total: sum of ``log_evidence_of`` over the views, (..., D).
+            n_views: number of views in the sum, (...).
+            classes: number of classes.
+
+        Returns:
+            Belief, (..., classes) float64; sums to 1.
+
+        Raises:
+            ModelError: the evidence is not finite.
         """
         return _softmax(self.log_belief(total, n_views, classes))
 
     def azimuth_bins(
         self, total: Floating, n_views: NDArray | int, classes: int, azimuth: Floating
     ) -> Float | None:
-        """Belief in the bin seen from an azimuth, given each hypothesis, (..., hypotheses,
-        bins); None without bins.
+        """Return the belief in the azimuth bin seen from an azimuth, given each hypothesis.
+
+        Args:
+            total: sum of ``log_evidence_of`` over the views, (..., D).
+            n_views: number of views in the sum, (...).
+            classes: number of classes.
+            azimuth: from which the object is seen, radians, (...).
+
+        Returns:
+            Belief, (..., hypotheses, azimuth bins) float64; sums to 1 over the bins. None without
+            bins.
         """
         if total.shape[-1] == classes:
             return None
         return _softmax(reorient(self._pointing(total, n_views, classes).swapaxes(-1, -2), azimuth))
 
     def threshold(self, risk: float, max_views: int) -> float:
-        """The lowest threshold of the belief that promises an error rate; RiskError if none
-        does.
+        """Return the lowest threshold that guarantees an error rate.
+
+        Args:
+            risk: largest share of wrong answers among the episodes that stop early, 0 to 1.
+            max_views: largest number of views of an episode.
+
+        Returns:
+            Threshold of the belief.
+
+        Raises:
+            RiskError: the recogniser guarantees no error rate, or not this one.
         """
         if self.risk is None:
             raise RiskError(
@@ -275,7 +358,16 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
 
     @classmethod
     def from_arrays(cls, radii: Float, log_density: Float, weight: float) -> "SizeEvidence":
-        """From arrays (R,) and (C, R)."""
+        """Create it from arrays.
+
+        Args:
+            radii: object radii, metres, ascending, (R,).
+            log_density: log-density of each class at these radii, (C, R).
+            weight: of the log-density beside the logits.
+
+        Returns:
+            The evidence from size.
+        """
         return cls(tuple(radii.tolist()), tuple(map(tuple, log_density.tolist())), float(weight))
 
     @cached_property
@@ -294,8 +386,14 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
         return low, high
 
     def impossible(self, radius: float, much: float = MUCH) -> NDArray[np.bool_]:
-        """Whether an object of this radius, metres, is much smaller or larger than nearly all of
-        each class, (C,).
+        """Return the classes of which an object of this radius is far too small or too large.
+
+        Args:
+            radius: of the object, metres.
+            much: factor beyond the usual sizes of a class.
+
+        Returns:
+            Whether the size rules each class out, (C,) bool.
         """
         low, high = self._usual
         return (np.log(radius) < low - np.log(much)) | (np.log(radius) > high + np.log(much))
@@ -342,19 +440,37 @@ class Stopping:
         risk: float | None = None,
         max_views: int = 5,
     ) -> "Stopping":
-        """The rule that goes with a recogniser's calibration: the threshold decays with its
-        correlation.
+        """Create the rule that goes with a recogniser's calibration.
 
-        With a ``risk`` instead, the lowest threshold at which at most this share of those who stop
-        early is wrong; it does not decay. RiskError if that cannot be promised.
+        The threshold decays with the correlation of the views. With a ``risk`` it is the lowest
+        threshold that guarantees this error rate, and does not decay.
+
+        Args:
+            calibration: of the recogniser.
+            threshold: of the belief, for the first view.
+            risk: largest share of wrong answers among the episodes that stop early; None for a
+                threshold.
+            max_views: largest number of views of an episode.
+
+        Returns:
+            The stopping rule.
+
+        Raises:
+            RiskError: the error rate cannot be guaranteed.
         """
         if risk is not None:
             return cls(calibration.threshold(risk, max_views), max_views)
         return cls(threshold, max_views, calibration.threshold_decay)
 
     def reached(self, belief: Floating, n_views: NDArray | int) -> NDArray[np.bool_]:
-        """Whether beliefs, (..., classes), after so many views, (...), are sure enough to stop,
-        (...).
+        """Return whether beliefs are high enough to stop.
+
+        Args:
+            belief: (..., classes).
+            n_views: number of views that each is based on, (...).
+
+        Returns:
+            Whether to stop, (...) bool.
         """
         return belief.max(-1) >= self.threshold_at(n_views)
 

@@ -50,5 +50,13 @@ class Evidence:
 
 
 def items_at(items: Sequence[Any] | None, rows: Any) -> list[Any] | None:
-    """Some items of a sequence, by index or mask; None of None."""
+    """Select items of a sequence.
+
+    Args:
+        items: the sequence, or None.
+        rows: indices or a mask.
+
+    Returns:
+        The selected items; None of None.
+    """
     return None if items is None else [items[i] for i in np.arange(len(items))[rows]]

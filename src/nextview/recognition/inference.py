@@ -56,7 +56,21 @@ class OnnxFile(ort.InferenceSession):
 
 
 def open_onnx(path: Path, sha256: str, threads: int = 0) -> OnnxFile:
-    """Check the hash of an ONNX file, which holds all its weights, and hand it to ONNX Runtime."""
+    """Check the hash of an ONNX file and open it.
+
+    The file holds all of its weights: other files that it refers to are not read.
+
+    Args:
+        path: of the file.
+        sha256: that its content must have.
+        threads: of ONNX Runtime; 0 for one on each core.
+
+    Returns:
+        The open network.
+
+    Raises:
+        ModelError: the file is missing, has another hash, or is not a network.
+    """
     content = checked_bytes(path, sha256)
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
@@ -80,8 +94,19 @@ def open_onnx(path: Path, sha256: str, threads: int = 0) -> OnnxFile:
 def run_onnx(
     path: Path, session: ort.InferenceSession, names: Sequence[str], inputs: NDArray
 ) -> list[NDArray]:
-    """The named outputs of a network with one input, (B, ...); ModelError if they are not B rows
-    of finite numbers.
+    """Run a network that has one input.
+
+    Args:
+        path: of its file, for messages.
+        session: the open network.
+        names: of the outputs.
+        inputs: batch of inputs, (B, ...).
+
+    Returns:
+        The named outputs, (B, ...) each.
+
+    Raises:
+        ModelError: the network fails, or its outputs are not B rows of finite numbers.
     """
     try:
         answers = session.run(list(names), {session.get_inputs()[0].name: inputs})
@@ -105,8 +130,16 @@ def run_onnx(
 
 
 def check_end(path: Path, end: ort.NodeArg, kind: str, shape: Shape) -> None:
-    """Refuse an input or output that is not of this type ("tensor(float)") and shape, after a
-    free batch dimension.
+    """Check the type and the shape of an input or output of a network.
+
+    Args:
+        path: of the network's file, for messages.
+        end: the input or output.
+        kind: type that it must have, such as "tensor(float)".
+        shape: that it must have after a free batch dimension; None is any size.
+
+    Raises:
+        ModelError: it has another type or shape.
     """
     there = end.shape[1:]
     fits = len(end.shape) == len(shape) + 1 and all(
@@ -122,7 +155,18 @@ def check_end(path: Path, end: ort.NodeArg, kind: str, shape: Shape) -> None:
 
 
 def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
-    """Open a model's file and check its inputs and outputs against its card."""
+    """Open a model's file and check its inputs and outputs against its card.
+
+    Args:
+        card: of the model.
+        threads: of ONNX Runtime; 0 for one on each core.
+
+    Returns:
+        The open network.
+
+    Raises:
+        ModelError: the file does not agree with the card.
+    """
     session = open_onnx(card.path, card.sha256, threads)
     kind = "tensor(float)" if card.input.kind == "cloud" else "tensor(uint8)"
     ends = {end.name: end for end in session.get_outputs()}
@@ -194,8 +238,17 @@ class NetworkRecogniser:
     def from_inputs(
         self, inputs: NDArray[Any], elevations: NDArray[np.floating] | None = None
     ) -> Evidence:
-        """Evidence by shape alone, from what the network takes; a memory needs elevations too,
-        radians, (B,).
+        """Return the evidence by shape alone from prepared inputs.
+
+        Args:
+            inputs: what the network takes, (B, ...).
+            elevations: of the cameras, radians, (B,); only memories of things use them.
+
+        Returns:
+            The evidence of the views.
+
+        Raises:
+            ModelError: the network fails.
         """
         names = ["logits"] + [BINS_OUTPUT] * bool(self.azimuth_bins)
         outputs = dict(
@@ -315,8 +368,18 @@ def names_of(networks: Mapping[str, MapNetwork]) -> tuple[str, ...]:
 def open_maps(
     cards: Mapping[str, str | Path], needs: Sequence[str], threads: int = 0
 ) -> dict[str, MapNetwork]:
-    """The networks, of some cards, that predict the maps among a policy's needs, by the name of
-    the local map.
+    """Open the networks that predict the maps which a policy needs.
+
+    Args:
+        cards: names or paths of cards by the name of the local map.
+        needs: of the policy.
+        threads: of ONNX Runtime; 0 for one on each core.
+
+    Returns:
+        The networks by the name of the local map.
+
+    Raises:
+        ModelError: no card predicts one of the maps, or a network cannot be opened.
     """
     wanted = maps_among(needs)
     names = dict.fromkeys(name.removesuffix(SPHERE) for name in wanted)

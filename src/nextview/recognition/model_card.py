@@ -296,11 +296,17 @@ def read_card(path: Path) -> ModelCard:
 
 
 def memory_path(card: Path, sha256: str) -> Path:
-    """Where the file of a memory of things is written, by the path of its card and the SHA-256 of
-    the file.
+    """Return where the file of a memory of things is written.
 
-    It is NAME-HASH.safetensors beside NAME.json, HASH the first digits of the SHA-256: a new memory
-    lies beside the old one until the card names it.
+    It is NAME-HASH.safetensors beside NAME.json, with the first digits of the SHA-256 as HASH. A
+    new memory thus lies beside the old one until the card names it.
+
+    Args:
+        card: path of the memory's card.
+        sha256: of the memory's file.
+
+    Returns:
+        Path of the memory's file.
     """
     return card.with_name(f"{card.stem}-{sha256[:SHORT_HASH]}{MEMORY_SUFFIX}")
 
@@ -353,7 +359,12 @@ def is_memory(card: Path) -> bool:
 
 
 def write_card(path: Path, card: ModelCard) -> None:
-    """Write a card, or replace it by one that says more."""
+    """Write a card, or replace it.
+
+    Args:
+        path: of the card.
+        card: its content.
+    """
     write_record(path, replace(card, path=NOWHERE), overwrite=True)
 
 

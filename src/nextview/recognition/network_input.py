@@ -39,8 +39,17 @@ class InputSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def from_observations(spec: InputSpec, observations: Sequence[Observation]) -> NDArray[Any]:
-    """What a network takes of B views; ObservationError if they are not from one camera, or do
-    not suit it.
+    """Compute the input of a network from observations.
+
+    Args:
+        spec: what the network takes.
+        observations: B views from one camera.
+
+    Returns:
+        Input of the network, (B, ...).
+
+    Raises:
+        ObservationError: the views are not from one camera, or do not suit the network.
     """
     if not isinstance(observations, Sequence) or not all(
         isinstance(view, Observation) for view in observations
@@ -64,7 +73,17 @@ def from_observations(spec: InputSpec, observations: Sequence[Observation]) -> N
 def from_store(
     spec: InputSpec, store: Any, i: int, chosen: NDArray[np.int64] | slice = slice(None)
 ) -> NDArray[Any]:
-    """The same of the views of object i of a ``ViewStore``, all V or the chosen ones."""
+    """Compute the input of a network from the stored views of an object.
+
+    Args:
+        spec: what the network takes.
+        store: a ``ViewStore``.
+        i: row of the object.
+        chosen: the views, (B,) int64; all by default.
+
+    Returns:
+        Input of the network, (B, ...).
+    """
     reads: dict[str, Any] = {"geometry": store.depth, "image": store.image, "cloud": store.points}
     return _network_input(
         spec, reads[spec.kind](i)[chosen], store.sphere.poses[chosen], store.intrinsics
@@ -87,11 +106,18 @@ def _network_input(
 
 
 def cloud_input(points: NDArray[np.float32], poses: Float) -> NDArray[np.float32]:
-    """Clouds, (B, P, 3), upright, with the camera at azimuth zero, scaled to [0, 1] by their own
-    extent, float32.
+    """Turn point clouds to the camera's azimuth and scale each to [0, 1].
 
-    In this frame the cells of the predicted map, all rings and azimuth -1, 0, +1, are in the same
-    place for every view. All zero for a cloud without extent.
+    In this frame the cells of the predicted map, all rings and azimuth -1, 0, +1, have the same
+    place for every view.
+
+    Args:
+        points: (B, P, 3) float32, object frame.
+        poses: camera-to-world, (B, 4, 4), object frame.
+
+    Returns:
+        Clouds, (B, P, 3) float32, upright, with the camera at azimuth zero; all zero for a cloud
+        without extent.
     """
     azimuth = np.arctan2(poses[:, 1, 3], poses[:, 0, 3])
     c = np.cos(azimuth).astype(np.float32)[:, None]
@@ -106,8 +132,17 @@ def cloud_input(points: NDArray[np.float32], poses: Float) -> NDArray[np.float32
 
 
 def image_input(images: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
-    """Grey images, (B, H, W), as one channel, (B, 1, size, size) uint8: the mean over squares of
-    pixels.
+    """Reduce grey images to one channel of the network's size.
+
+    Args:
+        images: (B, H, W) uint8, with H = W a multiple of ``size``.
+        size: side of the result, pixels.
+
+    Returns:
+        Mean over squares of pixels, (B, 1, size, size) uint8.
+
+    Raises:
+        ObservationError: the images cannot be reduced to this size.
     """
     b, h, w = images.shape
     if h != w or h % size:
@@ -121,17 +156,28 @@ def image_input(images: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
 def geometry_input(
     depth: NDArray[np.float32], poses: Float, intrinsics: Float, size: int
 ) -> NDArray[np.uint8]:
-    """Depth images as four channels in the frame of gravity and of the viewing ray, free of texture
-    and lighting.
+    """Convert depth images to four channels in the frame of gravity and of the viewing ray.
 
-    facing: cosine between the surface normal and the ray to the camera, 0 .. 1 (what a headlight
-        would show).
-    up: vertical part of the normal, -1 .. 1. height: above the object's centre, -1 .. 1 radii.
-    nearness: towards the camera from the object's centre, -1 .. 1 radii. Each becomes 1 .. 255; 0
-    is background. Normals come from differences between neighbouring pixels of the full image, on
-    whichever side the depth changes less; the image is then thinned to every k-th pixel. From depth
-    (B, H, W), object radii, 0 = no object, poses (B, 4, 4) and intrinsics (3, 3): (B, 4, size,
-    size) uint8.
+    The channels do not depend on texture or lighting. "facing": cosine between the surface normal
+    and the ray to the camera, 0 to 1, as a headlight would show it. "up": vertical component of the
+    normal, -1 to 1. "height": above the object's centre, -1 to 1 radii. "nearness": towards the
+    camera from the object's centre, -1 to 1 radii. Each is mapped to 1 to 255; 0 is background.
+
+    Normals come from differences between neighbouring pixels of the full image, on the side where
+    the depth changes less. The image is then thinned to every k-th pixel.
+
+    Args:
+        depth: (B, H, W) float32, object radii; 0 where there is no object. H = W is a multiple of
+            ``size``.
+        poses: camera-to-world, (B, 4, 4), object frame.
+        intrinsics: pinhole matrix, (3, 3), pixels.
+        size: side of the result, pixels.
+
+    Returns:
+        The channels, (B, 4, size, size) uint8.
+
+    Raises:
+        ObservationError: the images cannot be thinned to this size.
     """
     _b, h, w = depth.shape
     if h != w or h % size:

@@ -69,14 +69,20 @@ class Quantiles:
     def p_value(
         self, score: Float | float, n_views: NDArray[np.int64] | int
     ) -> NDArray[np.float64]:
-        """The share of known objects that are at least as novel after so many views, by the mean
-        score over them.
+        """Return the share of known objects that are at least as novel.
 
-        A conformal p-value (Vovk et al., 2005): an object of a known class falls below p in a share
-        p of the cases. It cannot fall below one in all known objects and one. Few things have few
-        known views, so a joint score beyond all of these has the p-value of a normal distribution,
-        if that is smaller. Beyond the number of views for which there are quantiles, the last
-        count. Shapes are broadcast; float64.
+        This is a conformal p-value (Vovk et al., 2005): an object of a known class falls below p in
+        a share p of the cases. It cannot fall below one in all known objects and one. Few things
+        have few known views, so a joint score beyond all of these has the p-value of a normal
+        distribution if that is smaller.
+
+        Args:
+            score: mean novelty score over the views, (...).
+            n_views: number of views, (...); beyond the numbers for which there are quantiles, the
+                last one counts.
+
+        Returns:
+            The p-value, (...) float64.
         """
         score, n_views = np.broadcast_arrays(np.asarray(score, np.float64), n_views)
         levels = np.linspace(0, 1, self.quantiles.shape[1])
@@ -91,8 +97,14 @@ class Quantiles:
         return found
 
     def of_belief(self, log_belief: Float, n_views: int) -> float:
-        """The joint score of an object by the log-belief in each class, up to a constant, after
-        so many views, (C,).
+        """Return the joint novelty score of an object.
+
+        Args:
+            log_belief: log-belief in each class, up to a constant, (C,).
+            n_views: number of views that it is based on.
+
+        Returns:
+            The score: the higher, the more novel.
         """
         best = int(log_belief.argmax())
         usual = 0.0 if self.usual is None else self.usual[min(n_views, len(self.usual)) - 1, best]
@@ -142,11 +154,17 @@ class Novelty(Quantiles):
     def scores(
         self, embeddings: Float, exact: NDArray[np.bool_] | bool = False
     ) -> NDArray[np.float64]:
-        """The novelty score of each view, (B,) float64, from embeddings (B, F): the higher, the
-        more novel.
+        """Return the novelty score of each view.
 
-        ``exact`` views, (B,), are without a sensor's errors. ModelError where the features are of
-        another size.
+        Args:
+            embeddings: features of the views, (B, F).
+            exact: whether each view is free of sensor errors, (B,) bool, or one value for all.
+
+        Returns:
+            Scores, (B,) float64: the higher, the more novel.
+
+        Raises:
+            ModelError: the features have another size than those that the score was fitted to.
         """
         if embeddings.shape[1] != self.neighbours.shape[1]:
             raise ModelError(
@@ -158,8 +176,14 @@ class Novelty(Quantiles):
         return (distance - middle) / deviation
 
     def save(self, path: Path, overwrite: bool = False) -> str:
-        """Write a .safetensors file, the known views in eight bits a number; returns its
-        SHA-256.
+        """Write the score to a .safetensors file, with eight bits per number of the known views.
+
+        Args:
+            path: of the file.
+            overwrite: whether to replace an existing file.
+
+        Returns:
+            SHA-256 of the file.
         """
         arrays = {name: getattr(self, name) for name in ARRAYS} | {
             "neighbours": _in_eight_bits(self.neighbours)
@@ -186,8 +210,14 @@ class ViewScore:
 
 
 def values_of(scores: Sequence[ViewScore], whole: bool = False) -> list[float]:
-    """Values of some scores, made together; ``whole``: as if nothing hid the object, by what is
-    usual then.
+    """Return the values of novelty scores, computing those that are missing together.
+
+    Args:
+        scores: of the views of one object.
+        whole: whether to correct for hidden parts of the object by their usual effect.
+
+    Returns:
+        The values, in the order of the scores.
     """
     asked = [score for score in scores if score.judge is not None]
     if asked and (judge := asked[0].judge) is not None:
@@ -239,11 +269,17 @@ def novelty_path(weights: Path) -> Path:
 
 
 def read_novelty(path: Path, sha256: str) -> Novelty:
-    """Read what ``Novelty.save`` wrote.
+    """Read a file that ``Novelty.save`` wrote.
+
+    Args:
+        path: of the file.
+        sha256: that its content must have.
+
+    Returns:
+        The novelty score.
 
     Raises:
-        ModelError: the file is missing, is not that of this hash, or one of its values makes no
-            sense.
+        ModelError: the file is missing, has another hash, or contains an invalid value.
     """
     content = checked_bytes(path, sha256, "a novelty score")
     arrays: dict[str, Any] = arrays_in(content, ARRAYS, f"{path}: not a novelty score")

@@ -56,7 +56,18 @@ class OwnStopping(Stopping):
     name: str = "a rule of your own"
 
     def reached(self, belief: Floating, n_views: NDArray | int) -> NDArray[np.bool_]:
-        """What the rule says, (...)."""
+        """Return what the rule decides.
+
+        Args:
+            belief: (..., classes).
+            n_views: number of views that each is based on, (...).
+
+        Returns:
+            Whether to stop, (...) bool.
+
+        Raises:
+            UsageError: the rule raises, or returns another type or shape.
+        """
         assert self.rule is not None
         with plugin_errors(lambda said: UsageError(f"the stopping rule {self.name} raised {said}")):
             said = np.asarray(self.rule(Believed(belief, n_views), self.threshold))
@@ -74,7 +85,20 @@ class OwnStopping(Stopping):
 
 
 def own_stopping(rule: Rule | str, threshold: float, max_views: int) -> Stopping:
-    """The rule of a function, or of MODULE:NAME: a function, or a kind of ``Stopping``."""
+    """Create a stopping rule from a function of your own.
+
+    Args:
+        rule: a function of ``Believed`` and the threshold, or MODULE:NAME of a function or of a
+            kind of ``Stopping``.
+        threshold: that the rule is called with.
+        max_views: largest number of views of an episode.
+
+    Returns:
+        The stopping rule.
+
+    Raises:
+        UsageError: the rule cannot be imported, or is not a function.
+    """
     found: Any = rule
     name = rule if isinstance(rule, str) else getattr(rule, "__name__", "a rule of your own")
     if isinstance(rule, str):
