@@ -1,7 +1,7 @@
-"""Everything that can be wrong with what a user handed in, asked for or has installed.
+"""Errors that a user can cause.
 
-Each message is one sentence: what is wrong, in which file, what to do. The command line prints it
-and ends with status 2. Any other exception is a bug of nextview and keeps its traceback.
+Each message is one sentence: what is wrong, in which file, and what to do. The command line prints
+it and exits with status 2. Any other exception is a bug and keeps its traceback.
 """
 
 import struct
@@ -28,45 +28,108 @@ DAMAGED = (
 
 
 class NextviewError(ValueError):
-    """The base of all errors that nextview raises on purpose."""
+    """The base class of all errors that nextview raises on purpose.
+
+    Example:
+        >>> issubclass(nextview.MeshError, nextview.NextviewError)
+        True
+    """
 
 
 class UsageError(NextviewError):
-    """An argument or an option that makes no sense."""
+    """An argument or an option is not valid.
+
+    Example:
+        >>> nextview.load(threshold=2)
+        Traceback (most recent call last):
+        nextview.errors.UsageError: the threshold is a probability between 0 and 1, not 2
+    """
 
 
 class MissingExtraError(NextviewError, ModuleNotFoundError):
-    """A package that an optional part of nextview needs is not installed."""
+    """A package that an optional part of nextview needs is not installed.
+
+    Example:
+        >>> issubclass(nextview.MissingExtraError, ModuleNotFoundError)
+        True
+    """
 
 
 class MeshError(NextviewError):
-    """A mesh file that cannot be used."""
+    """A mesh file cannot be used.
+
+    Example:
+        >>> nextview.load_mesh("missing.off")
+        Traceback (most recent call last):
+        nextview.errors.MeshError: missing.off: no such file
+    """
 
 
 class ObservationError(NextviewError):
-    """What a camera gave cannot be taken for a view of an object."""
+    """The output of a camera is not a valid view of an object.
+
+    Example:
+        >>> nextview.load().session().update("a picture")
+        Traceback (most recent call last):
+        nextview.errors.ObservationError: ...
+    """
 
 
 class NoViewLeftError(ObservationError):
-    """A camera that cannot go everywhere has no view left to offer."""
+    """A camera with a limited set of views has no view left.
+
+    Example:
+        >>> issubclass(nextview.NoViewLeftError, nextview.ObservationError)
+        True
+    """
 
 
 class SessionError(NextviewError):
-    """A session is asked for what it cannot do: it has ended, has not ended yet, or lacks what
-    its policy needs.
+    """A session cannot do what it was asked to do.
+
+    It has ended, it has not ended yet, or its models lack what its policy needs.
+
+    Example:
+        >>> session = nextview.load(max_views=1).session()
+        >>> camera = nextview.SimulatedCamera(sample_mesh("chair"))
+        >>> view = session.update(camera.observe(session.pose))
+        >>> session.failed()
+        Traceback (most recent call last):
+        nextview.errors.SessionError: this session has ended; begin another one
     """
 
 
 class ModelError(NextviewError):
-    """A network, or the card of one, that cannot be used."""
+    """A network or its card cannot be used.
+
+    Example:
+        >>> nextview.load("missing")
+        Traceback (most recent call last):
+        nextview.errors.ModelError: missing: is neither a folder with models nor ...
+    """
 
 
 class RiskError(NextviewError):
-    """An error rate that cannot be promised."""
+    """An error rate cannot be guaranteed.
+
+    Example:
+        >>> nextview.load(risk=1e-9)
+        Traceback (most recent call last):
+        nextview.errors.RiskError: this recogniser cannot promise an error rate of 1e-09...
+    """
 
 
 class PolicyError(NextviewError):
-    """A policy that cannot be made, or that failed, in an episode that may be known."""
+    """A policy cannot be created, or failed.
+
+    Attributes:
+        episode: number of the episode in which it failed; None if it is not known.
+
+    Example:
+        >>> nextview.load(policy="missing")
+        Traceback (most recent call last):
+        nextview.errors.PolicyError: no policy is called 'missing'; there are random, ...
+    """
 
     def __init__(self, message: str, episode: int | None = None) -> None:
         super().__init__(message)
@@ -74,24 +137,60 @@ class PolicyError(NextviewError):
 
 
 class OtherUseError(PolicyError):
-    """A policy that was learned for other viewpoints or classes."""
+    """A policy was learned for other viewpoints or classes.
+
+    Example:
+        >>> nextview.load("ycb", policy="gain")
+        Traceback (most recent call last):
+        nextview.errors.OtherUseError: ...gain.json: was learned for other classes ...
+    """
 
 
 class DatasetError(NextviewError):
-    """A dataset folder or a view store that cannot be used."""
+    """A dataset folder or a view store cannot be used.
+
+    Example:
+        >>> nextview.learn("missing", "out")
+        Traceback (most recent call last):
+        nextview.errors.DatasetError: missing: ...
+    """
 
 
 class MeasureError(NextviewError):
-    """A view measure that is not known, cannot be computed of these views, or failed."""
+    """A view measure is not known, cannot be computed for these views, or failed.
+
+    Example:
+        >>> nextview.data.measures.find_measure("missing")
+        Traceback (most recent call last):
+        nextview.errors.MeasureError: no measure is called 'missing'; there are ...
+    """
 
 
 class PredictionsError(NextviewError):
-    """Predictions that cannot be used."""
+    """Predictions cannot be used.
+
+    Example:
+        >>> nextview.data.predictions.Predictions.load("missing.npz")
+        Traceback (most recent call last):
+        nextview.errors.PredictionsError: missing.npz: there is no such file; ...
+    """
 
 
 class EntryError(NextviewError):
-    """An entry of the benchmark that cannot be run to its end."""
+    """An entry of the benchmark cannot be run to its end.
+
+    Example:
+        >>> issubclass(nextview.EntryError, nextview.NextviewError)
+        True
+    """
 
 
 class ResultsError(NextviewError):
-    """Results that are not there, cannot be written, or must not be replaced."""
+    """Results are missing, cannot be written, or must not be replaced.
+
+    Example:
+        >>> with nextview.files.new_file(Path(".")) as part:
+        ...     pass
+        Traceback (most recent call last):
+        nextview.errors.ResultsError: .: is a folder; give another name
+    """

@@ -115,7 +115,18 @@ def default_entries(specs: EpisodeSpecs) -> list[str]:
 
 
 def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
-    """The policy of that name."""
+    """Create the policy of a benchmark entry.
+
+    Args:
+        name: of the policy.
+        specs: the episodes.
+
+    Returns:
+        The policy.
+
+    Raises:
+        EntryError: the predictions lack what the policy needs.
+    """
     policy = _make(name, specs)
     if "observations" in policy.needs:  # predictions hold no depth; the ways are planned
         return ViewList(
@@ -206,8 +217,18 @@ def _ready(name: str, specs: EpisodeSpecs) -> bool:
 def fixed_views(
     name: str, specs: EpisodeSpecs, rng: np.random.Generator
 ) -> NDArray[np.int64] | None:
-    """The views of each episode in order, (E, k) int64; None if the name is not one of fixed
-    views.
+    """Return the views of an entry that always takes the same views.
+
+    Args:
+        name: of the entry, such as "orbit-8" or "best-5".
+        specs: the E episodes.
+        rng: source of all random numbers.
+
+    Returns:
+        Views in order, (E, k) int64; None if the name is not one of fixed views.
+
+    Raises:
+        EntryError: there are fewer views than the name asks for.
     """
     match = re.fullmatch(rf"({'|'.join([*FIXED, 'true-[a-z0-9_]+'])})-(\d+)", name)
     if not match:

@@ -129,8 +129,19 @@ class AfterAction(Stopping):
 
 
 def rows(values: Any, n: int, below: int, what: str) -> Rows:
-    """What an agent or a user chose, ``n`` whole numbers from 0 to below ``below``; (n,), or one
-    number for one.
+    """Check whole numbers that an agent or a user chose.
+
+    Args:
+        values: the numbers; one number for one row.
+        n: how many there have to be.
+        below: upper limit, exclusive; the lower limit is 0.
+        what: name of the numbers in the error message.
+
+    Returns:
+        The numbers, (n,) int64.
+
+    Raises:
+        UsageError: they are not n such numbers.
     """
     array = np.atleast_1d(np.asarray(values))
     if (
@@ -159,8 +170,18 @@ class Task:
         whole(self.rules.max_views, "the number of views", 2, len(self.sphere))
 
     def begin(self, n: int, rng: np.random.Generator, options: Info | None = None) -> "Cohort":
-        """Begin ``n`` episodes: the options of ``reset`` may name each "object" and "start";
-        else they are drawn.
+        """Begin episodes.
+
+        Args:
+            n: number of episodes.
+            rng: source of all random numbers.
+            options: of ``reset``: "object" and "start" of each episode; what is missing is drawn.
+
+        Returns:
+            The episodes.
+
+        Raises:
+            UsageError: an option is not valid.
         """
         weight = 1 / np.bincount(self.labels)[self.labels]
         chance = weight / weight.sum() if self.balanced else None
@@ -202,13 +223,23 @@ def replayed(
     balanced: bool = False,
     rules: Rules = Rules(),
 ) -> Task:
-    """The task of recognising the objects of one split, each shape once for "train"; None takes all
-    objects.
+    """Create the task of recognising the objects of predictions.
 
-    ``predictions`` to learn from are of objects that the recogniser was not trained on (``nextview
-    predict --held-out``). Of predictions that name no splits, as those of taught things, "train"
-    takes all. ``balanced`` draws every class equally often. PredictionsError: no objects of that
-    split, no such map or azimuth bins.
+    Train on objects that the recogniser was not trained on (``nextview predict --held-out``).
+    Predictions without splits, such as those of taught things, are used completely for "train".
+
+    Args:
+        predictions: the predictions, or their path.
+        split: "train" (each shape once), "test", or None for all objects.
+        balanced: whether every class is drawn equally often.
+        rules: of the episodes.
+
+    Returns:
+        The task.
+
+    Raises:
+        PredictionsError: there are no objects of the split, or a map or the azimuth bins are
+            missing.
     """
     p = predictions if isinstance(predictions, Predictions) else Predictions.load(Path(predictions))
     if split == "train" and not p.splits.any():
@@ -244,6 +275,15 @@ class Asked:
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Rows:
+        """Take the free view that is nearest to the one that the agent asked for.
+
+        Args:
+            state: the state of B episodes with V candidate views.
+            rng: source of all random numbers.
+
+        Returns:
+            The next view of each episode, (B,) int64.
+        """
         return np.where(state.free, self.sphere.travel[self.views[state.episodes]], np.inf).argmin(
             1
         )
@@ -349,6 +389,15 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         self._cohort: Cohort | None = None
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Begin an episode; see Gymnasium.
+
+        Args:
+            seed: of the draws; None to continue them.
+            options: "object" and "start"; what is missing is drawn.
+
+        Returns:
+            The first observation and its info.
+        """
         super().reset(seed=seed)
         self._cohort = self.task.begin(1, self.np_random, options)
         return self.observed(self._cohort.first), info_of(self._cohort.first)
@@ -414,6 +463,15 @@ class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: Info | None = None
     ) -> tuple[NDArray[np.float32], Info]:
+        """Begin an episode in every environment; see Gymnasium.
+
+        Args:
+            seed: of the draws; None to continue them.
+            options: "object" and "start" of each episode; what is missing is drawn.
+
+        Returns:
+            The first observations, (E, D) float32, and their infos.
+        """
         super().reset(seed=seed)
         cohort = self.task.begin(self.num_envs, self.np_random, options)
         self._cohorts = [(cohort, np.arange(self.num_envs))]

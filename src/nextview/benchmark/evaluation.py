@@ -62,7 +62,19 @@ class Evaluation:
 
 
 def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluation:
-    """Judge the recogniser and the map networks behind some predictions."""
+    """Evaluate the recogniser and the map networks behind predictions.
+
+    Args:
+        p: the predictions.
+        samples: number of bootstrap samples.
+        rng: source of all random numbers.
+
+    Returns:
+        All tables.
+
+    Raises:
+        ResultsError: there is only one class, or no bootstrap sample.
+    """
     if len(p.classes) < 2:
         raise ResultsError(
             f"the recogniser knows one class only, {p.classes[0]}: there is nothing to tell apart"
@@ -96,7 +108,19 @@ def fused_views(
     rng: np.random.Generator,
     classes: int,
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """Fuse 1, 2, ... V views of each object, in a random order and in all its rotations."""
+    """Fuse 1, 2, ... V views of each object, in a random order and in all its rotations.
+
+    Args:
+        log_evidence: of the views, (N, V, D).
+        labels: true classes, (N,) int64.
+        calibration: of the recogniser.
+        rng: source of all random numbers.
+        classes: number of classes.
+
+    Returns:
+        Whether the answer is right, (V, N, V) bool, and the confidence in it, (V, N, V) float32: by
+        number of views, object and rotation.
+    """
     n, v, _ = log_evidence.shape
     order = rng.permuted(np.tile(np.arange(v), (n, 1)), axis=1)
     shuffled = np.take_along_axis(log_evidence.astype(np.float64), order[:, :, None], axis=1)
@@ -213,16 +237,30 @@ def _reliability(right: NDArray[np.bool_], confidence: NDArray[np.float32]) -> p
 
 
 def judged_objects(p: Predictions, name: str) -> Index:
-    """The objects whose true map can be told: of the confidence those that are right from any
-    view (section 4.1.3).
+    """Return the objects whose true map is defined.
+
+    The confidence map needs an object that is recognised from some view (thesis, section 4.1.3).
+
+    Args:
+        p: the predictions.
+        name: of the map.
+
+    Returns:
+        Rows of the objects.
     """
     right = p.logits.argmax(2) == p.labels[:, None]
     return np.flatnonzero(right.any(1)) if measure_of(name) == CONFIDENCE else np.arange(len(p))
 
 
 def baselines(true: NDArray[np.floating], labels: Index) -> dict[str, NDArray[np.floating]]:
-    """Maps to be measured against: the mean map, and the mean map of the class at the view, each
-    as ``true`` is.
+    """Return maps that networks are compared with.
+
+    Args:
+        true: the true maps, (N, V, rings, 3).
+        labels: class of each object, (N,) int64.
+
+    Returns:
+        The mean map, and the mean map of the class at the view, each of the shape of ``true``.
     """
     classes, row = np.unique(labels, return_inverse=True)
     of_class = np.stack([true[labels == index].mean(0) for index in classes])
@@ -275,7 +313,18 @@ def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]
 
 
 def scores_for_card(card: ModelCard, p: Predictions) -> dict[str, Any]:
-    """The scores of one of the models that made some predictions, as its card notes them."""
+    """Return the scores of a model for its card.
+
+    Args:
+        card: of the model.
+        p: predictions that it made.
+
+    Returns:
+        The scores by their names.
+
+    Raises:
+        ResultsError: another model made the predictions, or no object can be judged.
+    """
     if p.models.get(card.kind) != (card.name, card.sha256):
         raise ResultsError(f"these predictions were not made by model {card.name}")
     if card.kind == "recogniser":

@@ -114,7 +114,16 @@ def _figures(e: Evaluation, p: Predictions) -> dict[str, Figure]:
 
 
 def page(e: Evaluation, p: Predictions, settings: dict[str, Any]) -> str:
-    """The whole page as text."""
+    """Return the page of an evaluation.
+
+    Args:
+        e: the evaluation.
+        p: the predictions.
+        settings: of the evaluation.
+
+    Returns:
+        HTML.
+    """
     v = len(p.sphere)
     curve = e.fusion.set_index("n_views")
     c = p.calibration

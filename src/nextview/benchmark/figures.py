@@ -78,8 +78,14 @@ def compared(results: Results) -> list[str]:
 
 
 def look_of(policy: str, results: Results) -> dict:
-    """Colour and line of a policy, the same in all figures; no two of those ``compared`` share
-    both.
+    """Return the colour and the line style of a policy, the same in all figures.
+
+    Args:
+        policy: its name.
+        results: of the benchmark.
+
+    Returns:
+        Keyword arguments of ``plot``; no two compared policies have the same.
     """
     own = [
         name
@@ -92,7 +98,15 @@ def look_of(policy: str, results: Results) -> dict:
 
 
 def threshold_curve(results: Results, measure: str = "class_accuracy") -> Figure:
-    """Accuracy against threshold, with 95 % intervals (figures 15 and 18)."""
+    """Draw accuracy against threshold, with 95 % intervals (figures 15 and 18).
+
+    Args:
+        results: of the benchmark.
+        measure: name of the accuracy.
+
+    Returns:
+        The figure.
+    """
     figure, axes = new_figure(4.6, 3.5)
     table = results.tables.summary.query("measure == @measure and threshold == threshold")
     ticks = sorted(table["threshold"].unique())
@@ -111,7 +125,15 @@ def threshold_curve(results: Results, measure: str = "class_accuracy") -> Figure
 
 
 def budget_curve(results: Results, budget: str) -> Figure:
-    """Accuracy against mean views or mean travel, over all thresholds."""
+    """Draw accuracy against mean views or mean travel, over all thresholds.
+
+    Args:
+        results: of the benchmark.
+        budget: "n_views" or "travel_all".
+
+    Returns:
+        The figure.
+    """
     figure, axes = new_figure(4.6, 3.5)
     for name in compared(results):
         rows = results.tables.sweep[results.tables.sweep["policy"] == name]
@@ -126,8 +148,16 @@ def budget_curve(results: Results, budget: str) -> Figure:
 
 
 def differences(results: Results, threshold: float) -> Figure:
-    """Difference of every policy to the reference in accuracy with its 95 % interval; filled
-    where Holm's p < 0.05.
+    """Draw the difference of every policy from the reference in accuracy.
+
+    Lines are 95 % intervals; dots are filled where Holm's p is below 0.05.
+
+    Args:
+        results: of the benchmark.
+        threshold: of the belief.
+
+    Returns:
+        The figure.
     """
     rows = results.tables.tests.query("threshold == @threshold and measure == 'accuracy'").iloc[
         ::-1
@@ -148,8 +178,15 @@ def differences(results: Results, threshold: float) -> Figure:
 
 
 def confusion_matrix(counts: NDArray, classes: Sequence[str], title: str) -> Figure:
-    """Percent of each true class, rows, that was taken for each class (thesis, figure 12);
-    counts (C, C).
+    """Draw the percentage of each true class that was taken for each class (figure 12).
+
+    Args:
+        counts: by true class (rows) and answer (columns), (C, C).
+        classes: names of the classes.
+        title: of the figure.
+
+    Returns:
+        The figure.
     """
     share = counts / np.maximum(counts.sum(1, keepdims=True), 1)
     figure, axes = new_figure(4.6, 4.4)
@@ -173,7 +210,16 @@ def confusion_matrix(counts: NDArray, classes: Sequence[str], title: str) -> Fig
 
 
 def confusion(episodes: pd.DataFrame, classes: Sequence[str], title: str) -> Figure:
-    """Confusion matrix of episodes."""
+    """Draw the confusion matrix of episodes.
+
+    Args:
+        episodes: with the columns "label" and "answer".
+        classes: names of the classes.
+        title: of the figure.
+
+    Returns:
+        The figure.
+    """
     label, answer = (
         pd.Categorical(episodes[c], categories=list(classes)) for c in ("label", "answer")
     )
@@ -181,8 +227,17 @@ def confusion(episodes: pd.DataFrame, classes: Sequence[str], title: str) -> Fig
 
 
 def reliability_diagram(results: Results, policies: Sequence[str], threshold: float) -> Figure:
-    """Reliability of the confidence at which the episodes stopped; bins of fewer than 20
-    episodes are left out.
+    """Draw the reliability of the confidence at which the episodes stopped.
+
+    Bins of fewer than 20 episodes are left out.
+
+    Args:
+        results: of the benchmark.
+        policies: names of the policies.
+        threshold: of the belief.
+
+    Returns:
+        The figure.
     """
     error = results.tables.summary.query(
         "measure == 'calibration_error' and threshold == @threshold"
@@ -227,7 +282,16 @@ def _reliability(curves: dict[str, tuple[pd.DataFrame, dict]], when: str, title:
 
 
 def evaluated_confusion(e: Evaluation, n_views: int, classes: Sequence[str]) -> Figure:
-    """Confusion matrix of that many views."""
+    """Draw the confusion matrix after a number of views.
+
+    Args:
+        e: the evaluation.
+        n_views: number of views, one or all.
+        classes: names of the classes.
+
+    Returns:
+        The figure.
+    """
     table = e.confusion[e.confusion["n_views"] == n_views].pivot(
         index="label", columns="answer", values="answers"
     )

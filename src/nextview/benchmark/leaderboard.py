@@ -25,12 +25,16 @@ def headline_threshold(thresholds: Sequence[float]) -> float:
 
 
 def leaderboard(tables: Tables, threshold: float) -> list[Any]:
-    """The policies under one threshold, the most accurate first and those that no robot could
-    follow last.
+    """List the policies at one threshold, the most accurate first and oracles last.
 
-    Rows with policy, accuracy, its 95 % interval low to high, class_accuracy, n_views, travel (grid
-    cells, over all episodes), difference and p_holm to the reference (NaN for the reference
-    itself), and differs: whether that is significant.
+    Args:
+        tables: of the benchmark.
+        threshold: of the belief.
+
+    Returns:
+        Rows with policy, accuracy, its 95 % interval (low, high), class_accuracy, n_views, travel
+        (grid cells, over all episodes), difference and p_holm to the reference (NaN for the
+        reference itself), and differs, whether the difference is significant.
     """
     rows = tables.summary[tables.summary["threshold"] == threshold]
     table = rows.pivot(index="policy", columns="measure", values="value")
@@ -68,8 +72,14 @@ def level_rows(tables: Tables) -> list[list[tuple[str, list[Any]]]]:
 
 
 def level_differences(tables: Tables, reference: str) -> str | None:
-    """A sentence that names the policies of a robot that differ in scenes after so many views;
-    None if none does.
+    """Return a sentence that names the policies that differ significantly in scenes.
+
+    Args:
+        tables: of the benchmark.
+        reference: name of the reference policy.
+
+    Returns:
+        The sentence; None if no policy of a robot differs.
     """
     found = [
         f"{policy} by {100 * row.difference:+.1f} points after {row.n_views} views under"
@@ -87,8 +97,15 @@ def level_differences(tables: Tables, reference: str) -> str | None:
 
 
 def nothing_differs(tables: Tables, threshold: float, reference: str) -> str | None:
-    """A sentence where no policy that a robot could follow differs from the reference in
-    accuracy; else None.
+    """Return a sentence if no policy of a robot differs significantly from the reference.
+
+    Args:
+        tables: of the benchmark.
+        threshold: of the belief.
+        reference: name of the reference policy.
+
+    Returns:
+        The sentence; None if some policy differs.
     """
     tests = _robot_tests(tables, threshold)
     if tests.empty or (tests["p_holm"] < SIGNIFICANT).any():
@@ -100,7 +117,16 @@ def nothing_differs(tables: Tables, threshold: float, reference: str) -> str | N
 
 
 def too_few(tables: Tables, threshold: float, objects: int) -> str | None:
-    """A warning where there are too few objects to tell policies apart; else None."""
+    """Return a warning if there are too few objects to compare policies.
+
+    Args:
+        tables: of the benchmark.
+        threshold: of the belief.
+        objects: number of objects.
+
+    Returns:
+        The warning; None if there are enough.
+    """
     tests = _robot_tests(tables, threshold)
     half = float((tests["high"] - tests["low"]).median() / 2)  # NaN if nothing was compared
     if objects >= FEW_OBJECTS and not half > WIDE:

@@ -92,8 +92,13 @@ def write_figures(
     tables: Mapping[str, pd.DataFrame],
     overwrite: bool = False,
 ) -> None:
-    """Write every figure as PDF and SVG, and every table as CSV and LaTeX; see
-    ``files.new_folder``.
+    """Write figures as PDF and SVG, and tables as CSV and LaTeX; see ``files.new_folder``.
+
+    Args:
+        folder: to write.
+        figures: by the names of their files.
+        tables: by the names of their files.
+        overwrite: whether to replace existing files.
     """
     with new_folder(folder, overwrite) as part:
         for name, figure in figures.items():
@@ -110,7 +115,15 @@ def write_figures(
 
 
 def origin(p: Predictions, settings: Mapping[str, Any]) -> dict[str, str]:
-    """From which predictions and models a page was made, and of which objects."""
+    """Return the predictions, models and objects that a page is about.
+
+    Args:
+        p: the predictions.
+        settings: of the benchmark or the evaluation.
+
+    Returns:
+        Texts by their headings.
+    """
     splits = zip(*np.unique(p.splits, return_counts=True), strict=True)
     conflicting = [name for name, twice in zip(p.names, p.conflicting, strict=True) if twice]
     return {

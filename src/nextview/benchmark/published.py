@@ -74,7 +74,18 @@ def published(
     classes: tuple[str, ...],
     label: str | None = None,
 ) -> float | None:
-    """The published value of one of our cells; None where nothing was published for it."""
+    """Return the published value of a cell of our tables.
+
+    Args:
+        policy: name of the policy.
+        threshold: of the belief; None for fixed views.
+        measure: name of the measure.
+        classes: names of the classes.
+        label: name of one class; None for all.
+
+    Returns:
+        The value; None if nothing was published.
+    """
     n = published_classes(classes)
     if n is None:
         return None
@@ -102,8 +113,14 @@ def published(
 
 
 def published_recognisers(classes: tuple[str, ...], views: int) -> list[tuple[str, int, float]]:
-    """Network, batch size and accuracy from one of so many views, over objects, of table 6; the
-    best first.
+    """Return the published recognisers of table 6.
+
+    Args:
+        classes: names of the classes.
+        views: number of views of the data set.
+
+    Returns:
+        Network, batch size and accuracy from one view over objects, the best first.
     """
     n = published_classes(classes)
     rows = [
@@ -117,8 +134,16 @@ def published_recognisers(classes: tuple[str, ...], views: int) -> list[tuple[st
 def published_map(
     name: str, measure: str, classes: tuple[str, ...], label: str | None = None
 ) -> float | None:
-    """The published score of a map network that was trained on these classes and tested on them
-    (tables 4 and 7).
+    """Return the published score of a map network (tables 4 and 7).
+
+    Args:
+        name: of the map.
+        measure: name of the score.
+        classes: on which it was trained and tested.
+        label: name of one class; None for all.
+
+    Returns:
+        The score; None if nothing was published.
     """
     n = published_classes(classes)
     over_classes = measure.startswith("class_")

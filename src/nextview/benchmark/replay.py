@@ -47,8 +47,20 @@ class Trajectories:
 
 
 def make_specs(predictions: Predictions, runs: int, seed: int) -> EpisodeSpecs:
-    """Every object from ``runs`` first views in reach, which the seed draws: episode = run *
-    objects + object.
+    """Create episodes with every object, from random first views.
+
+    In scenes, first views are reachable. The number of an episode is run * objects + object.
+
+    Args:
+        predictions: of the N objects.
+        runs: first views of each object.
+        seed: of the draw.
+
+    Returns:
+        The episodes.
+
+    Raises:
+        UsageError: there is no run.
     """
     if runs < 1:
         raise UsageError(f"at least one run is needed, not {runs}")
@@ -67,8 +79,20 @@ def make_specs(predictions: Predictions, runs: int, seed: int) -> EpisodeSpecs:
 def replay(
     name: str, specs: EpisodeSpecs, max_views: int, seed: int, beliefs: bool = False
 ) -> Trajectories:
-    """Run one entry through all episodes, to the last view; keep whole ``beliefs`` for a
-    stopping rule of your own.
+    """Run a benchmark entry through all episodes, to the last view.
+
+    Args:
+        name: of the entry.
+        specs: the episodes.
+        max_views: views of each episode.
+        seed: of the entry's draws, together with its name.
+        beliefs: whether to keep complete beliefs, for a stopping rule of your own.
+
+    Returns:
+        The paths of the episodes.
+
+    Raises:
+        EntryError: the entry cannot run on these predictions.
     """
     rng = np.random.default_rng([seed, *name.encode()])
     views = fixed_views(name, specs, rng)
@@ -98,8 +122,18 @@ def replay_policy(
     rng: np.random.Generator,
     beliefs: bool = False,
 ) -> Trajectories:
-    """Run a policy of any kind through all episodes, until a rule ends them; ``name`` is for
-    messages.
+    """Run a policy through all episodes until a rule ends them.
+
+    Args:
+        name: of the policy, for messages.
+        policy: the policy.
+        specs: the episodes.
+        stopping: ends the episodes.
+        rng: source of all random numbers.
+        beliefs: whether to keep complete beliefs.
+
+    Returns:
+        The paths of the episodes.
     """
     p = specs.predictions
     objects = specs.objects
@@ -143,8 +177,19 @@ def replay_policy(
 
 
 def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcome:
-    """The episodes as a rule ends them, as it would in live use: never after a view in which
-    nothing is seen.
+    """End episodes by a stopping rule, as in live use.
+
+    No episode ends with confidence after a view in which nothing is seen.
+
+    Args:
+        paths: of the episodes.
+        stopping: the rule; None takes all views.
+
+    Returns:
+        How the episodes end.
+
+    Raises:
+        UsageError: a rule of your own needs complete beliefs.
     """
     e = np.arange(len(paths.views))
     count = (paths.views >= 0).sum(1)
@@ -196,7 +241,15 @@ class Grid:
         )
 
     def ends(self, name: str, threshold: float | None) -> Outcome:
-        """The episodes of an entry under a threshold; None takes all views."""
+        """Return how the episodes of an entry end at a threshold.
+
+        Args:
+            name: of the entry.
+            threshold: of the belief; None takes all views.
+
+        Returns:
+            How the episodes end.
+        """
         return truncate(self.paths[name], None if threshold is None else self.stopping(threshold))
 
     def cells(self) -> Iterator[tuple[str, float | None, Outcome]]:
@@ -211,8 +264,14 @@ class Grid:
 
 
 def run_grid(grid: Grid, names: Sequence[str]) -> Iterator[int]:
-    """Run the entries one after the other; one that fails leaves its sentence and takes nothing
-    from the others.
+    """Run all entries; an entry that fails leaves its error message.
+
+    Args:
+        grid: receives paths and failures.
+        names: of the entries.
+
+    Yields:
+        Number of entries done.
     """
     for n, name in enumerate(names, 1):
         try:

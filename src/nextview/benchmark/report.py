@@ -82,8 +82,14 @@ def report(
 
 
 def headline_policy(results: Results, threshold: float) -> str:
-    """The most accurate policy that a robot could follow, other than the reference; the
-    reference if it is alone.
+    """Return the most accurate policy that a robot could follow, other than the reference.
+
+    Args:
+        results: of the benchmark.
+        threshold: of the belief.
+
+    Returns:
+        Its name; the reference if there is no other.
     """
     found = numbers(results.tables.summary, "policy", "threshold", "measure")
     reference = results.settings["reference"]
@@ -94,7 +100,16 @@ def headline_policy(results: Results, threshold: float) -> str:
 
 
 def page(results: Results, store: ViewStore | None, why_not: str) -> str:
-    """The whole page as text."""
+    """Return the page of a benchmark.
+
+    Args:
+        results: of the benchmark.
+        store: of the objects' pictures; None for a page without pictures.
+        why_not: why there are no pictures.
+
+    Returns:
+        HTML.
+    """
     s = results.settings
     t = results.tables
     p = results.predictions
@@ -199,8 +214,14 @@ def _thresholds(results: Results, at: float) -> dict[str, float]:
 
 
 def worst_failures(episodes: pd.DataFrame, most: int = 8) -> pd.DataFrame:
-    """Objects, and how often, how surely and in which run a policy gets them wrong, the most
-    often first.
+    """Return the objects that a policy gets wrong most often.
+
+    Args:
+        episodes: of the policy.
+        most: number of objects.
+
+    Returns:
+        Object, number of wrong episodes, mean confidence, and the run of the most confident one.
     """
     wrong = episodes[episodes["answer"].astype(str) != episodes["label"].astype(str)]
     wrong = wrong.assign(object=wrong["object"].astype(str)).sort_values(
@@ -234,7 +255,18 @@ def _failures(
 def pictures_of(
     predictions: Predictions, store: Path | None = None
 ) -> tuple[ViewStore | None, str]:
-    """The store of the objects' pictures, or None and why not."""
+    """Open the view store of the objects' pictures.
+
+    Args:
+        predictions: of the objects.
+        store: path of a store; None for the one that the predictions name.
+
+    Returns:
+        The store and "", or None and why there is none.
+
+    Raises:
+        ResultsError: the given store holds other objects or viewpoints.
+    """
     if store is not None:
         given = ViewStore.open(store)
         if given.sphere != predictions.sphere or not set(given.names) & set(predictions.names):

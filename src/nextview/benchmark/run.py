@@ -76,8 +76,14 @@ class Results:
     tables: Tables
 
     def episodes(self, policy: str, threshold: float | None) -> pd.DataFrame:
-        """The episodes of one cell, one a row: run by run, in each the objects in the order of
-        the predictions.
+        """Read the episodes of a policy at a threshold.
+
+        Args:
+            policy: name of the policy.
+            threshold: of the belief; None for fixed views.
+
+        Returns:
+            One episode per row: run by run, with the objects in the order of the predictions.
         """
         cell = [("policy", "==", policy)] + (
             [] if threshold is None else [("threshold", "==", threshold)]
@@ -177,7 +183,19 @@ def _prepare(predictions: Path, s: BenchmarkSettings) -> tuple[Grid, list[str], 
 
 
 def chosen_split(table: Predictions, path: Path, split: str | None) -> Predictions:
-    """The objects of one split; all of them where the predictions hold one only."""
+    """Select the objects of one split.
+
+    Args:
+        table: the predictions.
+        path: of the predictions, for messages.
+        split: name of the split; None if the predictions hold only one.
+
+    Returns:
+        The predictions of the split.
+
+    Raises:
+        UsageError: there are several splits and none is chosen.
+    """
     if split:
         return table.of_split(split)
     if len(set(table.splits)) > 1:

@@ -13,8 +13,15 @@ Float = NDArray[np.float64]
 
 
 def resample(n: int, samples: int, rng: np.random.Generator) -> Float:
-    """Bootstrap weights: how often each of n objects is drawn in each sample, (samples, n); each
-    row sums to n.
+    """Draw bootstrap weights.
+
+    Args:
+        n: number of objects.
+        samples: number of samples.
+        rng: source of all random numbers.
+
+    Returns:
+        How often each object is drawn in each sample, (samples, n) float64; each row sums to n.
     """
     return rng.multinomial(n, np.full(n, 1 / n), size=samples).astype(np.float64)
 
@@ -29,8 +36,16 @@ def interval(samples: Float) -> tuple[Float, Float]:
 def estimate(
     top: Float, bottom: Float, weights: Float, labels: NDArray[np.int64] | None = None
 ) -> tuple[Float, Float]:
-    """Ratios of sums over objects (N, M), with ``labels`` their means over classes: (M,), and
-    samples, (S, M).
+    """Return ratios of sums over objects and their bootstrap samples.
+
+    Args:
+        top: numerators, (N, M).
+        bottom: denominators, (N, M).
+        weights: bootstrap weights, (S, N).
+        labels: class of each object, (N,), for means over classes; None for sums over all objects.
+
+    Returns:
+        Ratios, (M,), and their samples, (S, M).
     """
     once = np.ones((1, len(top)))
     if labels is None:
@@ -41,16 +56,28 @@ def estimate(
 
 
 def bootstrap_p(difference: Float, samples: Float) -> Float:
-    """Two-sided p-values of "no difference", (M,), from observed ones, (M,), and paired
-    bootstrap samples, (S, M).
+    """Return two-sided p-values of "no difference".
+
+    Args:
+        difference: observed differences, (M,).
+        samples: paired bootstrap samples of the differences, (S, M).
+
+    Returns:
+        p-values, (M,).
     """
     error = samples.std(0)
     return 2 * norm.sf(np.abs(difference) / np.where(error > 0, error, np.inf))
 
 
 def mcnemar(right: NDArray[np.bool_], reference: NDArray[np.bool_]) -> float:
-    """Two-sided p-value of McNemar's test for right answers of two policies, each (runs, N),
-    clustered by object.
+    """Return the two-sided p-value of McNemar's test, clustered by object.
+
+    Args:
+        right: whether the answers of a policy are right, (runs, N) bool.
+        reference: the same of the reference policy, (runs, N) bool.
+
+    Returns:
+        The p-value.
     """
     difference = (right.astype(np.float64) - reference).mean(0)
     spread = (difference**2).sum()

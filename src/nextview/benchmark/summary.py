@@ -82,7 +82,19 @@ def summarise(
     promised: Mapping[float, float] | None = None,
     n_views: Sequence[int] = (),
 ) -> Tables:
-    """All tables of a grid."""
+    """Compute all tables of a benchmark.
+
+    Args:
+        grid: the episodes.
+        reference: name of the reference policy.
+        samples: number of bootstrap samples.
+        rng: source of all random numbers.
+        promised: thresholds by the error rates that they guarantee.
+        n_views: numbers of views for the table of fixed lengths; empty for none.
+
+    Returns:
+        The tables.
+    """
     weights = target_weights(grid.specs.predictions.names, samples, rng)
     cells = list(grid.cells())
     summary, drawn = _summary(grid, cells, weights)
@@ -268,8 +280,15 @@ def levels_of(names: Sequence[str]) -> NDArray[np.str_]:
 
 
 def target_weights(names: Sequence[str], samples: int, rng: np.random.Generator) -> Float:
-    """Bootstrap weights, (samples, N); scenes around one target are drawn together, as they are
-    not independent.
+    """Draw bootstrap weights of objects; scenes around one target are drawn together.
+
+    Args:
+        names: of the N objects.
+        samples: number of samples.
+        rng: source of all random numbers.
+
+    Returns:
+        Weights, (samples, N) float64.
     """
     targets = [name.rpartition("@")[0] if clutter_level(name) else name for name in names]
     place = {target: i for i, target in enumerate(dict.fromkeys(targets))}
@@ -277,8 +296,18 @@ def target_weights(names: Sequence[str], samples: int, rng: np.random.Generator)
 
 
 def by_level(grid: Grid, reference: str, samples: int, rng: np.random.Generator) -> pd.DataFrame:
-    """Accuracy in scenes after 1 view and after LEVEL_VIEWS, by the level of clutter; no
-    threshold ends an episode.
+    """Compute the accuracy in scenes by the level of clutter.
+
+    Episodes have 1 view and LEVEL_VIEWS views; no threshold ends them.
+
+    Args:
+        grid: the episodes.
+        reference: name of the reference policy.
+        samples: number of bootstrap samples.
+        rng: source of all random numbers.
+
+    Returns:
+        One row for each level, policy and number of views.
     """
     names: tuple[str, ...] = grid.specs.predictions.names
     level_of = levels_of(names)
@@ -338,5 +367,13 @@ def _after(values: NDArray, views: NDArray[np.int64], counts: list[int]) -> NDAr
 
 
 def grid_mean(grid: Grid, values: NDArray) -> Float:
-    """Mean over the runs of each object, (E, ...) to (N, ...)."""
+    """Average over the runs of each object.
+
+    Args:
+        grid: the episodes.
+        values: of the episodes, (E, ...).
+
+    Returns:
+        Means, (N, ...) float64.
+    """
     return values.reshape(grid.runs, -1, *values.shape[1:]).mean(0)

@@ -22,7 +22,15 @@ IN_PREDICTIONS: dict[str, Callable[[Predictions], NDArray]] = {  # (N, V); other
 
 
 def true_map(p: Predictions, name: str) -> NDArray[np.float32]:
-    """Local windows of the true map of that name, (N, V, R, 3), 0 .. 1."""
+    """Return the local windows of a true map.
+
+    Args:
+        p: the predictions.
+        name: of the map.
+
+    Returns:
+        Windows of all views, (N, V, rings, 3) float32, 0 to 1.
+    """
     measure = measure_of(name)
     known = IN_PREDICTIONS.get(measure)
     values = (
@@ -41,12 +49,34 @@ def known_maps(p: Predictions) -> tuple[str, ...]:
 
 
 def true_measure(p: Predictions, measure: str) -> NDArray[np.float32]:
-    """A measure of the views of some predictions, (N, V) float32."""
+    """Return a measure of the views of predictions.
+
+    Args:
+        p: the predictions.
+        measure: name of the measure.
+
+    Returns:
+        Values, (N, V) float32.
+
+    Raises:
+        EntryError: the view store is missing, or is another one.
+    """
     return p.depth_entropy if measure == "depth_entropy" else stored_rows(p, f"measures/{measure}")
 
 
 def stored_rows(p: Predictions, name: str) -> NDArray:
-    """Rows of one of the store's arrays for the objects of predictions, (N, ...)."""
+    """Read an array of the view store for the objects of predictions.
+
+    Args:
+        p: the predictions.
+        name: of the array.
+
+    Returns:
+        Its rows, (N, ...).
+
+    Raises:
+        EntryError: the view store is missing, or is another one.
+    """
     if not p.store:
         raise EntryError(
             "these predictions do not say which view store they were made from, so they lack "

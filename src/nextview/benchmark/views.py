@@ -28,7 +28,15 @@ Numbers = dict[tuple[str, int, str], tuple[float, float, float, float, float]]
 
 
 def after(paths: Trajectories, n_views: int) -> Outcome:
-    """How the episodes stand after so many views."""
+    """Return how episodes stand after a number of views.
+
+    Args:
+        paths: of the episodes.
+        n_views: number of views.
+
+    Returns:
+        How the episodes end.
+    """
     fields = ("views", "answers", "confidences", "travel", "arc")
     return truncate(
         replace(paths, **{name: getattr(paths, name)[:, :n_views] for name in fields}), None
@@ -38,14 +46,22 @@ def after(paths: Trajectories, n_views: int) -> Outcome:
 def measured(
     grid: Grid, n_views: Sequence[int], samples: int, references: Sequence[str]
 ) -> pd.DataFrame:
-    """Every number, by COLUMNS, of the policies that take so many views; their paths are as long,
-    or end by themselves.
+    """Compare policies after fixed numbers of views.
 
-    The measures: ``accuracy``; ``travel``, grid cells; ``to_random`` and so on, differences of
-    accuracy to references; ``share_of_gap``, how much of what ``oracle-gain`` has over the first
-    reference the policy has too. The bootstrap samples are those of the benchmark, the same for all
-    policies, which pairs the differences. p is McNemar's test over objects, corrected by Holm's
-    method for every policy without the truth, reference and number of views.
+    The measures are ``accuracy``; ``travel`` in grid cells; ``to_random`` and so on, differences of
+    accuracy from references; and ``share_of_gap``, the share of the lead of ``oracle-gain`` over
+    the first reference that a policy has. The bootstrap samples are those of the benchmark, the
+    same for all policies, which pairs the differences. p is McNemar's test over objects with one
+    Holm correction for every policy without the truth, reference and number of views.
+
+    Args:
+        grid: the episodes; the paths are as long, or end by themselves.
+        n_views: numbers of views.
+        samples: number of bootstrap samples.
+        references: names of the reference policies.
+
+    Returns:
+        One number per row, with the columns COLUMNS.
     """
     names = [
         name
@@ -134,7 +150,15 @@ def as_rows(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def markdown(rows: pd.DataFrame, left_out: Sequence[str] = ()) -> str:
-    """A table of text as Markdown, and what was left out."""
+    """Return a table of text as Markdown.
+
+    Args:
+        rows: the table.
+        left_out: sentences about what was left out.
+
+    Returns:
+        The table, and the sentences below it.
+    """
     lines = ["| " + " | ".join(rows.columns) + " |", "|---" * len(rows.columns) + "|"]
     lines += ["| " + " | ".join(map(str, row)) + " |" for row in rows.itertuples(index=False)]
     return "\n".join([*lines, *(f"\nLeft out: {sentence}" for sentence in left_out)]) + "\n"

@@ -31,7 +31,17 @@ def find(path: str) -> Any:
 def call(
     name: str, command: Command, arguments: Sequence[str], track: Callable[..., None]
 ) -> tuple[Any, dict]:
-    """What the function of a command returns, and its arguments by their names."""
+    """Call the function of a command with the arguments of a command line.
+
+    Args:
+        name: of the command.
+        command: the command.
+        arguments: of the command line.
+        track: follows the work of the command.
+
+    Returns:
+        What the function returns, and its arguments by their names.
+    """
     run, called = entry(command, arguments, track)
     returned = tyro.cli(run, prog=f"nextview {name}", args=arguments, config=CONFIG)
     return returned, called
@@ -40,12 +50,18 @@ def call(
 def entry(
     command: Command, arguments: Sequence[str] = (), track: Callable[..., None] | None = None
 ) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """A function that tyro can ask for on a command line, and a dictionary of the arguments that it
-    is called with.
+    """Create a function that tyro can read from a command line.
 
-    Parameters without a default, and those that are positional only, are arguments; all others are
-    options. A parameter ``track`` is given, and is not asked for. ``arguments`` tell whether the
-    defaults are those of another preset.
+    Parameters without a default, and positional-only ones, are arguments; all others are options. A
+    parameter ``track`` is passed in and is not an option.
+
+    Args:
+        command: the command.
+        arguments: of the command line; they decide which preset the defaults are of.
+        track: follows the work of the command.
+
+    Returns:
+        The function, and a dictionary that holds its arguments once it was called.
     """
     function = find(command.function)
     signature = inspect.signature(function)

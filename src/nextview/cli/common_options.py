@@ -91,7 +91,18 @@ class ObjectOptions:
     by_shape: bool = False
 
     def camera(self, path: Path, seed: int) -> Camera | FrameCamera:
-        """A camera before the object of a mesh file or of a folder."""
+        """Create a camera in front of the object of a mesh file or a folder of captured frames.
+
+        Args:
+            path: of the file or folder.
+            seed: of the sensor's errors.
+
+        Returns:
+            The camera.
+
+        Raises:
+            UsageError: an option does not apply to this kind of input.
+        """
         folder = path.is_dir()
         of_meshes = ("unit", "sensor", "max_faces", "largest_part")
         for field in fields(self)[1:]:
@@ -129,7 +140,17 @@ class ObjectOptions:
 
 
 def check_file(path: Path | None, overwrite: bool, kinds: tuple[str, ...] = PICTURES) -> None:
-    """Refuse, before any work, a file that cannot be written, or whose name ends otherwise."""
+    """Check a file that is to be written, before any work is done.
+
+    Args:
+        path: of the file; None for no file.
+        overwrite: whether an existing file may be replaced.
+        kinds: suffixes that the name may have.
+
+    Raises:
+        ResultsError: the file cannot be written.
+        UsageError: the name has another suffix.
+    """
     if path is not None:
         check_new(path, overwrite)
         if path.suffix.lower() not in kinds:

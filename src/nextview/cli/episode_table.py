@@ -131,7 +131,17 @@ def _pose_in_words(result: Recognition) -> list[str]:
 def episode_as_json(
     result: Recognition, name: str, frames: Sequence[str] = (), indent: int | None = 1
 ) -> str:
-    """Everything the table shows, and the whole beliefs and maps, as one JSON object."""
+    """Return all that the table shows, with complete beliefs and maps, as a JSON object.
+
+    Args:
+        result: of the episode.
+        name: of the object.
+        frames: names of the captured frames that were taken; empty for other cameras.
+        indent: of the text, in spaces; None for one line.
+
+    Returns:
+        The text.
+    """
     views = []
     for step, view in enumerate(result.views, 1):
         best = None

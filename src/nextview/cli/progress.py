@@ -31,13 +31,25 @@ console = Terminal(stderr=True)
 
 
 def track(done: Iterable[int], total: int, what: str, /) -> None:
-    """Exhaust an iterable of growing counts, and show how far it is, and the time left."""
+    """Exhaust an iterable of growing counts and show the progress and the time left.
+
+    Args:
+        done: growing counts.
+        total: number that is reached at the end.
+        what: name of the work.
+    """
     (_show_bar if console.is_terminal else _print_lines)(done, total, what)
 
 
 def follow(steps: Iterator[tuple[int, int]], what: str) -> tuple[int, int]:
-    """Track a stage that yields how many are done, of how many; return how many were done
-    before, of how many.
+    """Follow a stage that yields how many items are done.
+
+    Args:
+        steps: pairs of the number of items done and of all items; the first one is before any work.
+        what: name of the work.
+
+    Returns:
+        The number of items that were done before, and of all items.
     """
     before, total = next(steps)
     track((done for done, _ in steps), total, what)
@@ -45,8 +57,13 @@ def follow(steps: Iterator[tuple[int, int]], what: str) -> tuple[int, int]:
 
 
 def say_done(where: Path, done: str, before: int, total: int) -> None:
-    """Say at the end of a stage that resumes what this run did: ``done`` is a participle
-    ("measured", "planned").
+    """Print what a run of a resumable stage did.
+
+    Args:
+        where: what the stage wrote.
+        done: participle of the work, such as "measured" or "planned".
+        before: number of objects that were done before.
+        total: number of all objects.
     """
     if before == total:
         console.print(

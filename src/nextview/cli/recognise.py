@@ -111,7 +111,20 @@ def show(
     seed: int = 0,
     indent: int | None = 1,
 ) -> None:
-    """Recognise what a camera sees, print the episode and write what is asked for."""
+    """Recognise what a camera sees, print the episode and write the requested files.
+
+    Args:
+        camera: in front of the object.
+        name: of the object.
+        system: recognises it.
+        output: what is to be written.
+        start: index of the first view; None for a random one.
+        seed: of the draws.
+        indent: of the JSON text, in spaces; None for one line.
+
+    Raises:
+        ObservationError: nothing of the object is seen from any view.
+    """
     session = system.session_with(camera, start, seed)
     with ExitStack() as recorded:
         if output.record is not None:

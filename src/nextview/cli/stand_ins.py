@@ -57,7 +57,16 @@ class _Finder(MetaPathFinder, Loader):
         self.missing = frozenset(missing)
 
     def find_spec(self, fullname: str, path: Any, target: Any = None) -> ModuleSpec | None:
-        """A spec for a package that is missing, and for all that is below it."""
+        """Return a spec for a missing package and everything below it.
+
+        Args:
+            fullname: of the module.
+            path: see ``importlib.abc.MetaPathFinder``.
+            target: see ``importlib.abc.MetaPathFinder``.
+
+        Returns:
+            The spec; None for packages that are installed.
+        """
         package = fullname.partition(".")[0]
         return ModuleSpec(fullname, self, is_package=True) if package in self.missing else None
 

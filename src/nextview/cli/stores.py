@@ -155,7 +155,17 @@ def measure(
 def track_all(
     done: Iterable[tuple[str, str | None]], total: int, what: str, before: int = 0
 ) -> list[str]:
-    """Follow a job that yields what is done, and why it failed; return and print the reasons."""
+    """Follow a job that yields what is done and why it failed, and print the reasons.
+
+    Args:
+        done: name of each item and None, or why it failed.
+        total: number of items.
+        what: name of the work.
+        before: number of items that were done before.
+
+    Returns:
+        The reasons.
+    """
     failed: list[str] = []
 
     def counts() -> Iterator[int]:

@@ -44,6 +44,10 @@ class Mesh:
         name: what to call it in messages.
         unit: the file's unit, one of UNITS; None if it is not known.
         notes: what was left out of the file's mesh, a sentence each; usually nothing.
+
+    Example:
+        >>> sample_mesh("chair").vertices.shape
+        (80, 3)
     """
 
     vertices: NDArray[np.float64]
@@ -175,20 +179,28 @@ def load_mesh(
     max_faces: int = MAX_FACES,
     largest_part: bool = False,
 ) -> Mesh:
-    """Read an OFF, OBJ, PLY, STL or GLB file, by its suffix, into the object frame; the parts of a
-    scene are joined.
+    """Read an OFF, OBJ, PLY, STL or GLB file into the object frame.
+
+    The suffix tells the format. The parts of a scene are joined.
 
     Args:
-        path: the file.
-        up: its up axis, "y" or "z"; by default z, but y for GLB, whose standard says so.
+        path: of the file.
+        up: its up axis, "y" or "z"; by default z, and y for GLB, as in its standard.
         unit: its unit of length, one of UNITS; None if it is not known.
-        max_faces: how many triangles the mesh may have. The file may have BYTES_PER_FACE bytes for
-            each.
-        largest_part: leave out all that is not connected to the part with the largest surface, as
-            loose pieces of a scan. A plate, such as a turntable's, is not taken for that part.
+        max_faces: largest number of triangles of the mesh. The file may have BYTES_PER_FACE bytes
+            for each.
+        largest_part: whether to keep only the connected part with the largest surface. A plate,
+            such as a turntable's, is not taken for that part.
+
+    Returns:
+        The mesh.
 
     Raises:
-        MeshError: what is wrong with the file, in one sentence.
+        MeshError: the file cannot be used.
+
+    Example:
+        >>> nextview.load_mesh("samples/chair.off").faces.shape  # doctest: +SKIP
+        (120, 3)
     """
     path = Path(path)
     suffix = path.suffix.lower()

@@ -71,8 +71,13 @@ class Observation:
         exact: whether the depth is without a sensor's errors, as of a render.
 
     Raises:
-        ObservationError: shapes that are not these, or numbers that no camera can have: what is
-            wrong, and what it looks like.
+        ObservationError: a shape is not as above, or no camera can have the numbers; the message
+            names the likely mistake.
+
+    Example:
+        >>> camera = nextview.SimulatedCamera(sample_mesh("chair"), size=64)
+        >>> camera.observe(nextview.ViewSphere.named("40").poses[3]).depth.shape
+        (64, 64)
     """
 
     depth: NDArray[np.float32]
@@ -156,7 +161,13 @@ def enough_shows(mask: NDArray[np.bool_]) -> bool:
 
 
 class Camera(Protocol):
-    """Anything that can look at the object from a given pose."""
+    """Looks at the object from a given pose.
+
+    Example:
+        >>> camera = nextview.SimulatedCamera(sample_mesh("chair"))
+        >>> camera.observe(nextview.ViewSphere.named("40").poses[3]).seen
+        True
+    """
 
     def observe(self, pose: NDArray[np.float64]) -> Observation:
         """Look from a camera-to-world pose, (4, 4), OpenCV axes, object frame, object radii."""

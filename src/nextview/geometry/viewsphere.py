@@ -227,8 +227,9 @@ class Directions(Viewpoints):
         directions: from the object towards the views, (V, 3); any length but 0.
         distance: of every viewpoint from the origin, object radii.
 
-    >>> len(Directions.fibonacci(60))
-    60
+    Example:
+        >>> len(Directions.fibonacci(60))
+        60
     """
 
     directions: Float
@@ -264,9 +265,10 @@ class ViewSphere(Viewpoints):
         azimuths: viewpoints per ring; the first looks from +x.
         distance: distance of every viewpoint from the origin, object radii.
 
-    >>> sphere = ViewSphere.named("40")
-    >>> len(sphere), sphere.angles(11)
-    (40, (18.0, 135.0))
+    Example:
+        >>> sphere = ViewSphere.named("40")
+        >>> len(sphere), sphere.angles(11)
+        (40, (18.0, 135.0))
     """
 
     elevations: tuple[float, ...]

@@ -50,6 +50,13 @@ class EpisodeState:
             None unless the policy needs it.
         outlook: what can be foreseen of views by the geometry of taught things, of B episodes, None
             in those where that is nothing; None unless the policy needs it.
+
+    Example:
+        >>> visited = np.eye(40, dtype=bool)[[3]]  # one episode, seen from view 3
+        >>> evidence = Evidence(np.zeros((1, 10)))
+        >>> state = EpisodeState(np.array([3]), visited, np.full((1, 10), 0.1), evidence, step=1)
+        >>> int(state.free.sum())
+        39
     """
 
     current: NDArray[np.int64]
@@ -84,8 +91,12 @@ class EpisodeState:
 
 
 class Policy(Protocol):
-    """Chooses where to look next, in many episodes at once, in each by itself: no row may depend
-    on another.
+    """Chooses where to look next, in many episodes at once; no row may depend on another.
+
+    Example:
+        >>> policy = nextview.make_policy("furthest", nextview.ViewSphere.named("40"))
+        >>> policy.needs
+        ()
     """
 
     @property

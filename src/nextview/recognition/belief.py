@@ -415,8 +415,15 @@ class Stopping:
     The threshold is ``threshold`` at the first view. With a ``threshold_decay`` its log-odds are
     then divided by ``1 + threshold_decay * (views - 1)``: what is unclear after several views is
     seldom cleared up by another one. A calibrated belief whose threshold decay is its correlation
-    stops where the plain sum of logits does. UsageError: a threshold outside 0 .. 1, fewer than one
-    view, or a negative threshold decay.
+    stops where the plain sum of logits does.
+
+    Raises:
+        UsageError: a threshold outside of 0 to 1, fewer than one view, or a negative threshold
+            decay.
+
+    Example:
+        >>> Stopping(0.97).reached(np.array([0.99, 0.01]), n_views=1)
+        np.True_
     """
 
     threshold: float = 0.97

@@ -27,6 +27,10 @@ class Evidence:
         novelty: score of each view, B of them, made when asked for, see
             ``nextview.recognition.novelty``; None if the recogniser judges no single views.
         observations: the views themselves, B of them; None where only what the models say is known.
+
+    Example:
+        >>> Evidence(np.zeros((2, 10))).select([0]).logits.shape
+        (1, 10)
     """
 
     logits: NDArray[np.floating]

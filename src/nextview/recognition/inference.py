@@ -327,7 +327,16 @@ class MapNetwork:
 
 @dataclass(frozen=True)
 class Models:
-    """The recogniser and the map networks that a policy needs."""
+    """The recogniser and the map networks that a policy needs.
+
+    Attributes:
+        recogniser: turns views into evidence.
+        maps: networks by the name of the local map that they predict.
+
+    Example:
+        >>> nextview.load().models.classes[:2]
+        ('bathtub', 'bed')
+    """
 
     recogniser: Recogniser
     maps: dict[str, MapNetwork]

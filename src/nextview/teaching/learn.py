@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypedDict, Unpack
 
 import numpy as np
 from msgspec.structs import replace as replace_record
@@ -155,12 +155,72 @@ def _percent(shares: Sequence[float]) -> str:
     return ", ".join(f"{share:.0%}" for share in shares)
 
 
-def learn(folder: str | Path, out: str | Path, **options: Any) -> Learned:
-    """Teach the things in a folder, with options of ``TeachingOptions`` and ``learn_things``."""
-    how = {
-        name: options.pop(name) for name in TeachingOptions.__dataclass_fields__ if name in options
-    }
-    return learn_things(Path(folder), Path(out), TeachingOptions(**how), **options)
+class LearnOptions(TypedDict, total=False):
+    """Options of ``learn``.
+
+    Attributes:
+        unit: of the mesh files, "mm", "cm", "inch", "foot" or "m"; with it size counts as evidence,
+            and things are recognised by their geometry.
+        up: up axis of the mesh files, "y" or "z"; by default z, and y for GLB.
+        upright: whether the things only stand as in their files; by default they may also lie.
+        sensor: camera that will look at them, NAME or NAME:STRENGTH; "wrist" by default.
+        largest_part: whether to keep only the largest connected part of each mesh.
+        any_size: whether to accept things of very different sizes.
+        one_class: whether things that are all in one folder are one class.
+        turntable: direction in which a turntable turned, "ccw" or "cw", seen from above.
+        seed: of all random draws; 0 by default.
+        add: whether to add the things to those that the memory knows.
+        remove: names of things to remove from the memory.
+        workers: number of processes; None for one on each core, 0 for this process.
+        scheduler: address of a dask.distributed scheduler to use instead.
+        overwrite: whether to replace an existing memory.
+        track: follows the work; by default nothing is shown.
+    """
+
+    unit: Literal["mm", "cm", "inch", "foot", "m"] | None
+    up: Literal["y", "z"] | None
+    upright: bool
+    sensor: str
+    largest_part: bool
+    any_size: bool
+    one_class: bool
+    turntable: Literal["ccw", "cw"] | None
+    seed: int
+    add: bool
+    remove: tuple[str, ...]
+    workers: int | None
+    scheduler: str | None
+    overwrite: bool
+    track: Track
+
+
+def learn(folder: str | Path, out: str | Path, **options: Unpack[LearnOptions]) -> Learned:
+    """Teach the things in a folder and write a memory that recognises them.
+
+    Each mesh file is a thing, as is each folder of captured depth frames. An interrupted run
+    resumes.
+
+    Args:
+        folder: mesh files, folders of captured frames, or folders of meshes as classes.
+        out: folder of the memory, for ``nextview.load(models=out)``.
+        **options: see ``LearnOptions``.
+
+    Returns:
+        What was learned, with the accuracy on held-out views.
+
+    Raises:
+        DatasetError: nothing can be taught.
+        ResultsError: ``out`` exists, and neither ``add`` nor ``overwrite`` is set.
+        UsageError: an option is not valid.
+
+    Example:
+        >>> nextview.learn("scans", "mine", unit="m")  # doctest: +SKIP
+        >>> nextview.load(models="mine").recognise("scans/mug.ply", unit="m")  # doctest: +SKIP
+    """
+    given: dict[str, Any] = dict(options)
+    names = TeachingOptions.__dataclass_fields__
+    how = {name: given.pop(name) for name in names if name in given}
+    return learn_things(Path(folder), Path(out), TeachingOptions(**how), **given)
 
 
 def learn_things(

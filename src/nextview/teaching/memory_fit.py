@@ -215,10 +215,17 @@ def _confused(
 
 
 def size_evidence(radii: Float, label: Index) -> SizeEvidence | None:
-    """How likely each size is for the things of each class; None where no size is known.
+    """Estimate how likely each size is for the things of each class.
 
-    Each thing of a class adds a normal distribution of the logarithm of its radius, and a tenth of
-    a wide one: half hidden things look smaller. A class of which no size is known has none.
+    Each thing of a class adds a normal distribution of the log radius, and a tenth of a wide one,
+    because half-hidden things look smaller. A class of which no size is known has none.
+
+    Args:
+        radii: of the things, metres, (T,); NaN where not known.
+        label: class of each thing, (T,) int64.
+
+    Returns:
+        The evidence from size; None if no size is known.
     """
     known = np.isfinite(radii)
     if not known.any():

@@ -145,7 +145,15 @@ def _opened(card: Path) -> tuple[TaughtThings, Index]:
 
 
 def class_of_things(recogniser: TaughtRecogniser, known: TaughtThings) -> Index:
-    """The class of each thing of known geometry."""
+    """Return the class of each thing with known geometry.
+
+    Args:
+        recogniser: the memory.
+        known: its things with known geometry.
+
+    Returns:
+        Classes, (T,) int64.
+    """
     about = recogniser.card.memory
     assert about is not None
     names = [thing.name for thing in about.things]
@@ -327,8 +335,15 @@ def with_new_things(
 def as_stored(
     weights: EvidenceWeights, residuals: KnownResiduals | None, things: int
 ) -> Verification:
-    """What a card holds of weights and residuals, rounded; ``things`` is how many they are
-    fitted to.
+    """Round weights and residuals for a card.
+
+    Args:
+        weights: how much each kind of evidence counts.
+        residuals: of known things; None if there are none.
+        things: number of things that they were fitted to.
+
+    Returns:
+        What the card holds of them.
     """
     named = {field.name: float(f"{getattr(weights, field.name):.4g}") for field in fields(weights)}
     if residuals is None:

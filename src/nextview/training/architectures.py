@@ -79,7 +79,13 @@ class RecogniserNetwork(nn.Module):
     dropout = 0.0
 
     def finish(self, features: int, classes: int, azimuths: int) -> None:
-        """Add the last layers, and draw the first weights of all convolutions."""
+        """Add the last layers and draw the initial weights of all convolutions.
+
+        Args:
+            features: number of features before the last layers.
+            classes: number of classes.
+            azimuths: number of azimuth bins; 0 for none.
+        """
         self.avgpool = nn.AdaptiveAvgPool2d(1)
         self.fc = nn.Linear(features, classes)
         self.azimuths = azimuths
@@ -215,7 +221,16 @@ class ResNet(RecogniserNetwork):
 
 
 def recogniser_network(recipe: RecogniserRecipe, classes: int, azimuths: int) -> ResNet | LiteNet:
-    """The untrained network of a recipe, with so many azimuth bins."""
+    """Create the untrained network of a recipe.
+
+    Args:
+        recipe: the recipe.
+        classes: number of classes.
+        azimuths: number of azimuth bins; 0 for none.
+
+    Returns:
+        The network.
+    """
     channels = CHANNELS_OF[recipe.input]
     if recipe.network == "lite0":
         return LiteNet(classes, channels, azimuths, recipe.dropout)
@@ -304,7 +319,15 @@ class ViewMap(nn.Module):
 
 
 def map_network(recipe: MapRecipe, sphere: ViewSphere) -> nn.Module:
-    """The network of a recipe, untrained. The columns of its map are ``map_columns``."""
+    """Create the untrained map network of a recipe; its columns are ``map_columns``.
+
+    Args:
+        recipe: the recipe.
+        sphere: the viewpoints of the maps.
+
+    Returns:
+        The network.
+    """
     columns = len(map_columns(recipe, sphere))
     if recipe.input == "cloud":
         return PointNet(sphere.rings, columns)
@@ -313,7 +336,15 @@ def map_network(recipe: MapRecipe, sphere: ViewSphere) -> nn.Module:
 
 
 def map_columns(recipe: MapRecipe, sphere: ViewSphere) -> list[int]:
-    """Azimuth steps from the view to each column of a map: -1, 0, +1, or 0, 1, ... once round."""
+    """Return the azimuth steps from the view to each column of a map.
+
+    Args:
+        recipe: of the network.
+        sphere: the viewpoints of the maps.
+
+    Returns:
+        -1, 0, +1 for a window; 0, 1, ... once round for the whole sphere.
+    """
     return [-1, 0, 1] if recipe.extent == "window" else list(range(sphere.azimuths))
 
 

@@ -128,7 +128,17 @@ class Walks:
 
     @classmethod
     def draw(cls, data: Predictions, rng: Generator, n_views: int, walks: int) -> "Walks":
-        """So many walks of each kind over every object."""
+        """Draw random walks over every object.
+
+        Args:
+            data: predictions.
+            rng: source of all random numbers.
+            n_views: views of each walk.
+            walks: number of walks of each kind (local window, whole sphere) over every object.
+
+        Returns:
+            The walks.
+        """
         objects = np.tile(np.arange(len(data)), 2 * walks)
         views = []
         n_views = min(n_views, len(data.sphere))
@@ -156,8 +166,16 @@ class Walks:
 def fit_temperature(
     data: Predictions, rng: Generator, n_views: int = 5, walks: int = 4
 ) -> Calibration:
-    """Temperature of one view and correlations of several, by maximum likelihood over 1 to
-    ``n_views`` views.
+    """Fit the temperature of one view and the correlations of several by maximum likelihood.
+
+    Args:
+        data: predictions of held-out objects.
+        rng: source of all random numbers.
+        n_views: largest number of views that are fused.
+        walks: number of random walks of each kind over every object.
+
+    Returns:
+        The calibration.
     """
     walked = Walks.draw(data, rng, n_views, walks)
 
@@ -176,7 +194,16 @@ def fit_temperature(
 
 
 def calibration_of(data: Predictions, rng: Generator, walks: int = 4) -> Calibration:
-    """The calibration of predictions; fitted to them where their recogniser was not calibrated."""
+    """Return the calibration of predictions, fitted to them if their recogniser has none.
+
+    Args:
+        data: the predictions.
+        rng: source of all random numbers.
+        walks: number of random walks of each kind over every object.
+
+    Returns:
+        The calibration.
+    """
     return (
         data.calibration
         if data.calibration != PLAIN_SUM
@@ -187,8 +214,17 @@ def calibration_of(data: Predictions, rng: Generator, walks: int = 4) -> Calibra
 def loss(
     data: Predictions, calibration: Calibration, rng: Generator, n_views: int = 5, walks: int = 4
 ) -> float:
-    """Mean negative log-likelihood of the true class over 1 to ``n_views`` views; see
-    ``fit_temperature``.
+    """Return the mean negative log-likelihood of the true class; see ``fit_temperature``.
+
+    Args:
+        data: predictions of held-out objects.
+        calibration: to be judged.
+        rng: source of all random numbers.
+        n_views: largest number of views that are fused.
+        walks: number of random walks of each kind over every object.
+
+    Returns:
+        The loss, nats.
     """
     return Walks.draw(data, rng, n_views, walks).loss(calibration)
 
@@ -201,8 +237,20 @@ def fit_risk(
     n_views: int = 8,
     walks: int = 4,
 ) -> RiskBounds:
-    """Error rates that can be promised among those who stop at a threshold, on either half of
-    the walks.
+    """Fit the error rates that can be guaranteed among the episodes that stop at a threshold.
+
+    The bounds hold on either half of the walks.
+
+    Args:
+        data: predictions of held-out objects.
+        calibration: of the recogniser.
+        rng: source of all random numbers.
+        delta: probability with which a bound may be wrong.
+        n_views: largest number of views of an episode.
+        walks: number of random walks of each kind over every object.
+
+    Returns:
+        The bounds.
     """
     walked = Walks.draw(data, rng, n_views, walks)
     belief = calibration.belief(walked.totals, walked.numbers, len(data.classes))
@@ -233,8 +281,18 @@ def _promise(sure: Float, wrong: NDArray[np.bool_], weights: Float, delta: float
 
 
 def error_bound(failed: Float, stopped: Float, weights: Float, delta: float) -> float:
-    """Upper bound of a weighted share of failures: Clopper and Pearson's for an effective number
-    of objects.
+    """Return an upper bound of a weighted error rate.
+
+    It is the bound of Clopper and Pearson for an effective number of objects.
+
+    Args:
+        failed: share of failures of each object, (N,).
+        stopped: share of stops of each object, (N,).
+        weights: of the objects, (N,).
+        delta: probability with which the bound may be wrong.
+
+    Returns:
+        The bound, 0 to 1.
     """
     total = float(weights @ stopped)
     if total == 0:
@@ -312,7 +370,19 @@ def fit_size(
 
 
 def densities(radii: Float, labels: NDArray[np.int64], classes: int) -> Float:
-    """Logarithm of the density of each class over log radius, at ``RADII``, (classes, R)."""
+    """Return the log-density of each class over the log radius.
+
+    Args:
+        radii: of the objects, metres, (N,).
+        labels: class of each object, (N,).
+        classes: number of classes.
+
+    Returns:
+        Log-density at ``RADII``, (classes, R) float64.
+
+    Raises:
+        DatasetError: a class has no objects of different sizes.
+    """
     span = np.log(RADII[-1] / RADII[0])
     density = np.empty((classes, len(RADII)))
     for c in range(classes):
@@ -331,8 +401,17 @@ def densities(radii: Float, labels: NDArray[np.int64], classes: int) -> Float:
 def fit_weight(
     data: Predictions, radii: Float, log_density: Float
 ) -> tuple[SizeEvidence, float, float]:
-    """The most likely weight beside the logits, over single views, at the temperature most
-    likely with it.
+    """Fit the weight of the size beside the logits of single views.
+
+    The temperature is fitted together with the weight.
+
+    Args:
+        data: predictions of held-out objects.
+        radii: of the objects, metres, (N,).
+        log_density: of each class at ``RADII``, (classes, R).
+
+    Returns:
+        The evidence from size, the loss without it, and the loss with it.
     """
     of_size = SizeEvidence.from_arrays(RADII, log_density, 1.0).logits(radii)[:, None]
 
@@ -392,8 +471,18 @@ def fit_valleys(
 def valley_gains(
     sphere: ViewSphere, logits: Floats, maps: Floats, labels: NDArray[np.int64]
 ) -> dict[int, float]:
-    """For each class, what the second view gains in belief in the truth at the valley rather
-    than at the peak.
+    """Return what the valley of a map gains over its peak for each class.
+
+    The gain is that of the belief in the truth after the second view.
+
+    Args:
+        sphere: the viewpoints.
+        logits: (N, V, classes).
+        maps: predicted local maps of each view, (N, V, rings, 3).
+        labels: true classes, (N,) int64.
+
+    Returns:
+        Mean gain by the index of the class.
     """
     n, v, classes = logits.shape
     objects = np.repeat(np.arange(n), v)

@@ -94,8 +94,17 @@ class ShippedMap(nn.Module):
 def export_onnx(
     net: nn.Module, example: NDArray, inputs: str, outputs: list[str], path: Path, bits: int = 16
 ) -> None:
-    """Write a network as ONNX: any batch size, weights in fewer bits, arithmetic in single
-    precision.
+    """Write a network as ONNX with any batch size.
+
+    Weights may be stored in fewer bits; the arithmetic is in single precision.
+
+    Args:
+        net: the network.
+        example: of its input, (B, ...).
+        inputs: name of the input.
+        outputs: names of the outputs.
+        path: of the file.
+        bits: of each weight: 8, 16 or 32.
     """
     # it warns that torchvision is not installed
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
@@ -263,7 +272,16 @@ def export_recogniser(
 
 
 def run_network(run: Path, recipe: RecogniserRecipe, views: ViewStore) -> ResNet | LiteNet:
-    """The recogniser of a finished run, in evaluation mode."""
+    """Load the recogniser of a finished run.
+
+    Args:
+        run: folder of the run.
+        recipe: of the run.
+        views: the view store that it was trained on.
+
+    Returns:
+        The network, in evaluation mode.
+    """
     azimuths = views.sphere.azimuths if recipe.azimuth_bins_weight else 0
     return load_run(recogniser_network(recipe, len(views.classes), azimuths), run)
 

@@ -28,8 +28,21 @@ Indices = NDArray[np.int64]
 def hold_out(
     labels: Indices, measured: NDArray[np.floating], folds: int, seed: int
 ) -> list[Indices]:
-    """Divide objects into parts, each to be held out from one network; every class is spread
-    evenly.
+    """Divide objects into parts of which each is held out from one network.
+
+    Every class is spread evenly; copies of a shape stay together.
+
+    Args:
+        labels: class of each object, (N,).
+        measured: depth entropy of the views, (N, V), by which copies are found.
+        folds: number of parts.
+        seed: of the draw.
+
+    Returns:
+        Indices of the objects of each part.
+
+    Raises:
+        DatasetError: there are fewer objects than parts, or fewer than two parts.
     """
     if not 2 <= folds <= len(labels):
         raise DatasetError(
@@ -56,7 +69,18 @@ def for_fitting(predictions: Predictions) -> Predictions:
 
 
 def load_sensed(paths: Sequence[Path], table: Predictions) -> list[Predictions]:
-    """Predictions of the objects of ``table`` through sensors, in its order."""
+    """Load predictions of the same objects through sensors.
+
+    Args:
+        paths: of the predictions.
+        table: predictions of the objects.
+
+    Returns:
+        The predictions, in the order of ``table``.
+
+    Raises:
+        PredictionsError: an object is missing, or models, classes or viewpoints differ.
+    """
     loaded = []
     for path in paths:
         other = Predictions.load(path).by_shape()
@@ -79,8 +103,17 @@ def load_sensed(paths: Sequence[Path], table: Predictions) -> list[Predictions]:
 def blind_walks(
     sphere: ViewSphere, policy: Policy, starts: Indices, n_views: int, rng: np.random.Generator
 ) -> Indices:
-    """Views in order, (E, views) int64, of a policy that knows only where it has been;
-    ``starts`` is (E,).
+    """Return the views of a policy that knows only where it has been.
+
+    Args:
+        sphere: the viewpoints.
+        policy: the policy.
+        starts: first views, (E,) int64.
+        n_views: views of each walk.
+        rng: source of all random numbers.
+
+    Returns:
+        Views in order, (E, n_views) int64.
     """
 
     def nothing(episodes: Indices, views: Indices) -> Evidence:
@@ -95,8 +128,18 @@ def blind_walks(
 def card_to_fit(
     path: Path, recogniser: bool = True
 ) -> Iterator[tuple[ModelCard, Callable[..., None]]]:
-    """A card, and ``write(name, about, sources, **fields)`` for what was fitted to these
-    sources; one run at a time.
+    """Open a card for a fit; only one run may do so at a time.
+
+    Args:
+        path: of the card.
+        recogniser: whether it must be the card of a recogniser.
+
+    Yields:
+        The card, and ``write(name, about, sources, **fields)``, which writes what was fitted to
+        sources.
+
+    Raises:
+        ModelError: the card is of another kind, or was changed meanwhile.
     """
     with only_one(path):
         card = read_card(path)

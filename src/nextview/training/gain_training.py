@@ -122,11 +122,18 @@ class Score:
 def walk(
     table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np.random.Generator
 ) -> list[NDArray]:
-    """S states that are met when each of the policies is followed once over every object.
+    """Collect the states that policies meet when each is followed once over every object.
 
-    Their features, (S, D) float32; the value of each choice less the mean over the free ones, (S,
-    V) float32, cells as in ``policies.learned_tables``; which are free, (S, V); and the objects,
-    (S,).
+    Args:
+        table: the objects.
+        policies: the policies.
+        recipe: of the training.
+        rng: source of all random numbers.
+
+    Returns:
+        Of S states: features, (S, D) float32; value of each choice less the mean over the free
+        ones, (S, V) float32, with cells as in ``policies.learned_tables``; which are free, (S, V)
+        bool; and the objects, (S,) int64.
     """
     sphere = table.data.sphere
     parts = []
@@ -147,8 +154,15 @@ def walk(
 
 
 def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gain]:
-    """Train the networks: after every epoch, the policy as it then is, at travel weight 0 and
-    over all views.
+    """Train the networks of one fold.
+
+    Args:
+        table: the objects of the fold.
+        recipe: of the training.
+        fold: number of the fold, which together with the seed decides all draws.
+
+    Yields:
+        After every epoch the policy, at travel weight 0 and over all views.
     """
     rng = np.random.default_rng([recipe.seed, fold])
     data = table.data
@@ -200,8 +214,16 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
 def best_epoch(
     folds: Sequence[Iterable[Gain]], tables: Sequence[ReplayTable], recipe: GainRecipe
 ) -> Iterator[Best]:
-    """After every epoch, the policies of the best epoch so far, and their mean value over all
-    objects.
+    """Follow the trainings of all folds and keep the best epoch.
+
+    Args:
+        folds: the trainings, see ``train``.
+        tables: the held-out objects of each fold.
+        recipe: of the training.
+
+    Yields:
+        After every epoch the policies of the best epoch so far, and their mean value over all
+        objects.
     """
     best = None
     for policies in zip(*folds, strict=True):
@@ -226,8 +248,16 @@ def averaged(policies: Sequence[Gain]) -> Gain:
 
 
 def write_gain(card: Path, policy: Gain, about: PolicyCard, features: NDArray[np.float32]) -> float:
-    """Write a policy that was trained, NAME.onnx and NAME.json, in place of what has these
-    names.
+    """Write a trained policy, NAME.onnx and NAME.json, replacing files of these names.
+
+    Args:
+        card: path of the card.
+        policy: the policy.
+        about: content of the card.
+        features: of states by which the exported network is compared, (S, D) float32.
+
+    Returns:
+        Largest difference between the networks in torch and in ONNX.
     """
     assert isinstance(policy.score, Score)
     weights = card.with_suffix(".onnx")

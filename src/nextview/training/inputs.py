@@ -55,7 +55,16 @@ class PackedViews:
 
 
 def inputs_path(store: Path, size: int, kind: InputKind = "geometry") -> Path:
-    """The folder where the inputs of a store are kept."""
+    """Return the folder in which the inputs of a store are kept.
+
+    Args:
+        store: path of the view store.
+        size: side of the inputs, pixels.
+        kind: of the inputs.
+
+    Returns:
+        The folder.
+    """
     store = Path(os.path.realpath(store)) if store.name in ("", "..") else store  # "." has no name
     return store.with_name(f"{store.name}.{'inputs' if kind == 'geometry' else kind}{size}")
 
@@ -63,7 +72,17 @@ def inputs_path(store: Path, size: int, kind: InputKind = "geometry") -> Path:
 def ready_inputs(
     path: Path, size: int, kind: InputKind = "geometry", track: Track = silently
 ) -> PackedViews:
-    """The inputs of a store, (N, V, C, size, size) uint8, computed if they are not there."""
+    """Return the inputs of a store and compute them if they are not there.
+
+    Args:
+        path: of the view store.
+        size: side of the inputs, pixels.
+        kind: of the inputs.
+        track: follows the computation.
+
+    Returns:
+        Inputs, (N, V, C, size, size) uint8.
+    """
     # not above: the processes that compute inputs need no torch
     from nextview.training.runs import is_first
 
@@ -107,7 +126,19 @@ def _packed(path: Path, spec: InputSpec, i: int) -> list[bytes]:
 
 
 def load_inputs(path: Path, size: int, kind: InputKind = "geometry") -> PackedViews:
-    """The inputs of a store, (N, V, C, size, size) uint8, as ``ready_inputs`` computed them."""
+    """Load the inputs of a store that ``ready_inputs`` computed.
+
+    Args:
+        path: of the view store.
+        size: side of the inputs, pixels.
+        kind: of the inputs.
+
+    Returns:
+        Inputs, (N, V, C, size, size) uint8.
+
+    Raises:
+        DatasetError: they are damaged, or lack objects of the store.
+    """
     target = inputs_path(path, size, kind)
     store = ViewStore.open(path)
     file = target / "views.lz4"

@@ -110,8 +110,17 @@ class Windows(OwnBatches):
 
 
 def peak_loss(logits: Tensor, goal: Tensor, reach: int) -> Tensor:
-    """Mean negative log-likelihood that a cell drawn by its logit lies within ``reach`` of the
-    highest of ``goal``.
+    """Return the loss of the predicted peak.
+
+    It is the mean negative log-likelihood that a cell drawn by its logit is near the true peak.
+
+    Args:
+        logits: of the cells, (B, rings, columns).
+        goal: the true map, (B, rings, columns).
+        reach: distance from the true peak that still counts, cells.
+
+    Returns:
+        The loss, a scalar.
     """
     cells = torch.cartesian_prod(
         *(torch.arange(float(n), device=goal.device) for n in goal.shape[1:])
@@ -140,6 +149,15 @@ class MapModule(L.LightningModule):
         return self.net((seen.float() / 255).to(memory_format=torch.channels_last))
 
     def training_step(self, batch: tuple[Tensor, Tensor], _: int) -> Tensor:
+        """Compute the loss of a batch; see Lightning.
+
+        Args:
+            batch: inputs, (B, ...), and true maps, (B, rings, columns).
+            _: number of the batch.
+
+        Returns:
+            The loss, a scalar.
+        """
         predicted, *transforms = self(batch[0])
         predicted = predicted.float()
         true = batch[1]
@@ -157,6 +175,12 @@ class MapModule(L.LightningModule):
         )
 
     def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:
+        """Log the squared error of a batch; see Lightning.
+
+        Args:
+            batch: inputs, (B, ...), and true maps, (B, rings, columns).
+            _: number of the batch.
+        """
         error = F.mse_loss(self(batch[0])[0].float()[..., self.window], batch[1][..., self.window])
         self.log("validation_mse", error, prog_bar=True, batch_size=len(batch[1]), sync_dist=True)
 
@@ -228,8 +252,19 @@ def train_map(
 def target_of(
     measure: str, store: ViewStore, predictions: Predictions | None = None
 ) -> tuple[NDArray, NDArray]:
-    """A measure of all views, scaled to 0 .. 1 over each object's, or the confidence; and which
-    objects have it.
+    """Return the values that a map network learns.
+
+    Args:
+        measure: name of the measure, or "confidence".
+        store: the view store.
+        predictions: of its objects; for the confidence only.
+
+    Returns:
+        Values of all views, (N, V), scaled to 0 to 1 over each object's views (the confidence is
+        not scaled); and which objects have them, (N,) bool.
+
+    Raises:
+        UsageError: there are no predictions for the confidence, or predictions for another measure.
     """
     if (measure == CONFIDENCE) != (predictions is not None):
         alone = (

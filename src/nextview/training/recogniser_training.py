@@ -144,6 +144,16 @@ class RecogniserModule(L.LightningModule):
             self.register_buffer(name, torch.zeros(classes), persistent=False)
 
     def training_step(self, batch: tuple[Tensor, ...], _: int) -> Tensor:
+        """Compute the loss of a batch; see Lightning.
+
+        Args:
+            batch: inputs, (B, C, S, S) uint8, classes, (B,), and azimuth bins, (B,), if they are
+                learned.
+            _: number of the batch.
+
+        Returns:
+            The loss, a scalar.
+        """
         x = batch[0].float() / 255
         label = batch[1]
         mirrored = torch.zeros_like(label, dtype=torch.bool)
@@ -174,6 +184,12 @@ class RecogniserModule(L.LightningModule):
         return loss
 
     def validation_step(self, batch: tuple[Tensor, Tensor], _: int) -> None:
+        """Count the right answers and the loss of a batch; see Lightning.
+
+        Args:
+            batch: inputs, (B, C, S, S) uint8, and classes, (B,).
+            _: number of the batch.
+        """
         x = (batch[0].float() / 255).to(memory_format=torch.channels_last)
         logits = self.net(x)[0].float()
         label = batch[1]
@@ -229,8 +245,22 @@ def fit_recogniser(
     hardware: Hardware = Hardware(),
     azimuths: int = 0,
 ) -> nn.Module:
-    """Train and return the network of the best epoch; checkpoints in ``out``, from which a
-    second call resumes.
+    """Train a recogniser and return the network of its best epoch.
+
+    Checkpoints are kept in ``out``, from which a second call resumes.
+
+    Args:
+        sources: inputs of the store, and of deformed stores of the same objects.
+        labels: class of each object, (N,) int64.
+        parts: rows of the training and of the validation objects.
+        recipe: of the training.
+        out: folder of the run.
+        weights: file or run with the initial weights; None for random ones.
+        hardware: devices and precision.
+        azimuths: number of azimuth bins; 0 for none.
+
+    Returns:
+        The network.
     """
     own = np.random.SeedSequence([recipe.seed, recipe.ensemble_seed])
     L.seed_everything(int(own.generate_state(1)[0]), verbose=False)
@@ -252,8 +282,14 @@ def fit_recogniser(
 
 
 def mirror_planes(store: ViewStore, objects: Indices) -> Float:
-    """Azimuth of the plane of symmetry of each class, steps of the store's viewpoints,
-    (classes,).
+    """Find the plane of symmetry of each class.
+
+    Args:
+        store: the view store.
+        objects: rows of the objects to use.
+
+    Returns:
+        Azimuth of each plane in steps of the store's viewpoints, (classes,) float64.
     """
     n = store.sphere.azimuths
     measured = store.measure()[objects].reshape(len(objects), -1, n).astype(np.float64)
@@ -266,8 +302,15 @@ def mirror_planes(store: ViewStore, objects: Indices) -> Float:
 
 
 def azimuth_bins(store: ViewStore, azimuths: int, planes: Float) -> NDArray[np.float32]:
-    """The azimuth bin, 0 .. azimuths, from which each view sees its object, (N, V), given the
-    ``mirror_planes``.
+    """Return the azimuth bin from which each view sees its object.
+
+    Args:
+        store: the view store.
+        azimuths: number of bins.
+        planes: of the classes, see ``mirror_planes``.
+
+    Returns:
+        Bins, (N, V) float32, from 0 to below ``azimuths``; fractions lie between two bins.
     """
     sphere = store.sphere
     steps = sphere.azimuth_index * (azimuths / sphere.azimuths)
@@ -276,8 +319,17 @@ def azimuth_bins(store: ViewStore, azimuths: int, planes: Float) -> NDArray[np.f
 
 
 def side_loss(likely: Tensor, label: Tensor, side: Tensor) -> Tensor:
-    """Mean cross-entropy of the azimuth bin given the true class; between two bins, both count
-    by their nearness.
+    """Return the mean cross-entropy of the azimuth bin, given the true class.
+
+    Between two bins, both count by their nearness.
+
+    Args:
+        likely: log-probabilities of the bins, (B, classes, bins).
+        label: true classes, (B,).
+        side: true bins, (B,), with fractions.
+
+    Returns:
+        The loss, a scalar.
     """
     own = likely[torch.arange(len(label), device=label.device), label]
     low = side.floor().long()[:, None]

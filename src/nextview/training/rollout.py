@@ -44,8 +44,22 @@ class ReplayTable:
         sensed: Sequence[Predictions] = (),
         scenes: SceneSight | None = None,
     ) -> "ReplayTable":
-        """Some of the objects of predictions, by index; calibrated here where their recogniser
-        is not.
+        """Select some of the objects of predictions.
+
+        They are calibrated here if their recogniser is not.
+
+        Args:
+            predictions: of the objects.
+            kept: indices of the objects.
+            rng: source of all random numbers.
+            sensed: predictions of the same objects through sensors.
+            scenes: in which the objects stand; None for those of the predictions.
+
+        Returns:
+            The table.
+
+        Raises:
+            PredictionsError: no object is left.
         """
         if len(kept) == 0:
             raise PredictionsError("no object is left to learn from")
@@ -69,8 +83,17 @@ class DecisionState:
 def rollout(
     table: ReplayTable, policy: Policy, n_views: int, rng: Generator, visibility: bool = False
 ) -> Iterator[DecisionState]:
-    """Every object once, from a random first view to where the policy leads: the decision state
-    after each view.
+    """Follow a policy once over every object from a random first view.
+
+    Args:
+        table: the N objects.
+        policy: the policy.
+        n_views: views of each episode.
+        rng: source of all random numbers.
+        visibility: whether the policy needs the expected visibility.
+
+    Yields:
+        The state of all episodes after each view.
     """
     data = table.data
     sphere = table.data.sphere
@@ -102,8 +125,16 @@ def rollout(
 
 
 def value_after(table: ReplayTable, total: Float, n_views: NDArray | int, kind: str) -> Float:
-    """The value, (N, ...), of sums of the log-evidence, (N, ..., D), after ``n_views`` views, by
-    one of OBJECTIVES.
+    """Return the value of sums of log-evidence.
+
+    Args:
+        table: the N objects.
+        total: sums of the log-evidence of each object, (N, ..., D).
+        n_views: number of views in the sums, (N, ...).
+        kind: one of OBJECTIVES.
+
+    Returns:
+        Values, (N, ...) float64.
     """
     return value_of(
         table.data.calibration.log_belief(total, n_views, len(table.data.classes)),
@@ -113,7 +144,16 @@ def value_after(table: ReplayTable, total: Float, n_views: NDArray | int, kind: 
 
 
 def value_of(logs: Float, labels: NDArray[np.int64], kind: str) -> Float:
-    """The value of beliefs."""
+    """Return the value of log-beliefs.
+
+    Args:
+        logs: log-beliefs up to a constant, (N, ..., C).
+        labels: true classes, (N,) int64.
+        kind: one of OBJECTIVES.
+
+    Returns:
+        Values, (N, ...) float64.
+    """
     if kind == "right":
         return np.equal(logs.argmax(-1).T, labels).T.astype(np.float64)
     of_truth = of_true_class(logs, labels)
@@ -121,7 +161,16 @@ def value_of(logs: Float, labels: NDArray[np.int64], kind: str) -> Float:
 
 
 def candidate_values(table: ReplayTable, moment: DecisionState, kind: str) -> Float:
-    """The value of looking from every view next, (N, V) float64."""
+    """Return the value of taking each view next.
+
+    Args:
+        table: the N objects.
+        moment: the state of the episodes.
+        kind: one of OBJECTIVES.
+
+    Returns:
+        Values, (N, V) float64.
+    """
     # a view in which nothing is seen has no weight in the sum
     counts = table.data.seen.astype(np.float64)
     n_views = np.maximum(moment.seen[:, None] + counts, 1)
@@ -142,7 +191,19 @@ class Value(NamedTuple):
 def judge(
     table: ReplayTable, policy: Policy, n_views: int, kind: str, rng: Generator, rounds: int = 8
 ) -> Value:
-    """Follow a policy ``rounds`` times over every object."""
+    """Follow a policy several times over every object and return its value.
+
+    Args:
+        table: the objects.
+        policy: the policy.
+        n_views: views of each episode.
+        kind: one of OBJECTIVES.
+        rng: source of all random numbers.
+        rounds: episodes with each object.
+
+    Returns:
+        Mean value and travel after 2, 3, ... views.
+    """
     weights = table.data.weights / len(table.data) / rounds
     reached = np.zeros((2, n_views - 1))
     for _ in range(rounds):
@@ -178,8 +239,17 @@ TRAVEL_WEIGHTS = (
 def judge_all(
     judged: Judged, n_views: int, kind: str, seed: int | list[int], rounds: int = 8
 ) -> Value:
-    """Mean value over the objects of all tables, each followed by a policy of its own; see
-    ``judge``.
+    """Return the mean value over the objects of several tables; see ``judge``.
+
+    Args:
+        judged: tables, each with its own policy.
+        n_views: views of each episode.
+        kind: one of OBJECTIVES.
+        seed: of the draws.
+        rounds: episodes with each object.
+
+    Returns:
+        Mean value and travel after 2, 3, ... views.
     """
     values = [judge(*pair, n_views, kind, np.random.default_rng(seed), rounds) for pair in judged]
     return Value(*np.average(values, 0, [len(table.data) for table, _ in judged]))
@@ -188,8 +258,18 @@ def judge_all(
 def fit_travel_weight(
     judged: Sequence[tuple[ReplayTable, Gain]], n_views: int, kind: str, seed: int
 ) -> float:
-    """The lowest of TRAVEL_WEIGHTS at which policies never travel farther than a random walk in
-    the local window.
+    """Choose the lowest travel weight at which policies travel no farther than a random walk.
+
+    The random walk stays in the local window. The choice is among TRAVEL_WEIGHTS.
+
+    Args:
+        judged: tables, each with its own policy.
+        n_views: views of each episode.
+        kind: one of OBJECTIVES.
+        seed: of the draws.
+
+    Returns:
+        The weight, value per grid cell; the largest one if all travel farther.
     """
     limit = judge_all(
         [(table, Random(table.data.sphere)) for table, _ in judged], n_views, kind, seed

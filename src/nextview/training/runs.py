@@ -94,6 +94,14 @@ class StepSeed(L.Callback):
     def on_train_batch_start(
         self, trainer: L.Trainer, pl_module: Any, batch: Any, batch_idx: int
     ) -> None:
+        """Seed the draws of a batch by its number, so that a resumed run repeats them.
+
+        Args:
+            trainer: Lightning's trainer.
+            pl_module: the module.
+            batch: the batch.
+            batch_idx: number of the batch in its epoch.
+        """
         step = [pl_module.recipe.seed, trainer.current_epoch, batch_idx, trainer.global_rank]
         torch.manual_seed(int(np.random.SeedSequence(step).generate_state(1, np.uint64)[0]))
 
@@ -106,11 +114,23 @@ class WholeCheckpoints(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
     ) -> None:
+        """Write a checkpoint, complete or not at all.
+
+        Args:
+            checkpoint: its content.
+            path: of the file.
+            storage_options: not used.
+        """
         save_whole(checkpoint, Path(path))
 
 
 def save_whole(values: dict[str, Any], path: Path) -> None:
-    """Write what torch can, whole or not at all."""
+    """Write values with torch, complete or not at all.
+
+    Args:
+        values: the values by their names.
+        path: of the file, which is replaced.
+    """
     written = io.BytesIO()
     torch.save(values, written)  # into a file it would turn a full disk into a RuntimeError
     with new_file(path, overwrite=True) as part:
@@ -145,9 +165,21 @@ class Log(L.Callback):
         self.rows = list[dict[str, float]]()
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Start the clock of an epoch.
+
+        Args:
+            trainer: Lightning's trainer.
+            pl_module: the module.
+        """
         self.began = time.perf_counter()
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Append a row with the scores and the duration of an epoch.
+
+        Args:
+            trainer: Lightning's trainer.
+            pl_module: the module.
+        """
         row = {"epoch": trainer.current_epoch + 1, "step": trainer.global_step}
         row |= {name: float(value) for name, value in trainer.callback_metrics.items()}
         row["rate"] = trainer.optimizers[0].param_groups[0]["lr"]
@@ -185,6 +217,12 @@ class Patience(EarlyStopping):
     """
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Stop a resumed run whose patience was exhausted before.
+
+        Args:
+            trainer: Lightning's trainer.
+            pl_module: the module.
+        """
         trainer.should_stop = self.wait_count >= self.patience
 
 
@@ -197,7 +235,20 @@ def fit(
     mode: Literal["min", "max"],
     hardware: Hardware = Hardware(),
 ) -> L.LightningModule:
-    """Train a module by its ``recipe`` and return it as it was after its best epoch."""
+    """Train a module by its ``recipe``.
+
+    Args:
+        module: the module.
+        training: batches of training data.
+        validation: batches of validation data.
+        out: folder of the run; an unfinished run in it is resumed.
+        select: name of the score by which the best epoch is chosen.
+        mode: whether the lowest ("min") or the highest ("max") score is the best.
+        hardware: devices and precision.
+
+    Returns:
+        The module as it was after its best epoch.
+    """
     recipe: Any = module.recipe
     # The last checkpoint comes last: it holds the states of the others.
     callbacks = [
@@ -252,8 +303,18 @@ def fit(
 
 
 def optimiser(parameters: Any, recipe: Any, steps: int, falls: float) -> dict[str, Any]:
-    """AdamW, by one cycle over all steps, or with a rate that falls to such a part every fifth
-    epoch.
+    """Create the optimiser and the schedule of its learning rate.
+
+    It is AdamW with one cycle over all steps, or with a rate that falls every fifth epoch.
+
+    Args:
+        parameters: of the network.
+        recipe: of the training.
+        steps: number of all steps.
+        falls: factor by which the rate falls.
+
+    Returns:
+        What Lightning's ``configure_optimizers`` returns.
     """
     adam = torch.optim.AdamW(parameters, lr=recipe.lr, weight_decay=recipe.weight_decay)
     if recipe.lr_schedule == "one-cycle":
@@ -284,8 +345,19 @@ def new_run(
     held_out: Sequence[str],
     made: Iterable[ViewStore | Predictions],
 ) -> Run:
-    """A run by the command that runs now, from stores and predictions; what is held out
-    validates it.
+    """Describe a run of the current command.
+
+    Args:
+        recipe: of the training.
+        weights: file or run with the initial weights; None for random ones.
+        held_out: names of the validation objects.
+        made: stores and predictions that the run uses.
+
+    Returns:
+        The description.
+
+    Raises:
+        DatasetError: the initial weights were trained on a part of the validation objects.
     """
     before = [line for source in made for line in source.commands]
     if weights is not None and weights.is_dir():
@@ -310,8 +382,18 @@ def new_run(
 
 
 def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
-    """Train a network into a run's folder unless it is there; alone, or with the other devices
-    of this run.
+    """Train a network into the folder of a run unless it is there already.
+
+    Other processes are kept out, except those of the other devices of this run.
+
+    Args:
+        out: folder of the run.
+        run: its description.
+        train: trains and returns the network.
+
+    Raises:
+        ModelError: the folder holds a run of another recipe, other initial weights or other
+            objects.
     """
     with only_one(out) if is_first() else nullcontext():
         if (out / "run.json").exists():
@@ -354,7 +436,18 @@ def read_run(out: Path) -> Run:
 
 
 def read_recipe(out: Path, kind: type[Recipe]) -> Recipe:
-    """The recipe of a finished run."""
+    """Read the recipe of a finished run.
+
+    Args:
+        out: folder of the run.
+        kind: type of the recipe.
+
+    Returns:
+        The recipe.
+
+    Raises:
+        ModelError: the folder holds no run of this kind.
+    """
     recipe = read_run(out).recipe
     if set(recipe) != set(kind.__annotations__):
         raise ModelError(f"{out}: holds no run of a {kind.__name__} of this version")
@@ -362,7 +455,18 @@ def read_recipe(out: Path, kind: type[Recipe]) -> Recipe:
 
 
 def load_run(network: N, run: Path) -> N:
-    """Give a network the parameters of a finished run: the network, in evaluation mode."""
+    """Load the parameters of a finished run into a network.
+
+    Args:
+        network: the network.
+        run: folder of the run.
+
+    Returns:
+        The network, in evaluation mode.
+
+    Raises:
+        ModelError: the parameters are of another network.
+    """
     path = run / "network.pt"
     try:
         network.load_state_dict(_read_state(path))
@@ -384,11 +488,17 @@ LITE_NAMES = {
 
 
 def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> None:
-    """Give a network its first parameters: of a finished run (a folder), or of a published
-    checkpoint.
+    """Load initial parameters into a network.
 
-    Its own last layers stay where those of the checkpoint are of another shape, or ``head`` is
-    false.
+    The last layers keep their values if those of the file have another shape.
+
+    Args:
+        network: the network.
+        weights: folder of a finished run, or file of a published checkpoint.
+        head: whether to load the last layers too.
+
+    Raises:
+        ModelError: the parameters are of another network.
     """
     path = weights / "network.pt" if weights.is_dir() else weights
     state = {name.removeprefix("resnet."): value for name, value in _read_state(path).items()}

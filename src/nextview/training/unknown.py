@@ -215,8 +215,15 @@ def fit_novelty(
 
 
 def quantiles(scores: NDArray[np.float64], labels: NDArray[np.int64], n_views: int) -> Float32:
-    """Quantiles of the mean score over 1 to ``n_views`` views, classes weighted evenly: (views,
-    LEVELS), ascending.
+    """Return quantiles of the mean score over several views, with classes weighted evenly.
+
+    Args:
+        scores: of the views of each object, (N, V).
+        labels: class of each object, (N,) int64.
+        n_views: largest number of views.
+
+    Returns:
+        Quantiles, (views, LEVELS) float32, ascending.
     """
     count = np.bincount(labels)
     share_of = 1 / count[labels]

@@ -75,8 +75,14 @@ def _pose(walk: Walk) -> str:
 
 
 def preview_card(observation: Observation, walk: Walk) -> str:
-    """What a camera that is being dragged would see, and the leading things as remembered from
-    nearest there.
+    """Describe what a camera that is being dragged would see.
+
+    Args:
+        observation: what it would see.
+        walk: the walk.
+
+    Returns:
+        HTML: the picture, and the leading things as remembered from the nearest view.
     """
     nearest, _ = walk.sphere.nearest(direction_of(observation.pose))
     parts = f"<h3>From here</h3>{_image(observation.picture, 200)}{rivals_card(walk, nearest)}"
@@ -137,8 +143,14 @@ def _table(rows: Iterable[Iterable[str]]) -> str:
 
 
 def rivals_card(walk: Walk, view: int | None = None) -> str:
-    """The two taught things believed most, as remembered from a view, by default the next;
-    nothing for other models.
+    """Describe the two most likely taught things as they are remembered from a view.
+
+    Args:
+        walk: the walk.
+        view: index of the view; None for the next one.
+
+    Returns:
+        HTML; empty for models without a memory.
     """
     rivals = walk.rivals
     at = walk.next_view if view is None else view

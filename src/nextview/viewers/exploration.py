@@ -66,8 +66,18 @@ class ShownObject:
 def shown_objects(
     path: Path | None = None, up: str | None = None, unit: str | None = None
 ) -> tuple[ShownObject, ...]:
-    """The objects of a path, in order: of a mesh file, a folder of meshes or a view store; the
-    samples if not given.
+    """List the objects of a path.
+
+    Args:
+        path: mesh file, folder of meshes or view store; None for the samples.
+        up: up axis of the mesh files; None for that of their format.
+        unit: of the mesh files; None if it is not known.
+
+    Returns:
+        The objects, in order.
+
+    Raises:
+        DatasetError: there is no object.
     """
     if path is None:
         return tuple(ShownObject(name, partial(sample_mesh, name), name) for name in SAMPLES)
@@ -160,7 +170,15 @@ class Walk:
         return things.rivals(joint[0], float(azimuths[-1]))
 
     def remembered(self, rivals: Rivals, view: int) -> list[tuple[str, NDArray[np.uint8]]]:
-        """Name and picture of both rivals as remembered from a candidate view."""
+        """Return the rivals' names and their remembered pictures from a candidate view.
+
+        Args:
+            rivals: the two most likely classes.
+            view: index of the view.
+
+        Returns:
+            Name and picture, (64, 64) uint8, of both.
+        """
         recogniser = self.session.models.recogniser
         assert isinstance(recogniser, TaughtRecogniser)
         seen_from = zip(rivals.classes, rivals.hypotheses, rivals.azimuths[:, view], strict=True)
@@ -205,10 +223,19 @@ class Walk:
 def remembered_picture(
     recogniser: TaughtRecogniser, hypothesis: int, ring: int, azimuth: int
 ) -> NDArray[np.uint8]:
-    """Draw a thing in a resting pose, from a ring and an azimuth bin, as a (64, 64) picture.
+    """Draw a taught thing in a resting pose as the memory holds it.
 
-    It is drawn from the memory's own surface, or else from the mesh that it was taught from; where
-    neither is there, its one picture is taken.
+    It is drawn from the memory's surface, or else from the mesh that was taught; if neither is
+    there, the stored picture is returned.
+
+    Args:
+        recogniser: the memory.
+        hypothesis: the thing in its resting pose.
+        ring: index of the ring of views.
+        azimuth: index of the azimuth bin.
+
+    Returns:
+        Picture, (64, 64) uint8.
     """
     memory = recogniser.memory
     about = recogniser.card.memory

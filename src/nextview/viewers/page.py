@@ -269,7 +269,15 @@ def _listed(value: object, options: Collection[str]) -> str:
 
 
 def serve(host: str, port: int) -> viser.ViserServer:
-    """Serve a page that only its own scripts can drive, at a port or the next free one."""
+    """Start the server of a page that only its own scripts can control.
+
+    Args:
+        host: address to listen at.
+        port: to listen at; the next free one if it is taken.
+
+    Returns:
+        The server.
+    """
     _check_address(host, port)
     plain = websocket.serve
 
@@ -296,11 +304,19 @@ def serve(host: str, port: int) -> viser.ViserServer:
 
 
 def refused(hosts: Sequence[str], origins: Sequence[str], served: str) -> str | None:
-    """Why a request is refused, by its headers Host and Origin; None if it is answered.
+    """Decide by its headers whether a request is refused.
 
-    A page of another site can reach this machine in two ways. By this machine's address: then
-    Origin names the site. By a name of its own that points to this address: then Host has that
-    name.
+    There are two ways in which a page of another site can reach this machine. By this machine's
+    address: then Origin names the site. By a name of its own that points to this address: then Host
+    has that name.
+
+    Args:
+        hosts: values of the header Host.
+        origins: values of the header Origin.
+        served: name or address under which the page is served.
+
+    Returns:
+        Why it is refused; None if it is answered.
     """
     name = _host_name(hosts[0]) if len(hosts) == 1 else None
     if name is None:

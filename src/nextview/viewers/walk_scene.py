@@ -92,8 +92,11 @@ class WalkScene:
             self._drag(np.asarray(event.target.position, float), event.phase == "end")
 
     def draw(self, walk: Walk, hide_unseen: bool) -> None:
-        """Draw the walk as it is now; ``hide_unseen`` hides the object, but for the points that
-        were seen.
+        """Draw the current state of a walk.
+
+        Args:
+            walk: the walk.
+            hide_unseen: whether to hide the object except for the points that were seen.
         """
         if self._object is not None:
             self._object.visible = not hide_unseen
