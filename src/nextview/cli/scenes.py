@@ -8,7 +8,7 @@ from typing import Literal
 from nextview.cli.common_options import Unit
 from nextview.cli.progress import console, track
 from nextview.cli.stores import Split, Workers, track_all
-from nextview.data import scene_drawing
+from nextview.data import room_drawing, scene_drawing
 from nextview.errors import DatasetError, UsageError
 from nextview.files import check_new
 from nextview.geometry.mesh import MAX_FACES, load_mesh
@@ -25,16 +25,22 @@ def scenes(
     scenes: int | None = None,
     split: Split | None = None,
     held_out: str | None = None,
+    room: bool = False,
+    unit: Unit | None = None,
     seed: int = 0,
     workers: Workers = Workers(),
 ) -> None:
     """Draw cluttered scenes: a target on a table among other objects, boxes and walls that hide
-    parts of it.
+    parts of it; or rooms.
 
     Each scene is a small JSON file that names meshes and says where they stand; the same seed draws
     the same files. Resumes where it was. Objects of one split stand only among objects of that
     split. Render them with nextview render OUT STORE --meshes MESHES, and go on as with any other
     store.
+
+    With --room a scene is a room as a mobile robot sees it, in metres: floor, walls, furniture
+    behind, objects at the size that they have in life, on the floor or on a table, and a level
+    camera. Its frames are taken by a RoomCamera (docs/scenes.md).
 
     Args:
         meshes: dataset folder, CLASS/train|test/MESH or CLASS/MESH.
@@ -45,8 +51,18 @@ def scenes(
         split: only this one.
         held_out: only around objects that this model (its name or card) held out of its training,
             for learning policies.
+        room: draw rooms; without --unit, of ModelNet10's classes at usual sizes.
+        unit: of rooms: the mesh files' unit of length. What is small lies on a table then, in any
+            pose that it can rest in.
         seed: decides which objects are targets, and all that stands around them.
     """
+    if room:
+        if held_out is not None or levels != ("light", "medium", "heavy"):
+            raise UsageError("--levels and --held-out are for cluttered tables, not for --room")
+        _draw_rooms(meshes, out, scenes, split, unit, seed, workers)
+        return
+    if unit is not None:
+        raise UsageError("--unit is for --room: on cluttered tables lengths are in object radii")
     total = len(scene_drawing.tasks(meshes, out, levels, scenes, seed, split, held_out))
     drawn = scene_drawing.draw_scenes(
         meshes, out, levels, scenes, seed, split, **vars(workers), held_out=held_out
@@ -57,6 +73,23 @@ def scenes(
     console.print(
         f"{out}: {total - len(failed)} scenes; next: nextview render {out} STORE --meshes {meshes}"
     )
+
+
+def _draw_rooms(
+    meshes: Path,
+    out: Path,
+    rooms: int | None,
+    split: str | None,
+    unit: str | None,
+    seed: int,
+    workers: Workers,
+) -> None:
+    total = len(room_drawing.room_tasks(meshes, out, rooms, seed, split))
+    drawn = room_drawing.draw_rooms(meshes, out, rooms, seed, split, unit, **vars(workers))
+    failed = track_all(drawn, total, f"drawing {out.name}")
+    if len(failed) == total:
+        raise DatasetError(f"{out}: none of the {total} rooms can be drawn; see the reasons above")
+    console.print(f"{out}: {total - len(failed)} rooms; next: frames of them, docs/scenes.md#rooms")
 
 
 def capture(

@@ -28,6 +28,13 @@ def clutter_level(name: str) -> str:
     return match[1] if match else ""
 
 
+def below_the_meshes(path: str) -> None:
+    """See that a path stays below the folder of meshes; ValueError if it may not."""
+    paths = PurePosixPath(path), PureWindowsPath(path)
+    if not path.isprintable() or any(one.anchor or ".." in one.parts for one in paths):
+        raise ValueError("a mesh is a path below the folder of meshes")
+
+
 class Placement(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """An object that stands on the table: a mesh file below the folder of meshes, its hash, and
     where it stands.
@@ -44,9 +51,7 @@ class Placement(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=T
     radius: Size = 1.0
 
     def __post_init__(self) -> None:
-        paths = PurePosixPath(self.mesh), PureWindowsPath(self.mesh)
-        if not self.mesh.isprintable() or any(path.anchor or ".." in path.parts for path in paths):
-            raise ValueError("a mesh is a path below the folder of meshes")
+        below_the_meshes(self.mesh)
 
 
 class Block(Struct, frozen=True, forbid_unknown_fields=True):

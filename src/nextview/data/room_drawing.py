@@ -1,0 +1,595 @@
+"""Draw a folder of rooms around the objects of a dataset, on all cores, resumable.
+
+A room is as a mobile robot sees it: floor, walls, ceiling and furniture, all at the size that it
+has in life, and a camera that is level. Furniture stands on the floor, half of it against a wall.
+Monitors, and what is small enough for a hand, stand on a table. What has a known unit of length
+lies there in any pose that it can rest in; furniture stands upright.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from nextview.checks import whole
+from nextview.data.folders import Entry, list_dataset, select
+from nextview.data.pool import WorkerDied, each
+from nextview.data.scene_drawing import LARGEST, MOST_SCENES
+from nextview.data.store import writing
+from nextview.errors import DatasetError, MeshError, UsageError
+from nextview.files import check_new
+from nextview.geometry.mesh import MAX_FACES, Mesh, load_mesh
+from nextview.geometry.ray_caster import RayCaster, pixel_rays
+from nextview.geometry.resting import resting_poses
+from nextview.geometry.viewsphere import level_pose, rotation_z
+from nextview.simulation.room import Room, at_rest, build_room
+from nextview.simulation.room_layout import IDENTITY, RoomLayout, Slab, Standing
+from nextview.simulation.scene import footprint, mesh_hash, separation
+from nextview.simulation.scene_layout import SUFFIX
+
+Float = NDArray[np.float64]
+
+LEVEL = "room"  # in the names of rooms, where other scenes have their level of clutter
+LAYOUTS_TRIED = 60
+VIEWS_TRIED = 60  # first views of one layout
+
+ROOM_SIDE = (3.5, 6.5)  # metres
+ROOM_HEIGHT = (2.4, 2.8)
+AT_WALL = (0.0, 0.06)  # metres between a thing that stands against a wall and the wall
+GAP = 0.3  # metres between the target and other furniture, at least
+FURNITURE = (1, 3)  # things beside the target, at least and at most
+PLACES_TRIED = 20  # for each
+
+HAND_SIZED = 0.3  # metres: what has a smaller radius lies on a table
+TABLE_HEIGHT = (0.70, 0.78)
+TABLE_WIDTH = (1.2, 1.6)
+TABLE_DEPTH = (0.7, 0.9)
+TABLE_TOP = 0.04  # thickness
+TABLE_LEG = 0.05
+EDGE = 0.08  # metres from the edge of the table to what lies on it, at least
+BESIDE = 0.08  # metres between two things on a table, at least
+MOST_BESIDE = 2
+BOOK = ((0.05, 0.25), (0.05, 0.2), (0.03, 0.15))  # width, depth and height of boxes on a table
+CABINET = ((0.4, 1.2), (0.3, 0.5), (0.6, 2.0))
+
+# of the first view: metres from the target, metres over the floor, and over a table
+FLOOR_DISTANCE = (1.5, 3.5)
+FLOOR_HEIGHT = (0.6, 1.6)
+ABOVE_TABLE = 0.1
+CLOSEST = 0.8  # metres from the target's sphere
+TABLE_DISTANCE = (0.4, 0.7)
+CLOSEST_TO_SMALL = 0.25
+TABLE_ELEVATION = (20.0, 60.0)  # degrees
+AIM_OFF = 0.02  # standard deviation of where the camera is aimed, as a part of its distance
+SHOWN = 0.7  # share of the target's picture that nothing else hides in the first view, at least
+PICTURE = 96  # pixels across, in which that is measured
+FIELD = 0.9  # of that picture: its half width at unit distance
+
+NOWHERE = tuple(np.eye(4).ravel().tolist())  # the first pose of a layout that has none yet
+
+
+@dataclass(frozen=True)
+class LifeSize:
+    """How large the objects of a class are in life.
+
+    Attributes:
+        measure: "height", or "length" for the longer side on the floor.
+        low: metres.
+        high: metres.
+        back: direction from an object's middle to its back, degrees from +x, in ModelNet's axes.
+    """
+
+    measure: str
+    low: float
+    high: float
+    back: float
+
+
+# usual sizes of furniture
+LIFE_SIZES = {
+    "bathtub": LifeSize("length", 1.5, 1.8, 0),
+    "bed": LifeSize("length", 1.9, 2.2, 90),
+    "chair": LifeSize("height", 0.78, 1.0, 90),
+    "desk": LifeSize("height", 0.70, 0.78, 0),
+    "dresser": LifeSize("height", 0.8, 1.25, 0),
+    "monitor": LifeSize("length", 0.4, 0.7, 0),
+    "night_stand": LifeSize("height", 0.45, 0.65, 0),
+    "sofa": LifeSize("length", 1.5, 2.2, 0),
+    "table": LifeSize("height", 0.70, 0.78, 0),
+    "toilet": LifeSize("height", 0.68, 0.82, 90),
+}
+ON_TABLES = ("monitor",)
+MOST_LENGTH = 2.6  # metres on the floor: a wide table is lower than usual instead
+
+
+@dataclass(frozen=True)
+class Task:
+    """One room to draw.
+
+    Attributes:
+        target: mesh file of the target, below the dataset.
+        split: of the target, and of all that stands around it.
+        label: class of the target.
+        name: of the room.
+        path: its file.
+    """
+
+    target: str
+    split: str
+    label: str
+    name: str
+    path: Path
+
+
+@dataclass(frozen=True)
+class Source:
+    """What rooms are drawn of.
+
+    Attributes:
+        folder: of the meshes.
+        unit: of length of all of them; None: furniture of known classes, and files that say it.
+        furniture: file below the folder and class of what may stand beside a target, by split.
+        small: files of what may lie beside a target on a table, by split.
+    """
+
+    folder: Path
+    unit: str | None
+    furniture: dict[str, tuple[tuple[str, str], ...]]
+    small: dict[str, tuple[str, ...]]
+
+
+def draw_rooms(
+    dataset: Path,
+    out: Path,
+    rooms: int | None = None,
+    seed: int = 0,
+    split: str | None = None,
+    unit: str | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> Iterator[tuple[str, str | None]]:
+    """Draw the rooms that are not in the folder yet. Which they are depends on the seed alone.
+
+    Classes take turns, and so do the objects of each, in an order that the seed draws. Files are
+    CLASS/SPLIT/NAME@room-NUMBER.json, or CLASS/NAME@room-NUMBER.json where the dataset has no
+    splits.
+
+    Args:
+        dataset: folder of meshes.
+        out: folder of the rooms.
+        rooms: how many of each split; by default one around each object.
+        seed: decides everything.
+        split: only this one.
+        unit: of length of the mesh files.
+        workers: see ``pool.each``.
+        scheduler: see ``pool.each``.
+
+    Yields:
+        The name of each room that is there, and None, or the reason why it cannot be drawn.
+    """
+    dataset = Path(dataset)
+    out = Path(out)
+    wanted = room_tasks(dataset, out, rooms, seed, split)
+    there = next(out.rglob(f"*@{LEVEL}-*{SUFFIX}"), None)
+    if there is None:
+        check_new(out, folder=True)
+    elif RoomLayout.load(there).seed != seed:
+        raise DatasetError(
+            f"{there}: was drawn with another seed; give another folder or the same seed"
+        )
+
+    done = [task for task in wanted if task.path.exists()]
+    yield from ((task.name, None) for task in done)
+    todo = [task for task in wanted if not task.path.exists()]
+    source = _source(dataset.absolute(), unit)
+    with writing(out):
+        for task, result in each(partial(_draw, source, seed), todo, workers, scheduler):
+            yield task.name, f"{task.name}: {result}" if isinstance(result, WorkerDied) else result
+
+
+def room_tasks(
+    dataset: Path, out: Path, rooms: int | None, seed: int, split: str | None
+) -> list[Task]:
+    """All rooms that are asked for, see ``draw_rooms``."""
+    if rooms is not None:
+        whole(rooms, "the number of rooms", 1, MOST_SCENES)
+    whole(seed, "a seed", 0, 2**31 - 1)
+    entries = select(list_dataset(dataset), dataset, split, None)
+    found = []
+    for one in dict.fromkeys(entry.split for entry in entries):
+        order = _in_turns([entry for entry in entries if entry.split == one], seed)
+        for number in range(len(order) if rooms is None else rooms):
+            entry = order[number % len(order)]
+            name = f"{entry.name}@{LEVEL}-{number // len(order)}"
+            path = out.absolute() / entry.label / one / f"{name}{SUFFIX}"
+            target = entry.path.relative_to(dataset).as_posix()
+            found.append(Task(target, one, entry.label, name, path))
+    return found
+
+
+def _in_turns(entries: list[Entry], seed: int) -> list[Entry]:
+    """Entries of one split in an order in which classes take turns."""
+    rng = np.random.default_rng([seed, *entries[0].split.encode()])
+    shuffled = [entries[i] for i in rng.permutation(len(entries))]
+    labels = list(dict.fromkeys(entry.label for entry in shuffled))
+    turn = dict.fromkeys(labels, 0)
+    turns = []
+    for entry in shuffled:
+        turns.append((turn[entry.label], labels.index(entry.label)))
+        turn[entry.label] += 1
+    return [shuffled[i] for i in sorted(range(len(shuffled)), key=turns.__getitem__)]
+
+
+def _source(dataset: Path, unit: str | None) -> Source:
+    """What of a dataset may stand around a target."""
+    furniture: dict[str, list[tuple[str, str]]] = {}
+    small: dict[str, list[str]] = {}
+    for entry in list_dataset(dataset):
+        file = entry.path.relative_to(dataset).as_posix()
+        if unit is not None:
+            small.setdefault(entry.split, []).append(file)
+        elif entry.label in LIFE_SIZES and entry.label not in ON_TABLES:
+            furniture.setdefault(entry.split, []).append((file, entry.label))
+    return Source(
+        dataset,
+        unit,
+        {split: tuple(sorted(some)) for split, some in furniture.items()},
+        {split: tuple(sorted(some)) for split, some in small.items()},
+    )
+
+
+def _draw(source: Source, seed: int, task: Task) -> str | None:
+    """Draw one room into its file; the reason if that cannot be."""
+    try:
+        draw_room(source, task, seed).save(task.path)
+    except (MeshError, DatasetError) as error:
+        return str(error)
+    return None
+
+
+def draw_room(source: Source, task: Task, seed: int) -> RoomLayout:
+    """A room around a target; seed and name decide all that is random.
+
+    Args:
+        source: what stands in it.
+        task: which room.
+        seed: of the draws.
+
+    Raises:
+        MeshError: the target cannot be used.
+        DatasetError: its size is not known, or it shows in no layout that was tried.
+    """
+    rng = np.random.default_rng([seed, *task.name.encode()])
+    mesh = load_mesh(source.folder / task.target, unit=source.unit)
+    radius = life_radius(mesh, task.label, rng)
+    small = task.label in ON_TABLES or (mesh.metres is not None and radius < HAND_SIZED)
+    drawing = _on_table if small else _on_floor
+    for _ in range(LAYOUTS_TRIED):
+        layout = drawing(source, task, mesh, radius, rng)
+        if layout is None:
+            continue
+        room = build_room(layout, source.folder, MAX_FACES)
+        pose = _first_view(room, rng)
+        if pose is not None:
+            return _with_pose(layout, seed, pose)
+    raise DatasetError(f"{source.folder / task.target}: shows in none of {LAYOUTS_TRIED} rooms")
+
+
+def life_radius(mesh: Mesh, label: str, rng: np.random.Generator) -> float:
+    """The object radius that a mesh has in life, metres: by its unit, or drawn by its class."""
+    if mesh.metres is not None:
+        return mesh.metres
+    size = LIFE_SIZES.get(label)
+    if size is None:
+        known = ", ".join(LIFE_SIZES)
+        raise UsageError(
+            f"{mesh.name}: how large is a {label}? Give the files' --unit; without one, rooms hold"
+            f" {known}"
+        )
+    extent = np.ptp(mesh.vertices, axis=0)
+    measured = extent[2] if size.measure == "height" else extent[:2].max()
+    radius = rng.uniform(size.low, size.high) / max(measured, 1e-6)
+    return float(min(radius, MOST_LENGTH / max(extent[:2].max(), 1e-6)))
+
+
+def _on_floor(
+    source: Source, task: Task, mesh: Mesh, radius: float, rng: np.random.Generator
+) -> RoomLayout | None:
+    """A target on the floor, half of them with the back to a wall; None where nothing fits."""
+    width, depth, height = rng.uniform(*np.transpose([ROOM_SIDE, ROOM_SIDE, ROOM_HEIGHT]))
+    back = np.radians(LIFE_SIZES[task.label].back) if task.label in LIFE_SIZES else 0.0
+    against = bool(rng.integers(2))
+    target = _standing(source, task.target, mesh, radius, (width, depth), back, against, rng)
+    if target is None:
+        return None
+
+    taken = [footprint(at_rest(mesh.vertices, target))]
+    objects, slabs = _furniture(source, task.split, (width, depth), taken, rng)
+    return RoomLayout(
+        name=task.name,
+        kind="floor",
+        seed=0,
+        label=task.label,
+        target=target,
+        width=_short(width),
+        depth=_short(depth),
+        height=_short(height),
+        pose=NOWHERE,
+        objects=tuple(objects),
+        slabs=tuple(slabs),
+    )
+
+
+def _on_table(
+    source: Source, task: Task, mesh: Mesh, radius: float, rng: np.random.Generator
+) -> RoomLayout | None:
+    """A target on a table; None where it does not fit."""
+    width, depth, height = rng.uniform(*np.transpose([ROOM_SIDE, ROOM_SIDE, ROOM_HEIGHT]))
+    slabs = _table((width, depth), rng)
+    top = slabs[0]
+    upright = task.label in ON_TABLES
+    poses = np.eye(3)[None] if upright else resting_poses(mesh)
+    rest = poses[rng.integers(len(poses))]
+    azimuth = rng.uniform(0, 2 * np.pi)
+    if upright:  # its back to the wall, as the table's
+        azimuth = top.azimuth + np.pi / 2 - np.radians(LIFE_SIZES[task.label].back)
+    taken: list[Float] = []
+    target = _lying(source, task.target, mesh, (radius, azimuth, rest), top, taken, rng)
+    if target is None:
+        return None
+
+    objects = []
+    for _ in range(int(rng.integers(MOST_BESIDE + 1)) * (not upright)):
+        other = _beside(source, task, top, taken, rng)
+        if isinstance(other, Standing):
+            objects.append(other)
+        elif other is not None:
+            slabs.append(other)
+    around = [footprint(_slab_corners(top))]
+    more, boxes = _furniture(source, task.split, (width, depth), around, rng)
+    return RoomLayout(
+        name=task.name,
+        kind="table",
+        seed=0,
+        label=task.label,
+        target=target,
+        width=_short(width),
+        depth=_short(depth),
+        height=_short(height),
+        pose=NOWHERE,
+        objects=(*objects, *more),
+        slabs=(*slabs, *boxes),
+    )
+
+
+def _with_pose(layout: RoomLayout, seed: int, pose: Float) -> RoomLayout:
+    """A layout with the seed that drew it and the pose of its first view, (4, 4)."""
+    return replace(layout, seed=seed, pose=tuple(np.round(pose, 5).ravel().tolist()))
+
+
+def _standing(
+    source: Source,
+    file: str,
+    mesh: Mesh,
+    radius: float,
+    room: tuple[float, float],
+    back: float,
+    against: bool,
+    rng: np.random.Generator,
+) -> Standing | None:
+    """A mesh on the floor of a room, somewhere or with its back against a wall; None where it is
+    too large.
+    """
+    wall = int(rng.integers(4))
+    azimuth = np.pi / 2 * wall - back if against else rng.uniform(0, 2 * np.pi)
+    thing = Standing(file, mesh_hash(source.folder / file), _short(radius), azimuth=_short(azimuth))
+    half = np.ptp(at_rest(mesh.vertices, thing)[:, :2], axis=0) / 2
+    free = np.array(room) / 2 - half - AT_WALL[1]
+    if (free <= 0).any():
+        return None
+
+    place = rng.uniform(-free, free)
+    if against:
+        axis, side = wall % 2, 1 if wall < 2 else -1
+        place[axis] = side * (room[axis] / 2 - half[axis] - rng.uniform(*AT_WALL))
+    return Standing(thing.mesh, thing.sha256, thing.radius, *map(_short, place), 0.0, thing.azimuth)
+
+
+def _furniture(
+    source: Source,
+    split: str,
+    room: tuple[float, float],
+    taken: list[Float],
+    rng: np.random.Generator,
+) -> tuple[list[Standing], list[Slab]]:
+    """Furniture against the walls, away from footprints that are taken; these are added."""
+    objects: list[Standing] = []
+    slabs: list[Slab] = []
+    others = source.furniture.get(split, ())
+    for _ in range(int(rng.integers(FURNITURE[0], FURNITURE[1] + 1))):
+        for _ in range(PLACES_TRIED):
+            thing: Standing | Slab | None = _cabinet(room, rng)
+            corners = _slab_corners(thing) if isinstance(thing, Slab) else np.zeros((0, 3))
+            if others and rng.integers(3):
+                file, label = others[int(rng.integers(len(others)))]
+                mesh = _other(source.folder / file)
+                if mesh is None:
+                    continue
+                back = np.radians(LIFE_SIZES[label].back)
+                radius = life_radius(mesh, label, rng)
+                thing = _standing(source, file, mesh, radius, room, back, True, rng)
+                if thing is None:
+                    continue
+                corners = at_rest(mesh.vertices, thing)
+            outline = footprint(corners)
+            if min(separation(outline, other) for other in taken) >= GAP:
+                taken.append(outline)
+                (objects if isinstance(thing, Standing) else slabs).append(thing)  # type: ignore[arg-type]
+                break
+    return objects, slabs
+
+
+@lru_cache(maxsize=64)
+def _other(path: Path, unit: str | None = None) -> Mesh | None:
+    """A mesh that stands beside a target; None for one that is too large or damaged."""
+    try:
+        return load_mesh(path, unit=unit, max_faces=LARGEST)
+    except MeshError:
+        return None
+
+
+def _cabinet(room: tuple[float, float], rng: np.random.Generator) -> Slab:
+    """A box against a wall."""
+    width, depth, height = rng.uniform(*np.transpose(CABINET))
+    wall = int(rng.integers(4))
+    azimuth = np.pi / 2 * (wall - 1)
+    axis, side = wall % 2, 1 if wall < 2 else -1
+    free = np.maximum(np.array(room) / 2 - width / 2, 0)
+    place = rng.uniform(-free, free)
+    place[axis] = side * (room[axis] / 2 - depth / 2 - rng.uniform(*AT_WALL))
+    return Slab(*map(_short, (*place, 0, azimuth, width, depth, height)))
+
+
+def _table(room: tuple[float, float], rng: np.random.Generator) -> list[Slab]:
+    """A table top with four legs, against a wall or in the room; the top comes first."""
+    width, depth = rng.uniform(*np.transpose([TABLE_WIDTH, TABLE_DEPTH]))
+    height = rng.uniform(*TABLE_HEIGHT)
+    wall = int(rng.integers(4))
+    azimuth = np.pi / 2 * (wall - 1)
+    half = np.array([width, depth] if wall % 2 else [depth, width]) / 2
+    free = np.maximum(np.array(room) / 2 - half - AT_WALL[1], 0)
+    place = rng.uniform(-free, free)
+    if rng.integers(2):
+        axis, side = wall % 2, 1 if wall < 2 else -1
+        place[axis] = side * (room[axis] / 2 - half[axis] - rng.uniform(*AT_WALL))
+
+    shape = _short(width), _short(depth), TABLE_TOP
+    top = Slab(*map(_short, (*place, height - TABLE_TOP, azimuth)), *shape, even=False)
+    legs = []
+    for x in (-1, 1):
+        for y in (-1, 1):
+            aside = np.array([x * (width - TABLE_LEG), y * (depth - TABLE_LEG), 0]) / 2
+            at = place + (rotation_z(azimuth) @ aside)[:2]
+            size = TABLE_LEG, TABLE_LEG, height - 2 * TABLE_TOP
+            legs.append(Slab(*map(_short, (*at, 0, azimuth, *size))))
+    return [top, *legs]
+
+
+def _lying(
+    source: Source,
+    file: str,
+    mesh: Mesh,
+    how: tuple[float, float, Float],
+    top: Slab,
+    taken: list[Float],
+    rng: np.random.Generator,
+) -> Standing | None:
+    """A mesh on a table, of a radius, an azimuth and a resting pose; None where it does not fit
+    between what lies there. Its footprint is added to those.
+    """
+    radius, azimuth, rest = how
+    rotation = IDENTITY if np.array_equal(rest, np.eye(3)) else tuple(rest.ravel().tolist())
+    sha256 = mesh_hash(source.folder / file)
+    for _ in range(PLACES_TRIED):
+        aside = _on_top(top, rng)
+        thing = Standing(
+            file,
+            sha256,
+            _short(radius),
+            *map(_short, aside),
+            _short(top.z + top.height),
+            _short(azimuth),
+            rotation,
+        )
+        outline = footprint(at_rest(mesh.vertices, thing))
+        if _fits(outline, top, taken):
+            taken.append(outline)
+            return thing
+    return None
+
+
+def _beside(
+    source: Source, task: Task, top: Slab, taken: list[Float], rng: np.random.Generator
+) -> Standing | Slab | None:
+    """Another thing on a table, or a box; None where it does not fit."""
+    others = [file for file in source.small.get(task.split, ()) if file != task.target]
+    if others and rng.integers(2):
+        file = others[int(rng.integers(len(others)))]
+        mesh = _other(source.folder / file, source.unit)
+        if mesh is None or mesh.metres is None or mesh.metres > HAND_SIZED:
+            return None
+        how = mesh.metres, rng.uniform(0, 2 * np.pi), np.eye(3)
+        return _lying(source, file, mesh, how, top, taken, rng)
+
+    x, y = _on_top(top, rng)
+    size = rng.uniform(*np.transpose(BOOK))
+    box = Slab(*map(_short, (x, y, top.z + top.height, rng.uniform(0, 2 * np.pi), *size)))
+    outline = footprint(_slab_corners(box))
+    if not _fits(outline, top, taken):
+        return None
+    taken.append(outline)
+    return box
+
+
+def _on_top(top: Slab, rng: np.random.Generator) -> Float:
+    """A place on a table, (2,)."""
+    free = np.array([top.width, top.depth]) / 2 - EDGE
+    aside = np.append(rng.uniform(-free, free), 0)
+    return np.array([top.x, top.y]) + (rotation_z(top.azimuth) @ aside)[:2]
+
+
+def _fits(outline: Float, top: Slab, taken: list[Float]) -> bool:
+    """Whether an outline, (K, 2), lies on a table, away from its edge and from what is taken."""
+    own = (outline - (top.x, top.y)) @ rotation_z(top.azimuth)[:2, :2]
+    inside = (np.abs(own) < np.array([top.width, top.depth]) / 2 - EDGE / 2).all()
+    return bool(inside) and all(separation(outline, other) >= BESIDE for other in taken)
+
+
+def _slab_corners(slab: Slab) -> Float:
+    """The corners of a box, (8, 3)."""
+    half = np.array([slab.width, slab.depth]) / 2
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)], float)
+    corners *= (*half, slab.height)
+    return corners @ rotation_z(slab.azimuth).T + (slab.x, slab.y, slab.z)
+
+
+def _first_view(room: Room, rng: np.random.Generator) -> Float | None:
+    """A level pose, (4, 4), from which the target shows; None where none was found."""
+    centre = room.centre
+    for _ in range(VIEWS_TRIED):
+        azimuth = rng.uniform(0, 2 * np.pi)
+        if room.layout.kind == "floor" or room.layout.label in ON_TABLES:
+            distance = max(rng.uniform(*FLOOR_DISTANCE), room.radius + CLOSEST)
+            lowest = max(FLOOR_HEIGHT[0], room.layout.target.z + ABOVE_TABLE)
+            rise = np.clip((rng.uniform(lowest, FLOOR_HEIGHT[1]) - centre[2]) / distance, -1, 1)
+        else:
+            distance = max(rng.uniform(*TABLE_DISTANCE), room.radius + CLOSEST_TO_SMALL)
+            rise = np.sin(np.radians(rng.uniform(*TABLE_ELEVATION)))
+        level = np.sqrt(1 - rise**2)
+        direction = np.array([level * np.cos(azimuth), level * np.sin(azimuth), rise])
+        aim = centre + rng.normal(0, AIM_OFF * distance, 3)
+        pose = level_pose(direction, distance)
+        pose[:3, 3] += aim
+        if room.reachable(pose) and _shown(room, pose) >= SHOWN:
+            return pose
+    return None
+
+
+def _shown(room: Room, pose: Float) -> float:
+    """Share of the target's picture from a pose that lies in it and that nothing hides."""
+    focal = PICTURE / 2 / FIELD
+    intrinsics = np.array([[focal, 0, PICTURE / 2], [0, focal, PICTURE / 2], [0, 0, 1.0]])
+    rays = pixel_rays(intrinsics, (PICTURE, PICTURE)).reshape(-1, 3) @ pose[:3, :3].T
+    alone, _ = RayCaster(room.things[:1]).cast(pose[:3, 3], rays.astype(np.float32))
+    _, which = room.caster.cast(pose[:3, 3], rays.astype(np.float32))
+    whole_picture = np.isfinite(alone).sum()
+    return float((which == 0).sum() / whole_picture) if whole_picture else 0.0
+
+
+def _short(value: float) -> float:
+    """Few digits are enough, and JSON holds them exactly."""
+    return round(float(value), 5)

@@ -1,0 +1,108 @@
+"""What stands where in a room: one small JSON file, of which the room is built to the bit.
+
+Lengths are in metres and angles in radians. The world is z up; its origin is in the middle of the
+floor.
+"""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+from nextview.errors import DatasetError
+from nextview.files import read_record, write_record
+from nextview.simulation.scene_layout import MOST, Hash, Length, Size, below_the_meshes
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+Rotation = Annotated[tuple[Length, ...], Meta(min_length=9, max_length=9)]
+Pose = Annotated[tuple[Length, ...], Meta(min_length=16, max_length=16)]
+
+
+class Standing(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A mesh at the size that it has in life, at rest on a floor or a table.
+
+    Attributes:
+        mesh: its file, below the folder of meshes.
+        sha256: of that file.
+        radius: its object radius.
+        x: of the middle of its bounding box.
+        y: the same.
+        z: of its lowest point.
+        azimuth: by which it is turned about the vertical, after ``rotation``.
+        rotation: into the pose in which it rests, (3, 3), row by row.
+    """
+
+    mesh: str
+    sha256: Hash
+    radius: Size
+    x: Length = 0.0
+    y: Length = 0.0
+    z: Length = 0.0
+    azimuth: Length = 0.0
+    rotation: Rotation = IDENTITY
+
+    def __post_init__(self) -> None:
+        below_the_meshes(self.mesh)
+
+
+class Slab(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """An upright box: a table top, its legs, a cabinet.
+
+    Attributes:
+        x: of its middle.
+        y: the same.
+        z: of its bottom.
+        azimuth: by which it is turned about the vertical.
+        width: along its own x axis.
+        depth: along its own y axis.
+        height: of it.
+        even: whether its top is flat; that of a table is not quite.
+    """
+
+    x: Length
+    y: Length
+    z: Length
+    azimuth: Length
+    width: Size
+    depth: Size
+    height: Size
+    even: bool = True
+
+
+class RoomLayout(Struct, frozen=True, forbid_unknown_fields=True):
+    """A room with a target on its floor, or on a table in it, and where a camera stands first.
+
+    Attributes:
+        name: unique in its folder, "chair_0890@room-1".
+        kind: where the target stands.
+        seed: with which the room was drawn.
+        label: the class of the target.
+        target: the object that is meant.
+        width: of the room, along x.
+        depth: of the room, along y.
+        height: of the room.
+        pose: of the first camera, camera-to-world, (4, 4), row by row; OpenCV's axes, level.
+        objects: other meshes.
+        slabs: boxes.
+    """
+
+    name: str
+    kind: Literal["floor", "table"]
+    seed: int
+    label: str
+    target: Standing
+    width: Size
+    depth: Size
+    height: Size
+    pose: Pose
+    objects: Annotated[tuple[Standing, ...], MOST] = ()
+    slabs: Annotated[tuple[Slab, ...], MOST] = ()
+
+    def save(self, path: Path) -> None:
+        """Write its file, whole or not at all. The same room makes the same bytes."""
+        write_record(path, self)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "RoomLayout":
+        """Read what ``save`` wrote; DatasetError if there is nothing, or something else."""
+        return read_record(Path(path), cls, "a room", DatasetError)
