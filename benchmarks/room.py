@@ -41,7 +41,7 @@ from scipy.stats import binomtest
 
 import nextview
 from nextview import System
-from nextview.cli.ending import orderly_end
+from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
 from nextview.data.pool import WorkerDied, each
 from nextview.errors import DatasetError, NextviewError, ObservationError, UsageError

@@ -6,7 +6,7 @@ Monitors, and what is small enough for a hand, stand on a table. What has a know
 lies there in any pose that it can rest in; furniture stands upright.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -396,7 +396,7 @@ def _standing(
     if against:
         axis, side = wall % 2, 1 if wall < 2 else -1
         place[axis] = side * (room[axis] / 2 - half[axis] - rng.uniform(*AT_WALL))
-    return Standing(thing.mesh, thing.sha256, thing.radius, *map(_short, place), 0.0, thing.azimuth)
+    return replace(thing, x=_short(place[0]), y=_short(place[1]))
 
 
 def _furniture(
@@ -451,7 +451,7 @@ def _cabinet(room: tuple[float, float], rng: np.random.Generator) -> Slab:
     free = np.maximum(np.array(room) / 2 - width / 2, 0)
     place = rng.uniform(-free, free)
     place[axis] = side * (room[axis] / 2 - depth / 2 - rng.uniform(*AT_WALL))
-    return Slab(*map(_short, (*place, 0, azimuth, width, depth, height)))
+    return _slab((*place, 0.0), azimuth, (width, depth, height))
 
 
 def _table(room: tuple[float, float], rng: np.random.Generator) -> list[Slab]:
@@ -467,15 +467,15 @@ def _table(room: tuple[float, float], rng: np.random.Generator) -> list[Slab]:
         axis, side = wall % 2, 1 if wall < 2 else -1
         place[axis] = side * (room[axis] / 2 - half[axis] - rng.uniform(*AT_WALL))
 
-    shape = _short(width), _short(depth), TABLE_TOP
-    top = Slab(*map(_short, (*place, height - TABLE_TOP, azimuth)), *shape, even=False)
+    size = width, depth, TABLE_TOP
+    top = _slab((*place, height - TABLE_TOP), azimuth, size, even=False)
     legs = []
     for x in (-1, 1):
         for y in (-1, 1):
             aside = np.array([x * (width - TABLE_LEG), y * (depth - TABLE_LEG), 0]) / 2
             at = place + (rotation_z(azimuth) @ aside)[:2]
             size = TABLE_LEG, TABLE_LEG, height - 2 * TABLE_TOP
-            legs.append(Slab(*map(_short, (*at, 0, azimuth, *size))))
+            legs.append(_slab((*at, 0.0), azimuth, size))
     return [top, *legs]
 
 
@@ -497,13 +497,14 @@ def _lying(
     for _ in range(PLACES_TRIED):
         aside = _on_top(top, rng)
         thing = Standing(
-            file,
-            sha256,
-            _short(radius),
-            *map(_short, aside),
-            _short(top.z + top.height),
-            _short(azimuth),
-            rotation,
+            mesh=file,
+            sha256=sha256,
+            radius=_short(radius),
+            x=_short(aside[0]),
+            y=_short(aside[1]),
+            z=_short(top.z + top.height),
+            azimuth=_short(azimuth),
+            rotation=rotation,
         )
         outline = footprint(at_rest(mesh.vertices, thing))
         if _fits(outline, top, taken):
@@ -527,7 +528,7 @@ def _beside(
 
     x, y = _on_top(top, rng)
     size = rng.uniform(*np.transpose(BOOK))
-    box = Slab(*map(_short, (x, y, top.z + top.height, rng.uniform(0, 2 * np.pi), *size)))
+    box = _slab((x, y, top.z + top.height), rng.uniform(0, 2 * np.pi), size.tolist())
     outline = footprint(_slab_corners(box))
     if not _fits(outline, top, taken):
         return None
@@ -547,6 +548,13 @@ def _fits(outline: Float, top: Slab, taken: list[Float]) -> bool:
     own = (outline - (top.x, top.y)) @ rotation_z(top.azimuth)[:2, :2]
     inside = (np.abs(own) < np.array([top.width, top.depth]) / 2 - EDGE / 2).all()
     return bool(inside) and all(separation(outline, other) >= BESIDE for other in taken)
+
+
+def _slab(place: Sequence[float], azimuth: float, size: Sequence[float], even: bool = True) -> Slab:
+    """A box whose bottom is at a place, (3,), of a width, a depth and a height."""
+    x, y, z = map(_short, place)
+    width, depth, height = map(_short, size)
+    return Slab(x, y, z, _short(azimuth), width, depth, height, even)
 
 
 def _slab_corners(slab: Slab) -> Float:

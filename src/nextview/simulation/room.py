@@ -112,7 +112,8 @@ def build_room(layout: RoomLayout, meshes: str | Path, max_faces: int = MAX_FACE
     around = [_uneven_top(layout.width, layout.depth, rng), _walls(layout)]
     for slab in layout.slabs:
         around += _slab_things(slab, rng)
-    return Room(layout, placed[0][0], (*placed, *around))
+    target = np.asarray(placed[0][0], np.float64)
+    return Room(layout, target, (*placed, *around))
 
 
 def stood(thing: Standing, meshes: Path, max_faces: int, name: str) -> Triangles:
