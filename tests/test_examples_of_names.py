@@ -16,7 +16,7 @@ from nextview.teaching.learn import LearnOptions, learn_things
 from nextview.teaching.thing_views import TeachingOptions
 
 OPTIONS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
-TO_COME = {"Recognition", "SimulatedCamera", "System", "View", "load"}  # not written yet
+TO_COME = {"Recognition", "Scene", "SimulatedCamera", "System", "View", "load"}  # not written yet
 NOT_RUN = {"learn", "load_mesh", "recognise", "Session"}  # need files of a user, or a robot
 
 
