@@ -310,7 +310,8 @@ def test_the_table_is_no_part_of_an_object_where_the_poses_of_an_arm_err(thing, 
 
         plane = seen.sightings[-1].plane
         on_table = np.linalg.inv(pose) @ [0.2, -0.1, 0, 1]  # a point of it, as the camera sees it
-        assert abs(plane.height((believed @ on_table)[:3])) < 0.002
+        stands = seen.sightings[-1].frame.camera_to_world
+        assert abs(plane.height((stands @ on_table)[:3])) < 0.002
 
     assert seen.object_frame.radius == pytest.approx(true_frame(made).radius, rel=0.15)
 

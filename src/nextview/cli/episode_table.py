@@ -178,7 +178,7 @@ def episode_as_json(
         "threshold_reached": result.confident,
         "views": views,
     }
-    whole["warnings"] = sorted({warning.name for view in result.views for warning in view.warnings})
+    whole["warnings"] = sorted(warning.name for warning in result.warnings)
     return json.dumps(_plain(whole), indent=indent)
 
 

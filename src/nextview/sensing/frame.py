@@ -1,5 +1,6 @@
 """One frame of a depth camera, in the units and axes of nextview, or refused in words."""
 
+from copy import copy
 from dataclasses import InitVar, dataclass, field
 
 import numpy as np
@@ -109,6 +110,14 @@ class Frame:
     def shape(self) -> tuple[int, int]:
         """Height and width, pixels."""
         return self.depth.shape[0], self.depth.shape[1]
+
+    def shifted(self, shift: NDArray[np.float64]) -> "Frame":
+        """The same frame from a place that is shifted in the world, (3,), metres; it has a pose."""
+        pose = self.camera_to_world.copy()
+        pose[:3, 3] += shift
+        moved = copy(self)  # what was checked is right
+        object.__setattr__(moved, "pose", pose)
+        return moved
 
     @property
     def camera_to_world(self) -> NDArray[np.float64]:

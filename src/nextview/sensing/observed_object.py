@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from copy import copy, deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import get_args
 
 import numpy as np
@@ -19,6 +19,7 @@ from nextview.geometry.viewsphere import DISTANCE
 from nextview.sensing import clusters, plausibility, segmentation, support
 from nextview.sensing.clusters import Footprint
 from nextview.sensing.convex_pieces import STANDS, cut
+from nextview.sensing.displacement import Displacement, displacement
 from nextview.sensing.facets import (
     ROWS,
     Facets,
@@ -30,6 +31,7 @@ from nextview.sensing.facets import (
     virtual_pose,
 )
 from nextview.sensing.frame import Frame, within
+from nextview.sensing.lean import lean_of
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, ObjectFrame, enclose, three, upright_axes
 from nextview.sensing.outliers import without_outliers
@@ -81,10 +83,16 @@ MAY_BE_TWO = ViewWarning(
 class Sighting:
     """What one frame, with the noise of it all, shows of the object.
 
-    ``facets`` are its surface, camera frame, ``mask`` its pixels, (H, W) bool, and ``hull`` the
-    corners of its convex hull, world, (K, 3). ``plane`` is the support plane, if it is seen,
-    ``footprint`` that of all that is above it, where the object was found so, and ``chosen`` which
-    of its cells are the object's, (cells,) bool.
+    Attributes:
+        frame: its pose is shifted so that the object stands where earlier frames show it.
+        noise: of the frame.
+        facets: the object's surface, camera frame.
+        mask: its pixels, (H, W) bool.
+        hull: corners of its convex hull, world, (K, 3), metres.
+        plane: the support plane, if it is seen.
+        footprint: of all that is above the plane, where the object was found so.
+        chosen: which cells of the footprint are the object's, (cells,) bool.
+        shift: by which the pose was shifted, (3,), metres.
     """
 
     frame: Frame
@@ -95,6 +103,23 @@ class Sighting:
     plane: Plane | None
     footprint: Footprint | None = None
     chosen: Mask | None = None
+    shift: Float = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def told(self) -> Frame:
+        """The frame with the pose that it was handed in with."""
+        return self.frame.shifted(-self.shift) if self.shift.any() else self.frame
+
+    def shifted(self, shift: Float) -> Sighting:
+        """The same from a place that is shifted in the world, (3,), metres."""
+        plane = self.plane
+        return replace(
+            self,
+            frame=self.frame.shifted(shift),
+            hull=self.hull + shift,
+            plane=plane and Plane(plane.normal, plane.offset - float(plane.normal @ shift)),
+            shift=self.shift + shift,
+        )
 
 
 @dataclass(frozen=True)
@@ -221,7 +246,7 @@ class ObservedObject:
             )
             with suppress(ObservationError):
                 for sighting in self.sightings:
-                    other.add(sighting.frame)
+                    other.add(sighting.told)
                 if 1 / SIZE_CHANGE < other.object_frame.radius / radius < SIZE_CHANGE:
                     found.append((novelty(other.observations) + LESS_NOVEL, other.state))
         self.state = min(found, key=lambda pair: pair[0])[1]
@@ -248,7 +273,7 @@ class ObservedObject:
 
     def _after(self, frame: Frame) -> ObjectState:
         before = self.state
-        last = before.sightings[-1].frame if before.sightings else None
+        last = before.sightings[-1].told if before.sightings else None
         self._refuse(frame, last)
 
         noise = noise_of(frame)
@@ -257,12 +282,18 @@ class ObservedObject:
         plane, up, rng = self._support(frame, samples)
 
         sightings, cell, two = self._find(frame, upright_axes(up), plane, samples, noise)
+        displaced = None if two else self._displaced(sightings)
+        if displaced is not None and displaced.mended:
+            sightings[-1] = sightings[-1].shifted(-displaced.shift)
         latest, made, revision = self._seen_as(sightings, up)
 
         warnings = self._warnings(frame, latest, made, up, two)
         warnings += [NO_PLANE] * (self.support and plane is None and self.known is None)
         for view in made[-4:-1]:
             warnings = warnings or check_views(view, made[-1])
+        warnings += plausibility.check_place(displaced)
+        if frame.pose is not None and self.up is not None:
+            warnings += self._check_lean(sightings)
 
         return ObjectState(
             rng,
@@ -395,13 +426,28 @@ class ObservedObject:
         if two:
             warnings.append(MAY_BE_TWO)
         if before.sightings:
-            warnings += plausibility.check_pose_moved(frame, before.sightings[-1].frame)
+            warnings += plausibility.check_pose_moved(frame, before.sightings[-1].told)
         if before.frame is not None:
             warnings += plausibility.check_size(latest.radius, before.frame.radius)
         if self.point is not None:
             aside = upright_axes(up)[:2] @ (self.point - latest.centre)
             warnings += plausibility.check_point(aside, latest.radius)
         return warnings
+
+    def _displaced(self, sightings: Sequence[Sighting]) -> Displacement | None:
+        """By how much the last of some sightings shows the object beside the earlier ones."""
+        if self.known is not None or len(sightings) == 1:
+            return None
+        return displacement(sightings[-1], sightings[:-1])
+
+    def _check_lean(self, sightings: Sequence[Sighting]) -> list[ViewWarning]:
+        """See ``plausibility.check_lean``; of the plane that the object stands on."""
+        shown = [sighting for sighting in sightings if sighting.plane is not None]
+        if self.up is None or len(shown) < 2:  # of one frame it may be an error of its depth
+            return []
+        normals = [sighting.plane.normal for sighting in shown if sighting.plane is not None]
+        poses = [sighting.frame.camera_to_world for sighting in shown]
+        return plausibility.check_lean(lean_of(normals, poses, upright_axes(self.up)))
 
     def _near(self, samples: Samples) -> Mask:
         """Which samples lie in the sphere of the object, as it is known from earlier frames, (N,)
@@ -610,7 +656,7 @@ class ObservedObject:
                         mended = self.sighting_of(
                             s.frame, s.footprint.pixels_of(now), s.plane, s.noise
                         )
-                    s = replace(mended, footprint=s.footprint, chosen=now)
+                    s = replace(mended, footprint=s.footprint, chosen=now, shift=s.shift)
             sightings.append(s)
         return sightings
 

@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 from nextview.errors import ObservationError
 from nextview.geometry.observation import Observation
+from nextview.sensing.displacement import Displacement
 from nextview.sensing.frame import AXES, Frame
+from nextview.sensing.lean import Lean
 
 Float = NDArray[np.float64]
 SAMPLE = 500  # pixels that are looked at
@@ -57,11 +59,18 @@ class ViewWarning:
 
     Names are "nothing seen", "opengl axes", "ros axes", "inverse pose", "scale", "outside",
     "contradiction" and "repeated"; of a frame "intrinsics", "unit", "far origin", "outline",
-    "support", "point" and "stale pose".
+    "support", "point", "size", "stale pose", "displaced" and "lean".
+
+    Attributes:
+        name: one of these.
+        message: a sentence for whoever set up the camera.
+        holds: whether no answer is confident by a view with it. It is not so where the mistake is
+            allowed for, or does not matter for the answer.
     """
 
     name: str
     message: str
+    holds: bool = True
 
 
 def refuse_far(frame: Frame, last: Frame | None, target: Float | None, radius: float) -> None:
@@ -234,6 +243,39 @@ def check_size(radius: float, before: float) -> list[ViewWarning]:
             "size",
             f"the radius of the object grows from {before:.2g} to {radius:.2g} m by this frame: is"
             " its pose wrong, so that the support or a neighbour is taken for a part of it?",
+        )
+    ]
+
+
+def check_place(displaced: Displacement | None) -> list[ViewWarning]:
+    """Whether a frame shows the object in another place than earlier ones; usually not.
+
+    Args:
+        displaced: by how much it does; None where that is not known.
+    """
+    if displaced is None or not displaced.noticed:
+        return []
+    return [
+        ViewWarning(
+            "displaced",
+            f"this frame shows the object {1000 * displaced.length:.0f} mm beside where earlier"
+            " ones do, which is allowed for: was it nudged, or does the camera's pose err"
+            " (hand-eye calibration, a late time stamp)?",
+            holds=False,
+        )
+    ]
+
+
+def check_lean(lean: Lean) -> list[ViewWarning]:
+    """Whether the support plane leans by more than errors of the camera explain; usually not."""
+    if not lean.noticed:
+        return []
+    return [
+        ViewWarning(
+            "lean",
+            f"the support plane leans by {lean.degrees:.1f} degrees against up: a tilted table,"
+            " is it another surface than the support, or is up another direction?",
+            holds=False,
         )
     ]
 

@@ -18,6 +18,8 @@ Mask = NDArray[np.bool_]
 TRIALS = 200
 # cosine of the lean of a support plane, at most: errors of a calibration
 TILT = np.cos(np.radians(12.0))
+# the same, at which a plane counts nothing when planes are compared
+STEEPEST_SUPPORT = np.cos(np.radians(15.0))
 # share of what is seen that lies on a support plane, at least; more if gravity is not known
 LEAST = 0.04
 LEAST_ALONE = 0.15
@@ -186,6 +188,9 @@ def find_plane(
     away = (points - samples.camera).astype(np.float32) @ normals.T.astype(np.float32)
     away += (offsets + normals @ samples.camera).astype(np.float32)
     count = (np.abs(away) < samples.tolerance[:, None].astype(np.float32)).sum(0)
+    if up is not None:
+        # What leans much is hardly a support, but a plane through things that stand on one.
+        count = count * (1 - (1 - normals @ up) / (1 - STEEPEST_SUPPORT))
     best = int(count.argmax())
     plane = refine_plane(Plane(normals[best], float(offsets[best])), samples)
     level = up is None or plane.normal @ up > TILT

@@ -49,6 +49,9 @@ class PoseFrame:
         frame = thing.object_frame
         from_object = np.eye(4)
         from_object[:3, :3] = frame.axes.T
-        from_object[:3, 3] = frame.centre
+        # Each frame shows the object in another place, if their poses err: it is where they show
+        # it in the mean.
+        shifts = [sighting.shift for sighting in thing.sightings]
+        from_object[:3, 3] = frame.centre - np.mean(shifts, axis=0)
         posed = thing.sightings[-1].frame.pose is not None
         return cls("world" if posed else "camera", from_object)

@@ -40,7 +40,7 @@ def after_repeated(state: "ObjectState", frame: Frame, first: int) -> "ObjectSta
         if frame.pose is None or not np.array_equal(sighting.frame.depth, frame.depth):
             continue
         assert state.frame is not None
-        was, now = (state.frame.pose_in_object(f.camera_to_world) for f in (sighting.frame, frame))
+        was, now = (state.frame.pose_in_object(f.camera_to_world) for f in (sighting.told, frame))
         if _is_one_picture(seen, replace(seen, pose=now @ np.linalg.inv(was) @ seen.pose)):
             sightings = (*state.sightings, sighting)
             observations = (*state.observations, seen)

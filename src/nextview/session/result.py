@@ -19,6 +19,7 @@ from nextview.recognition.poses import (
     uncertainty_of,
 )
 from nextview.recognition.protocol import JointBelief
+from nextview.sensing.plausibility import ViewWarning
 from nextview.session.pose_frame import PoseFrame, PoseFrameName
 from nextview.session.view import View
 
@@ -35,9 +36,9 @@ SUSPICIOUS = 5.0
 class Recognition:
     """The end of an episode, or how it stands; before the first view nothing is seen.
 
-    It is confident where the threshold was reached in a view without warnings, by an object that is
-    not suspiciously novel (see ``SUSPICIOUS``) and may be of the class by its size, and fewer than
-    half of the views contradict others.
+    It is confident where the threshold was reached in a view without warnings that hold it (see
+    ``ViewWarning.holds``), by an object that is not suspiciously novel (see ``SUSPICIOUS``) and may
+    be of the class by its size, and fewer than half of the views contradict others.
 
     Attributes:
         views: in order.
@@ -71,6 +72,14 @@ class Recognition:
     def seen(self) -> bool:
         """Whether the object was seen from any of the views."""
         return any(view.observation.seen for view in self.views)
+
+    @property
+    def warnings(self) -> tuple[ViewWarning, ...]:
+        """What is likely to be wrong with the views: each kind once, as the last view with it says
+        it.
+        """
+        found = {warning.name: warning for view in self.views for warning in view.warnings}
+        return tuple(found.values())
 
     @property
     def novelty(self) -> float | None:
@@ -328,7 +337,7 @@ class Recognition:
             sure += ", no other view in reach"
             if self.why_stranded:
                 sure += f": {self.why_stranded}"
-        names = dict.fromkeys(warning.name for view in self.views for warning in view.warnings)
+        names = [warning.name for warning in self.warnings]
         warnings = f", warnings: {', '.join(names)}" if names else ""
         return (
             f"{self.answer} (belief {self.confidence:.3f}, {views},"

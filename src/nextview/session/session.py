@@ -621,7 +621,7 @@ class Session:
                 episodes.take(evidence.get(k, step.evidence), directions[k][None], step.joint)
 
         reach = self._reach
-        doubtful = bool(warnings) or self._contradicted(last + 1)
+        doubtful = any(warning.holds for warning in warnings) or self._contradicted(last + 1)
         taken = episodes.next_step(
             evidence[last],
             directions[last][None],

@@ -1,0 +1,277 @@
+"""By how much a frame shows an object beside the place where earlier frames show it.
+
+A camera on an arm does not stand exactly where it is said to: the hand-eye calibration, the joints
+and the time stamp err, and the object may have been nudged. The surfaces of both frames are drawn
+together along their normals (point to plane, Chen and Medioni, "Object modelling by registration
+of multiple range images", 1992), and into each other's outlines, by robust Gauss-Newton steps. An
+error of the camera's direction turns the object, too, but so little against its size that the
+shift is all that is searched for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from nextview.sensing.facets import Facets
+
+if TYPE_CHECKING:
+    from nextview.sensing.observed_object import Sighting
+
+Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+CAMERA_PLACE = 0.003  # metres, standard deviation of a camera's place
+CAMERA_AIM = 0.006  # radians, standard deviation of the direction in which it looks
+FARTHEST_SHIFT = 5.0  # standard deviations from which it is no error of an arm
+POINTS = 200  # of a surface that are looked up in another frame
+FACETS = 3000  # of a surface in which points are looked up
+COMPARED = 2  # earlier frames, those from the nearest directions
+ALIKE = 60.0  # so many points are as good as all of them: neighbours err together
+SURFACE_ERROR = 0.003  # of a depth, as a part of it, beside the noise
+PLANE_ERROR = 0.002  # of the height of a support plane, as a part of the distance
+OUTLINE_PITCHES = 1.5  # distances of facets that an outline is blurred by
+NOT_HIDDEN = 0.02  # part of the depth by which a frame has to look past a point
+SAME_SIDE = 0.5  # cosine of the angle between the normals of one surface in two frames
+REACHES = (4.0, 2.5, 1.5, 1.0, 1.0)
+"""Standard deviations of a point at which a pull counts half, in each step."""
+FURTHER = (1.0, 0.6, 0.3, 0.0, 0.0)
+"""Parts of the shift to be expected by which points may still be off, in each step."""
+FEWEST_PULLS = 20  # from which a shift is told
+DEPTH_ERROR = 0.01
+"""Metres at a distance of 1 m, standard deviation of a shift by errors that a depth camera has in
+common for all pixels; they grow with the square of the distance. Of a real Kinect whose poses are
+exact a twentieth of the shifts is larger than twice that.
+"""
+MENDED = 3.0  # standard deviations that noise does not explain, from which a shift is allowed for
+LEAST_MENDED = 0.006  # parts of the distance from the camera: smaller shifts are left as they are
+NOTICED = 2.5  # standard deviations that noise and depth errors do not explain
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """Where a frame shows an object against earlier frames.
+
+    Attributes:
+        shift: of what it shows, (3,), world, metres.
+        further: the same against the last of the earlier frames, by the poses that both were
+            handed in with, (3,), metres.
+        covariance: of the shift, (3, 3), square metres.
+        distance: of the object from the camera, metres.
+        lasting: whether it is there where the last of the earlier frames showed it displaced.
+    """
+
+    shift: Float
+    further: Float
+    covariance: Float
+    distance: float
+    lasting: bool
+
+    @property
+    def length(self) -> float:
+        """Of ``further``, metres."""
+        return float(np.linalg.norm(self.further))
+
+    @property
+    def mended(self) -> bool:
+        """Whether it is more than the noise of the frames explains, and is to be allowed for."""
+        large = float(np.linalg.norm(self.shift)) > LEAST_MENDED * self.distance
+        return large and (self.lasting or _deviations(self.shift, self.covariance) > MENDED)
+
+    @property
+    def noticed(self) -> bool:
+        """Whether ``further`` is more than noise and the errors of depth cameras explain."""
+        common = (DEPTH_ERROR * self.distance**2) ** 2 * np.eye(3)
+        return self.mended and _deviations(self.further, self.covariance + common) > NOTICED
+
+
+def _deviations(shift: Float, covariance: Float) -> float:
+    """How many standard deviations a shift is long."""
+    return float(np.sqrt(shift @ np.linalg.solve(covariance, shift)))
+
+
+@dataclass(frozen=True)
+class _Pulls:
+    """Equations ``directions @ shift = distances`` of some points, with standard deviations.
+
+    ``directions`` is (N, 3), the others (N,); metres.
+    """
+
+    directions: Float
+    distances: Float
+    deviations: Float
+
+
+def displacement(latest: Sighting, earlier: Sequence[Sighting]) -> Displacement | None:
+    """By how much a frame shows an object displaced against earlier frames.
+
+    Args:
+        latest: what the frame shows of the object.
+        earlier: what those before show of it, in order, one at least. The search begins at 0, and
+            where the last of them shows the object: what was nudged stays where it is.
+
+    Returns:
+        The shift; None where too little of the object is seen in both, or it is no small one.
+    """
+    there = [sighting for sighting in earlier if len(sighting.facets.planes)]
+    if not there or not len(latest.facets.planes):
+        return None
+
+    ahead = latest.frame.camera_to_world[:3, 2]
+    there.sort(key=lambda one: -float(ahead @ one.frame.camera_to_world[:3, 2]))
+    surface = _Surface.of(latest)
+    others = [_Surface.of(sighting) for sighting in there[:COMPARED]]
+    last = -earlier[-1].shift
+    starts = [np.zeros(3), last] if last.any() else [last]
+    found = [_searched(surface, others, start) for start in starts]
+    best = min((one for one in found if one is not None), key=lambda one: one.cost, default=None)
+    if best is None:
+        return None
+    lasting = bool(last.any()) and best is found[-1]
+    return Displacement(best.shift, best.shift - last, best.covariance, surface.distance, lasting)
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """The facets of a sighting in the world, and where they are in its picture."""
+
+    sighting: Sighting
+    facets: Facets
+    points: Float
+    normals: Float
+    deviations: Float
+    rays: cKDTree
+    pitch: float
+    sample: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, sighting: Sighting) -> _Surface:
+        facets = sighting.facets
+        coarse = max(1, round(float(facets.pitch[0]) * float(sighting.frame.intrinsics[0, 0])))
+        side = int(np.ceil(np.sqrt(len(facets.rows) / FACETS)))
+        if side > 1:
+            kept = (facets.rows // coarse % side == 0) & (facets.columns // coarse % side == 0)
+            facets = replace(facets.some(kept), pitch=side * facets.pitch)
+        turn = sighting.frame.camera_to_world[:3, :3]
+        points = facets.points
+        depth = points[:, 2]
+        normals = -facets.planes / np.linalg.norm(facets.planes, axis=1, keepdims=True)
+        noise = sighting.noise.at(depth) * depth**2
+        every = max(1, len(depth) // POINTS)
+        return cls(
+            sighting=sighting,
+            facets=facets,
+            points=points @ turn.T + sighting.frame.camera_to_world[:3, 3],
+            normals=normals @ turn.T,
+            deviations=np.hypot(noise, SURFACE_ERROR * depth),
+            rays=cKDTree(facets.rays[:, :2]),
+            pitch=float(facets.pitch.mean()),
+            sample=np.arange(every // 2, len(depth), every),
+        )
+
+    @property
+    def distance(self) -> float:
+        """From the camera, metres."""
+        camera = self.sighting.frame.camera_to_world[:3, 3]
+        return float(np.linalg.norm(np.median(self.points, 0) - camera))
+
+    def pulls(self, other: _Surface, shift: Float, reach: float) -> _Pulls:
+        """What the points of another surface, moved by a shift, say of a further one."""
+        pose = self.sighting.frame.camera_to_world
+        points = other.points[other.sample] + shift
+        inside = (points - pose[:3, 3]) @ pose[:3, :3]
+        z = np.maximum(inside[:, 2], 1e-6)
+        rays = inside[:, :2] / z[:, None]
+        away, nearest = self.rays.query(rays)
+
+        met = away < OUTLINE_PITCHES * self.pitch
+        normals = self.normals[nearest]
+        off = np.einsum("ni,ni->n", normals, self.points[nearest] - points)
+        alike = np.einsum("ni,ni->n", normals, other.normals[other.sample]) > SAME_SIDE
+        deviations = np.hypot(self.deviations[nearest], other.deviations[other.sample])
+        on = met & alike & (np.abs(off) < 3 * (deviations + reach))
+
+        outside = ~met & self._looks_past(rays, z)
+        aside = (self.facets.rays[nearest, :2] - rays) * z[:, None]
+        length = np.maximum(np.linalg.norm(aside, axis=1), 1e-9)
+        towards = (aside / length[:, None]) @ pose[:3, :2].T
+        slack = OUTLINE_PITCHES * self.pitch * z
+        return _Pulls(
+            np.concatenate([normals[on], towards[outside]]),
+            np.concatenate([off[on], (length - slack)[outside]]),
+            np.concatenate([deviations[on], np.hypot(slack, deviations)[outside]]),
+        )
+
+    def _looks_past(self, rays: Float, z: Float) -> Mask:
+        """Where the frame measured something behind points with these rays, (N, 2), and depths."""
+        frame = self.sighting.frame
+        k = frame.intrinsics
+        column = np.floor(rays[:, 0] * k[0, 0] + k[0, 2]).astype(int)
+        row = np.floor(rays[:, 1] * k[1, 1] + k[1, 2]).astype(int)
+        height, width = frame.shape
+        inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        depth = frame.depth[np.where(inside, row, 0), np.where(inside, column, 0)]
+        return inside & (depth > (1 + NOT_HIDDEN) * z)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A shift, (3,), metres, its covariance, (3, 3), and how badly the surfaces then fit."""
+
+    shift: Float
+    covariance: Float
+    cost: float
+
+
+def _searched(latest: _Surface, earlier: Sequence[_Surface], start: Float) -> _Fit | None:
+    """The best shift near one; None where too little tells, or it leads far away."""
+    expected = float(np.hypot(CAMERA_PLACE, CAMERA_AIM * latest.distance))
+    moved = -start
+    information = np.eye(3) / expected**2
+    cost = np.inf
+    for reach, part in zip(REACHES, FURTHER, strict=True):
+        further = part * expected
+        pulls = [one.pulls(latest, moved, further) for one in earlier]
+        pulls += [_reversed(latest.pulls(one, -moved, further)) for one in earlier]
+        pulls.append(_heights(latest, earlier, moved))
+        directions, distances, deviations = (
+            np.concatenate([getattr(pull, name) for pull in pulls])
+            for name in ("directions", "distances", "deviations")
+        )
+        if len(distances) < FEWEST_PULLS:
+            return None
+
+        scale = np.hypot(deviations, further)
+        robust = 1 / (1 + (distances / (reach * scale)) ** 2)
+        weight = robust / scale**2 * min(1.0, ALIKE / len(distances))
+        information = (directions.T * weight) @ directions + np.eye(3) / expected**2
+        pull = (directions.T * weight) @ distances - (moved + start) / expected**2
+        moved = moved + np.linalg.solve(information, pull)
+        cost = float(np.log1p((distances / deviations) ** 2).mean())
+    shift = -moved
+    if np.linalg.norm(shift - start) > FARTHEST_SHIFT * expected:
+        return None
+    return _Fit(shift, np.asarray(np.linalg.inv(information), np.float64), cost)
+
+
+def _reversed(pulls: _Pulls) -> _Pulls:
+    """The same pulls on the other surface."""
+    return _Pulls(-pulls.directions, pulls.distances, pulls.deviations)
+
+
+def _heights(latest: _Surface, earlier: Sequence[_Surface], moved: Float) -> _Pulls:
+    """How far the support plane of a frame, moved so, is below those of earlier ones."""
+    plane = latest.sighting.plane
+    here = latest.points.mean(0)
+    others = [one.sighting.plane for one in earlier if one.sighting.plane is not None]
+    if plane is None or not others:
+        return _Pulls(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+    foot = here - plane.height(here) * plane.normal + moved
+    below = -np.array([float(other.height(foot)) for other in others])
+    normals = np.array([other.normal for other in others])
+    return _Pulls(normals, below, np.full(len(others), PLANE_ERROR * latest.distance))
