@@ -31,9 +31,7 @@ from nextview.recognition.model_card import DISCRIMINATE
 
 @dataclass(frozen=True)
 class EpisodeSpecs:
-    """The E episodes that every entry has to go through: the same objects from the same first
-    views.
-    """
+    """The E episodes of every entry: the same objects from the same first views."""
 
     predictions: Predictions
     objects: NDArray[np.int64]
@@ -193,9 +191,7 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
 
 
 def _oracle(t: EpisodeSpecs, true: str, base: str, how: str) -> Policy:
-    """The oracle by the map ``base``, the true one where ``true`` is TRUE; ``how`` ends its
-    name.
-    """
+    """Return the oracle of the map ``base``; ``true`` and ``how`` are parts of its name."""
     sphere = t.predictions.sphere
     valleys = t.valley_classes(base)
     if how == "-oracle-valley":
@@ -204,9 +200,7 @@ def _oracle(t: EpisodeSpecs, true: str, base: str, how: str) -> Policy:
 
 
 def _ready(name: str, specs: EpisodeSpecs) -> bool:
-    """Whether an entry is for these classes and views, and the predictions and their view store
-    hold what it needs.
-    """
+    """Return whether predictions and view store hold what an entry needs."""
     try:
         entry_policy(name, specs)
     except (EntryError, OtherUseError):

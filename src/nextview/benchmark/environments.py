@@ -1,5 +1,6 @@
-"""Gymnasium environments: learn, or judge, a policy of your own. Importing this registers them;
-docs/environments.md.
+"""Gymnasium environments to train or judge a policy; see docs/environments.md.
+
+Importing this module registers them.
 
 - ``nextview/Recognise-v0``: over a file of predictions, thousands of episodes in one batch, nothing
 is rendered.
@@ -119,9 +120,7 @@ class Rules:
 
 @dataclass(frozen=True)
 class AfterAction(Stopping):
-    """As ``Stopping``, but never at the first view: an environment has no episode without an
-    action.
-    """
+    """Stops as ``Stopping`` does, but never at the first view."""
 
     def threshold_at(self, n_views: NDArray[np.int64] | int) -> NDArray[np.float64]:
         """See ``Stopping``; infinity for one view."""
@@ -193,9 +192,7 @@ class Task:
 
     @property
     def observation_space(self) -> gymnasium.spaces.Box:
-        """Of the numbers that ``policies.gain.features`` makes, (D,) float32; all but the maps
-        from 0 to 1.
-        """
+        """Space of ``policies.gain.features``, (D,) float32; all but the maps in 0 to 1."""
         c = len(self.classes)
         rules = self.rules
         widths = {
@@ -211,9 +208,7 @@ class Task:
 
     @property
     def action_space(self) -> gymnasium.spaces.Discrete:
-        """Where to go: a ring, and how many azimuth steps ahead: ``ring * azimuths + steps``, V
-        of them.
-        """
+        """Ring and azimuth steps ahead, as ``ring * azimuths + steps``; V actions."""
         return gymnasium.spaces.Discrete(len(self.sphere))
 
 
@@ -266,9 +261,7 @@ def replayed(
 
 @dataclass
 class Asked:
-    """The policy of a cohort: goes where the actions want, or as near to there as a view is
-    free.
-    """
+    """The policy of a cohort: goes to the free view nearest to the action."""
 
     sphere: ViewSphere
     views: Rows
@@ -291,8 +284,7 @@ class Asked:
 
 @dataclass(frozen=True)
 class Seen:
-    """What the agent is handed after a view in A episodes: (A, D) float32, and change of the
-    objective and price, (A,).
+    """Observations, (A, D) float32, change of the objective and price, (A,), of A episodes.
 
     ``info`` has for each: "object", "view", "n_views", "travel" (cells so far), "answer", its
     "confidence", "prediction_target" and "action_mask", the actions that lead to a view not taken
@@ -326,9 +318,7 @@ class Cohort:
         self.first = self._look(np.zeros(len(objects)))
 
     def step(self, actions: Rows) -> Seen:
-        """Go on in each running episode; where a view was taken before, to the nearest one that
-        was not.
-        """
+        """Continue all running episodes; a visited view is replaced by the nearest unvisited."""
         sphere = self.task.sphere
         running = self.episodes.running
         rules = self.task.rules
@@ -429,8 +419,9 @@ def info_of(seen: Seen) -> Info:
 
 
 class RecogniseEnv(TaskEnv):
-    """Recognise an object by few views, looked up in predictions: see ``replayed``; ``rules`` as
-    of ``Rules``.
+    """Recognise an object from few views, looked up in predictions; see ``replayed``.
+
+    ``rules`` are as for ``Rules``.
     """
 
     def __init__(
@@ -444,9 +435,7 @@ class RecogniseEnv(TaskEnv):
 
 
 class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
-    """Many episodes of a task at once; as many cohorts as there are numbers of views are under
-    way at most.
-    """
+    """Many episodes of a task at once, in at most as many cohorts as numbers of views."""
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
     metadata["autoreset_mode"] = AutoresetMode.SAME_STEP
@@ -490,9 +479,7 @@ class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         )
 
     def go(self, actions: Any) -> tuple[Seen, Info]:
-        """What is seen in each episode; where one ended, the observation and the info are those
-        of the next.
-        """
+        """Return the next observation of each episode, of a new one where an episode ended."""
         if not self._cohorts:
             raise SessionError("no episode is under way; call reset")
         actions = rows(actions, self.num_envs, len(self.task.sphere), "actions")

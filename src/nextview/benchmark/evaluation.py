@@ -1,6 +1,4 @@
-"""How good the models under the policies are: every view of every object judged, no policy
-asked.
-"""
+"""Evaluate the models: every view of every object, without a policy."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -31,8 +29,9 @@ RELIABILITY_LOOKS = (1, 2, 5)
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The results as long tables; intervals are 95 % bootstrap intervals over objects, ``low``
-    to ``high``.
+    """The results of an evaluation, as long tables.
+
+    Intervals are 95 % bootstrap intervals over objects, ``low`` to ``high``.
 
     Attributes:
         accuracy: by n_views (1, or V: all logits summed), label (empty: all) and measure:
@@ -92,9 +91,7 @@ def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluati
 
 
 def _judged(p: Predictions) -> dict[int, NDArray]:
-    """Logits of single views, and log-beliefs of all views together, by the number of views,
-    each (N, answers, C).
-    """
+    """Return logits of single views and log-beliefs of all views, (N, answers, C) each."""
     fused = p.calibration.log_belief(
         p.log_evidence.astype(np.float64).sum(1), len(p.sphere), len(p.classes)
     )
@@ -138,8 +135,9 @@ def fused_views(
 def _means(
     top: Float, bottom: Float, labels: Index, classes: tuple[str, ...], weights: Float | None
 ) -> Iterator[tuple[str, str, Float, Float, Float]]:
-    """Ratios of sums over objects (N, M): over all of them, as the mean over classes ("class_"),
-    and in each class.
+    """Return ratios of sums over objects, (N, M): over all, over classes, and by class.
+
+    The mean over classes has "class_" before its name.
     """
     every = np.ones(len(labels), bool)
     in_classes = [(classes[index], "", labels == index) for index in np.unique(labels)]

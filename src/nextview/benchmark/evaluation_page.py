@@ -1,6 +1,4 @@
-"""The stage that judges the models behind some predictions: a folder of tables and one HTML
-page.
-"""
+"""Evaluate the models behind predictions: a folder of tables and an HTML page."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -50,8 +48,7 @@ def write_evaluation(
     figures: Path | None = None,
     overwrite: bool = False,
 ) -> Evaluation:
-    """Judge recogniser and maps on every view: accuracy, confusions, calibration, map scores,
-    beside the published.
+    """Evaluate recogniser and maps on every view, beside the published scores.
 
     Args:
         predictions: made by nextview predict.

@@ -52,16 +52,18 @@ MOST = 8  # curves of policies that a robot could follow, at most
 
 
 def ceiling(results: Results) -> list[str]:
-    """One step of foresight, in the window if it was run there, else over all views; empty if it
-    was not run.
+    """Return the oracle of one step ahead, in the window or over all views.
+
+    It is empty if neither was run.
     """
     ran = set(results.tables.sweep["policy"])
     return [name for name in ("oracle-gain", "oracle-gain-all") if name in ran][:1]
 
 
 def compared(results: Results) -> list[str]:
-    """The policies of the curves: the reference, the most accurate others, the published oracle
-    and the ceiling.
+    """Return the policies of the curves.
+
+    They are the reference, the most accurate others, the published oracle and the upper bound.
     """
     names = list(results.tables.sweep["policy"].unique())
     reference = results.settings["reference"]
@@ -254,9 +256,7 @@ def reliability_diagram(results: Results, policies: Sequence[str], threshold: fl
 
 
 def _reliability(curves: dict[str, tuple[pd.DataFrame, dict]], when: str, title: str) -> Figure:
-    """Share of right answers against confidence, a bin a row, with dots as large as its answers
-    are many.
-    """
+    """Draw accuracy against confidence; the size of a dot is its number of answers."""
     figure, axes = new_figure(4.6, 3.9)
     axes.plot([0, 1], [0, 1], color=INK, linewidth=0.9)
     axes.set(
@@ -300,9 +300,7 @@ def evaluated_confusion(e: Evaluation, n_views: int, classes: Sequence[str]) -> 
 
 
 def fusion_curve(e: Evaluation) -> Figure:
-    """Accuracy, with 95 % intervals, and mean confidence against the number of random views
-    fused.
-    """
+    """Draw accuracy, with intervals, and confidence against the number of fused views."""
     figure, axes = new_figure(4.6, 3.5)
     table = e.fusion
     axes.fill_between(
@@ -344,8 +342,9 @@ def fusion_curve(e: Evaluation) -> Figure:
 
 
 def evaluated_reliability(e: Evaluation) -> Figure:
-    """Reliability after one view and more, in random order; bins of fewer than 20 answers are
-    left out.
+    """Draw the reliability after one view and more, in random order.
+
+    Bins of fewer than 20 answers are left out.
     """
     errors = e.fusion.set_index("n_views")["calibration_error"]
     curves = {}

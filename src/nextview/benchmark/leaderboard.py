@@ -1,6 +1,4 @@
-"""Who leads under one threshold, which differences can be told from chance, and when there are
-too few objects.
-"""
+"""Leaderboard at one threshold, significant differences, and too few objects."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -49,9 +47,7 @@ def leaderboard(tables: Tables, threshold: float) -> list[Any]:
 
 
 def promised_risks(tables: Tables) -> list[Any]:
-    """The rows of ``Tables.risks``, and broken: whether more were wrong than was promised,
-    beyond chance.
-    """
+    """Return the rows of ``Tables.risks``, and whether a guarantee is broken beyond chance."""
     return list(
         tables.risks.assign(broken=tables.risks["low"] > tables.risks["risk"]).itertuples(
             index=False

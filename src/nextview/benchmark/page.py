@@ -1,6 +1,4 @@
-"""The pages of a benchmark and of an evaluation: numbers as they are written, and the templates
-that take them.
-"""
+"""Pages of a benchmark and of an evaluation: formatted numbers and templates."""
 
 import base64
 from collections.abc import Mapping

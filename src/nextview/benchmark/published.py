@@ -1,6 +1,4 @@
-"""The numbers of the thesis "Multi-View 3D Object Recognition: Selecting the Best Sequences of
-Views", beside ours.
-"""
+"""Published numbers of "Multi-View 3D Object Recognition: Selecting the Best Sequences"."""
 
 import csv
 from functools import cache
@@ -50,16 +48,12 @@ def published_classes(classes: tuple[str, ...]) -> int | None:
 
 
 def comparable_classes(p: Predictions) -> tuple[str, ...]:
-    """The classes by which published numbers are found; none for scenes: those published are of
-    single objects.
-    """
+    """Return the classes by which published numbers are found; none for scenes."""
     return () if any(map(clutter_level, p.names)) else p.classes
 
 
 def published_threshold(policy: str) -> float | None:
-    """The threshold of the published numbers of a policy (table 5); None if there are none or
-    none is needed.
-    """
+    """Return the published threshold of a policy (table 5); None if there is none."""
     return (
         read_table("table5_nbv_modelnet10")["threshold"][COLUMNS[policy]]
         if policy in COLUMNS

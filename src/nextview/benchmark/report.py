@@ -202,8 +202,9 @@ def _figures(results: Results, best: str, at: float) -> dict[str, Figure]:
 
 
 def _thresholds(results: Results, at: float) -> dict[str, float]:
-    """Policies by class (tables 8 to 11), each at its published threshold; for scenes nothing is
-    published.
+    """Return policies by class at their published thresholds (tables 8 to 11).
+
+    For scenes nothing is published.
     """
     if not results.tables.levels.empty:
         return {name: at for name in draw.compared(results) if not is_oracle(name)}
@@ -281,9 +282,7 @@ def pictures_of(
 
 
 def _images(store: ViewStore, name: str, views: list[int]) -> dict[str, str]:
-    """Images of some views of an object, as data URIs; in a scene the target is told from all
-    else by its colour.
-    """
+    """Return images of views as data URIs; in scenes the target has a colour of its own."""
     row = store.names.index(name)
     images: NDArray = store.image(row)
     if store.attributes.scene:

@@ -99,8 +99,7 @@ def run_benchmark(
     overwrite: bool = False,
     track: Track = silently,
 ) -> Results:
-    """Run every policy under every threshold from the same first views, and say which are better
-    than the reference.
+    """Run all policies at all thresholds from the same first views, and compare them.
 
     Episodes, tables and tests are written; nextview report makes a page of them. Why a policy
     failed stands in the settings of the results.

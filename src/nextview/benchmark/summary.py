@@ -43,8 +43,9 @@ LEVEL_COLUMNS += ["difference_low", "difference_high", "p"]
 
 @dataclass(frozen=True)
 class Tables:
-    """The results as long tables; intervals are 95 % bootstrap intervals over objects, ``low``
-    to ``high``.
+    """The results of a benchmark, as long tables.
+
+    Intervals are 95 % bootstrap intervals over objects, ``low`` to ``high``.
 
     Attributes:
         summary: a row a policy, threshold and measure: ``accuracy``; ``clean_accuracy``, without
@@ -137,9 +138,7 @@ def _measures(grid: Grid, ends: Outcome) -> dict[str, tuple[Float, Float]]:
 def _columns(
     grid: Grid, cells: list[Cell], names: tuple[str, ...] | None = None
 ) -> tuple[list, Float, Float]:
-    """The measures of all cells side by side: (policy, threshold, measure), tops (N, M), bottoms
-    (N, M).
-    """
+    """Return the measures of all cells: their keys, numerators and denominators, (N, M)."""
     found = {
         (policy, threshold, measure): sums
         for policy, threshold, ends in cells
@@ -358,9 +357,7 @@ def by_level(grid: Grid, reference: str, samples: int, rng: np.random.Generator)
 
 
 def _after(values: NDArray, views: NDArray[np.int64], counts: list[int]) -> NDArray:
-    """Values after so many views, or after the last one where an episode ended before, (E,
-    counts).
-    """
+    """Return values after numbers of views, or at the end of shorter episodes, (E, counts)."""
     return values[
         np.arange(len(values))[:, None], np.minimum((views >= 0).sum(1)[:, None], counts) - 1
     ]

@@ -1,6 +1,4 @@
-"""What no model predicts: true measures and maps of every view, and plans, from predictions and
-their view store.
-"""
+"""True measures, true maps and planned paths, from predictions and their view store."""
 
 from collections.abc import Callable
 

@@ -1,5 +1,4 @@
-"""Policies after fixed numbers of views: nobody stops early, and each view and each cell of travel
-is counted.
+"""Compare policies after fixed numbers of views.
 
 A policy chooses without knowing how many views there will be, so it is run once and its path cut
 after each number.

@@ -1,6 +1,4 @@
-"""Call a function with the arguments of a command line: tyro reads its parameters, their
-comments and its docstring.
-"""
+"""Call a function with the arguments of a command line, using its signature and docstring."""
 
 import inspect
 import re

@@ -1,6 +1,4 @@
-"""The commands of ``nextview``: a table from each name to the function that it calls, which is
-imported when called.
-"""
+"""The table of commands: the function of each, which is imported when it is called."""
 
 from dataclasses import dataclass
 

@@ -1,6 +1,4 @@
-"""How a command ends, whatever happens: a mistake of the user's in one sentence, a bug with its
-traceback.
-"""
+"""How a command ends: a user's error in one sentence, a bug with its traceback."""
 
 import io
 import os
@@ -57,9 +55,7 @@ def orderly_end(after_ctrl_c: str) -> Iterator[None]:
 
 
 def _print_anything() -> None:
-    """Print what an output of another encoding than UTF-8 lacks as codes: ASCII has no degrees,
-    cp1252 no Chinese.
-    """
+    """Print characters that the encoding of an output lacks as codes."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")

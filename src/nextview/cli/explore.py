@@ -1,6 +1,4 @@
-"""``nextview explore``: an object, the views of it and what policies value them at, in the
-browser.
-"""
+"""``nextview explore``: an object, its views and their values, in the browser."""
 
 import os
 import sys
@@ -26,8 +24,7 @@ def explore(
     port: int = 8080,
     browser: bool = True,
 ) -> None:
-    """Look at objects in the browser: click where to look from, or let a policy walk, and see what
-    it believes.
+    """Explore objects in the browser: click the views to take, or let a policy walk.
 
     Candidate views are coloured by what the policy values them at. Images, local maps and belief
     follow at once. Two policies walk side by side, with clean renders or through a sensor with its

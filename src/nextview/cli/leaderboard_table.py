@@ -25,9 +25,7 @@ def print_results(found: Results) -> None:
 
 
 def print_leaderboard(results: Results) -> None:
-    """Print the policies under the headline threshold, what may be concluded from them, and what
-    was promised.
-    """
+    """Print the policies at the headline threshold, and what follows from them."""
     tables = results.tables
     reference = results.settings["reference"]
     console = Terminal()

@@ -1,6 +1,4 @@
-"""``nextview list`` and ``nextview download``: what ships with the package, and published
-datasets.
-"""
+"""``nextview list`` and ``nextview download``: bundled models, and published datasets."""
 
 from functools import partial
 from pathlib import Path

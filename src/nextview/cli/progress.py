@@ -15,9 +15,7 @@ EVERY = 30.0  # seconds between two lines where the output is no terminal
 
 
 class Terminal(Console):
-    """Prints text as it is: brackets and colons in names are no markup, and control characters
-    are shown, not sent.
-    """
+    """Prints text literally: no markup, and control characters are escaped."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, **options)

@@ -1,6 +1,4 @@
-"""``nextview scenes`` draws cluttered scenes; ``capture`` writes depth images as a camera would
-take them.
-"""
+"""``nextview scenes`` draws cluttered scenes; ``capture`` writes depth images of a mesh."""
 
 from pathlib import Path
 from typing import Literal
@@ -30,8 +28,7 @@ def scenes(
     seed: int = 0,
     workers: Workers = Workers(),
 ) -> None:
-    """Draw cluttered scenes: a target on a table among other objects, boxes and walls that hide
-    parts of it; or rooms.
+    """Draw cluttered scenes around targets on a table, or rooms.
 
     Each scene is a small JSON file that names meshes and says where they stand; the same seed draws
     the same files. Resumes where it was. Objects of one split stand only among objects of that
@@ -105,8 +102,7 @@ def capture(
     largest_part: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Write captured views of a mesh: depth images, poses, intrinsics, as ``nextview recognise
-    FOLDER`` reads them.
+    """Write depth images, poses and intrinsics of a mesh, for ``nextview recognise FOLDER``.
 
     Args:
         mesh: OFF, OBJ, PLY, STL or GLB file of one object that stands upright.

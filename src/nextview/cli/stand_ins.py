@@ -1,5 +1,4 @@
-"""The help of a command whose packages are not installed: its module is imported with stand-ins for
-them.
+"""Import modules whose packages are missing with stand-ins, for the help of a command.
 
 A command's help is made from the parameters of its function, and the module of that function
 imports torch or pandas. As Sphinx does for its pages (``autodoc_mock_imports``), what is missing is
@@ -49,9 +48,7 @@ def _stand_in(name: str) -> type:
 
 
 class _Finder(MetaPathFinder, Loader):
-    """Finds packages that are missing; it stands behind all others, so that what is installed is
-    taken.
-    """
+    """Finds missing packages; it comes last, so that installed ones are used."""
 
     def __init__(self, missing: Iterable[str]) -> None:
         self.missing = frozenset(missing)
@@ -82,9 +79,7 @@ class _Finder(MetaPathFinder, Loader):
 
 @contextmanager
 def stand_ins() -> Iterator[None]:
-    """Import with stand-ins for what is missing of all extras; only for a process that ends
-    afterwards.
-    """
+    """Import with stand-ins for missing extras; only for a process that ends afterwards."""
     named = {package for packages in EXTRAS.values() for package in packages}
     finder = import_stand_ins(package for package in named if find_spec(package) is None)
     try:
@@ -94,9 +89,7 @@ def stand_ins() -> Iterator[None]:
 
 
 def import_stand_ins(missing: Iterable[str]) -> MetaPathFinder:
-    """From now on, import stand-ins for packages that are missing; only for a process that ends
-    with its help.
-    """
+    """Install stand-ins for missing packages; only for a process that prints its help."""
     finder = _Finder(missing)
     sys.meta_path.append(finder)
     return finder

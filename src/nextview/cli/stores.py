@@ -42,8 +42,9 @@ def render(
     workers: Workers = Workers(),
     overwrite: bool = False,
 ) -> None:
-    """Render a dataset folder (CLASS/SPLIT/MESH, SPLIT/CLASS/MESH or CLASS/MESH) into a view store;
-    resumes.
+    """Render the meshes or scenes of a dataset folder into a view store; resumes.
+
+    The folder is CLASS/SPLIT/MESH, SPLIT/CLASS/MESH or CLASS/MESH.
 
     A folder of scenes (nextview scenes) makes a store too: of what shows of each target, and of the
     scene around it.

@@ -15,9 +15,7 @@ LONGEST = 200  # letters of what a server says of itself
 
 @dataclass(frozen=True)
 class Archive:
-    """A published zip file: where it is, its SHA-256, and the only folder in it that is
-    unpacked.
-    """
+    """A published zip file: its address, its SHA-256, and the folder to unpack."""
 
     url: str
     sha256: str

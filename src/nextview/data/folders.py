@@ -309,9 +309,7 @@ class _Content:
     folders: list[Path] = field(default_factory=list)
 
     def without_objects(self, kind: str) -> list[tuple[Path, str]]:
-        """The files that are no objects, and, instead of all that is in them, the folders that
-        hold none.
-        """
+        """Return files that are no objects, and folders without any object as a whole."""
         told = [*self.files, *(place for place, _ in self.left_out)]
         worth_entering = {Path(), *(folder for place in told for folder in place.parents)}
         found: dict[Path, str] = {}
@@ -324,9 +322,7 @@ class _Content:
 
 
 def _walk(root: Path, suffixes: tuple[str, ...], skip: Mapping[Path, str]) -> _Content:
-    """All that lies below a folder; each folder once, also where links lead to it twice or in a
-    circle.
-    """
+    """List all that lies below a folder, each folder once even if links lead there again."""
     content = _Content()
     unreadable: list[OSError] = []
     top = _real(root)
@@ -408,8 +404,9 @@ def _best_files(files: list[Path]) -> tuple[dict[Path, Path], list[tuple[Path, s
 
 
 def _model_of(place: Path) -> Path:
-    """What the files of one model have in common: the path without a suffix; in a YCB download,
-    the object's folder.
+    """Return what the files of one model have in common.
+
+    It is the path without suffix; in a YCB download, the folder of the object.
     """
     return place.parent.parent if place.parent.name in YCB_SCANS else place.with_suffix("")
 
@@ -460,9 +457,7 @@ def _entry(root: Path, model: Path, path: Path, split_first: bool, own_class: bo
 
 
 def _uniquely_named(found: Mapping[Path, Entry]) -> list[Entry]:
-    """Entries, by their models' places, with unique names: their file's, or as much of the path
-    as it takes.
-    """
+    """Name entries by their file, or by as much of the path as makes them unique."""
 
     # CLASS/ID/models/MESH: ID, models, MESH
     def below(model: Path, entry: Entry) -> tuple[str, ...]:

@@ -1,6 +1,4 @@
-"""View measures: what they are handed, users' own by import path, and their values of a whole
-store; resumable.
-"""
+"""View measures: their input, your own by import path, and their values for a store."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
@@ -52,9 +50,7 @@ class MeasuredView:
 
     @cached_property
     def near(self) -> NDArray[np.floating]:
-        """The depth in the box, (H', W'): most of an image is background, and so most of the
-        work is saved.
-        """
+        """The depth in the bounding box, (H', W'), which saves work on the background."""
         return self.depth[self.box]
 
     @cached_property
@@ -74,9 +70,7 @@ Views = Callable[[ViewStore, int], Iterator[MeasuredView]]
 
 @dataclass(frozen=True)
 class Measure:
-    """A function of a view, of its depth alone or of the mesh too; good views have high or low
-    values of it.
-    """
+    """A function of a view, with the input that it needs and which values are good."""
 
     function: Callable[[MeasuredView], float]
     needs: Literal["depth", "mesh"] = "depth"
@@ -102,8 +96,9 @@ def all_measures() -> dict[str, Measure]:
 
 
 def find_measure(name: str) -> Measure:
-    """A measure by name: one of ``all_measures``, or "MODULE:FUNCTION" for a function or a
-    ``Measure`` of your own.
+    """Return a measure by its name or as "MODULE:FUNCTION".
+
+    The latter is a function or a ``Measure`` of your own.
     """
     if name in MEASURES:
         return MEASURES[name]
@@ -149,8 +144,9 @@ def names_of(names: Sequence[str], meshes: bool) -> tuple[str, ...]:
 
 
 def depth_entropy(depth: NDArray[np.floating]) -> float:
-    """Shannon entropy, bits, of the values in a depth image (H, W), object radii, 0 where there
-    is no object.
+    """Return the Shannon entropy, bits, of the values of a depth image.
+
+    The image is (H, W), object radii, 0 where there is no object.
     """
     depth = object_depth(depth_image(depth).astype(np.float64, copy=False))
     seen = depth[depth > 0]
@@ -161,8 +157,9 @@ def depth_entropy(depth: NDArray[np.floating]) -> float:
 
 
 def normalise_per_object(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Scale (..., V) over an object's views to [0, 1] float32; all 0 where the views do not
-    differ.
+    """Scale values, (..., V), to [0, 1] over each object's views, float32.
+
+    They are all 0 where the views do not differ.
     """
     values = np.asarray(values)
     low = values.min(-1, keepdims=True)

@@ -1,6 +1,4 @@
-"""Every score, once: accuracy and its mean over classes, calibration error, and how well maps
-are predicted.
-"""
+"""Accuracy, calibration error, and the errors of predicted maps."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,6 +1,4 @@
-"""Run one function on many items: on this machine's cores, or on a cluster through
-dask.distributed.
-"""
+"""Run a function on many items, on all cores or on a dask.distributed cluster."""
 
 import multiprocessing
 import os
@@ -31,8 +29,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class WorkerDied:
-    """The process that worked on an item was killed, or crashed, again when it worked on that item
-    alone.
+    """The process that worked on an item was killed or crashed twice.
 
     Attributes:
         reason: What happened, in words. ``str`` gives it, too.
@@ -189,9 +186,7 @@ class _OwnMainContext(SpawnContext):
 
 
 def _begin_worker() -> None:
-    """Use one core, end at once and silently with Ctrl-C, and end with the parent: a worker
-    would wait for ever.
-    """
+    """Prepare a worker: one core, a silent end with Ctrl-C and with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     threadpool_limits(1, "blas")
     parent = multiprocessing.parent_process()

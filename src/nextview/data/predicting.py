@@ -133,16 +133,15 @@ def _card_file(card: ModelCard) -> Path:
 def _open(
     store: Path, recogniser: Path, maps: Files
 ) -> tuple[ViewStore, NetworkRecogniser, dict[str, MapNetwork]]:
-    """Each process has its own store and networks, and one thread: objects are what runs side by
-    side.
-    """
+    """Open store and networks in a process, with one thread each."""
     networks = {name: MapNetwork(card, threads=1) for name, card in maps}
     return ViewStore.open(store), open_recogniser(recogniser, threads=1), networks
 
 
 def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> None:
-    """Write maps, azimuth bins and logits of all views of one object, whole or not at all; zeros
-    if nothing is seen.
+    """Write the outputs for all views of an object, complete or not at all.
+
+    They are zero where nothing is seen.
     """
     (i, file), (store, recogniser, maps) = item, _open(*files)
     specs = {recogniser.card.input} | {network.card.input for network in maps.values()}
@@ -172,9 +171,7 @@ def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> 
 
 
 def _together(files: Sequence[Path]) -> dict[str, NDArray[np.float32]]:
-    """The arrays of all objects, (N, ...), from one file for each: "logits", "azimuth_bins" and
-    "map/NAME".
-    """
+    """Join the arrays of all objects, (N, ...), from one file for each."""
     objects = []
     for file in files:
         try:

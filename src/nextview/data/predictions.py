@@ -127,15 +127,17 @@ class Predictions:
 
     @cached_property
     def log_evidence(self) -> NDArray[np.float32]:
-        """What the recogniser says of each view, so that views can be summed, (N, V, D); see
-        ``log_evidence_of``.
+        """Log-evidence of each view, (N, V, D), which can be summed over views.
+
+        See ``log_evidence_of``.
         """
         return log_evidence_of(self.logits, self.azimuth_bins, self.sphere.azimuth)
 
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
-        """Whether enough of the object shows in each view to say anything of it, (N, V): else
-        all classes are alike.
+        """Whether enough of the object is visible in each view, (N, V).
+
+        In all other views the classes are alike.
         """
         seen = np.ptp(self.by_shape().logits, axis=2) > (SAME if len(self.classes) > 1 else -1)
         return (
@@ -182,9 +184,7 @@ class Predictions:
         return self.of_objects(np.flatnonzero(kept))
 
     def deduplicate(self) -> "Predictions":
-        """One object of each shape and label: without the copies that look the same from every
-        view.
-        """
+        """Return one object of each shape and label."""
         return self.of_objects(deduplicated(self.labels, self.depth_entropy))
 
     def of_objects(self, kept: NDArray[np.int64]) -> "Predictions":
@@ -195,9 +195,7 @@ class Predictions:
 
     @classmethod
     def joined(cls, parts: Sequence["Predictions"]) -> "Predictions":
-        """All objects of predictions by the same models, one after the other: in part K their
-        names end in #K.
-        """
+        """Join predictions by the same models; names of part K end in #K."""
         found = [part._arrays() for part in parts]
         arrays: dict[str, Any] = {
             name: np.concatenate([own[name] for own in found])
@@ -378,9 +376,7 @@ class Predictions:
 
 
 def _read(path: Path) -> dict[str, NDArray]:
-    """The arrays of a file by name, after the sizes that they announce were held against the
-    file's.
-    """
+    """Read the arrays of a file, once the sizes that they announce were checked."""
     with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
         members = file.zip.infolist()
         if sum(member.file_size for member in members) > PACKED * path.stat().st_size + SPARE:

@@ -301,9 +301,7 @@ def listing(dataset: Path, options: RenderOptions) -> Listing:
 
 
 def rotations(store: ViewStore) -> NDArray[np.float64]:
-    """By how much each object of a store was rotated about z when it was rendered, radians,
-    (N,).
-    """
+    """Return the rotation about z of each object of a store, radians, (N,)."""
     deform = Deform(store.attributes.stretch, store.attributes.rotated)
     return np.array([deform.draw(store.attributes.seed, name)[1] for name in store.names])
 
@@ -330,9 +328,7 @@ def _hash(path: Path) -> str:
 
 
 def _begin(path: Path, wanted: Attributes, overwrite: bool) -> ViewStore:
-    """The store as an earlier run left it, if that had the same meshes and settings, or a new
-    one.
-    """
+    """Open the store of an earlier run with the same settings, or create a new one."""
     if not path.exists():
         return ViewStore.create(path, wanted)
     if not (path / "zarr.json").exists():

@@ -381,8 +381,9 @@ def _standing(
     against: bool,
     rng: np.random.Generator,
 ) -> Standing | None:
-    """A mesh on the floor of a room, somewhere or with its back against a wall; None where it is
-    too large.
+    """Place a mesh on the floor of a room; None where it is too large.
+
+    It stands anywhere, or with its back against a wall.
     """
     wall = int(rng.integers(4))
     azimuth = np.pi / 2 * wall - back if against else rng.uniform(0, 2 * np.pi)
@@ -488,8 +489,9 @@ def _lying(
     taken: list[Float],
     rng: np.random.Generator,
 ) -> Standing | None:
-    """A mesh on a table, of a radius, an azimuth and a resting pose; None where it does not fit
-    between what lies there. Its footprint is added to those.
+    """Place a mesh on a table in a resting pose; None where it does not fit.
+
+    Its footprint is added to those of the other things.
     """
     radius, azimuth, rest = how
     rotation = IDENTITY if np.array_equal(rest, np.eye(3)) else tuple(rest.ravel().tolist())

@@ -74,9 +74,7 @@ MOST_SCENES = 100_000  # at each level, of each split
 
 @dataclass(frozen=True)
 class Task:
-    """One scene to draw: its target's mesh file (relative to the dataset), split, level of
-    clutter, name and file.
-    """
+    """A scene to draw: mesh file of its target, split, level of clutter, name and file."""
 
     target: str
     split: str
@@ -87,9 +85,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Meshes:
-    """The mesh files that may stand around a target: a folder, and paths below it, with forward
-    slashes, sorted.
-    """
+    """The mesh files that may stand around a target: a folder and sorted paths below it."""
 
     folder: Path
     files: tuple[str, ...]
@@ -259,9 +255,7 @@ def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) ->
 
 
 class _Hiding:
-    """What of a target shows from the 40 views, as rays from the cameras to the points of its
-    surface that they see.
-    """
+    """Rays from 40 cameras to the points of a target's surface that they see."""
 
     def __init__(self, mesh: Mesh) -> None:
         camera = SimulatedCamera(mesh, COARSE, GRID.distance)
@@ -316,9 +310,7 @@ def _layout(
     goal: float,
     rng: np.random.Generator,
 ) -> list[Thing] | None:
-    """Things around a target, of which they leave about so much to see; None if that does not
-    come about.
-    """
+    """Place things that hide a given share of a target; None if that does not work."""
     walls = int(rng.choice(3, p=WALLS[level]))
     middle = footprint(mesh.vertices)
     floor = float(mesh.vertices[:, 2].min())

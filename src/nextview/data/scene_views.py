@@ -151,9 +151,7 @@ def sight_of(scenes: "SceneSight | None", objects: NDArray[np.int64]) -> tuple[C
 
 
 def scenes_of(p: Predictions) -> "SceneSight | None":
-    """The scenes that predictions are of; None if they are of single objects, whose store need
-    not be there.
-    """
+    """Return the scenes of predictions; None if they are of single objects."""
     try:
         store = ViewStore.open(p.store) if p.store else None
     except DatasetError:
@@ -172,9 +170,7 @@ def scenes_of(p: Predictions) -> "SceneSight | None":
 
 @dataclass(frozen=True)
 class SceneSight:
-    """Of N scenes, ``rows`` of a store: where cameras can be, and what is expected to show after
-    some views.
-    """
+    """Reachable views and expected visibility in N scenes, ``rows`` of a store."""
 
     store: ViewStore
     rows: NDArray[np.int64]
@@ -234,9 +230,7 @@ class SceneSight:
         return np.stack([self._found[key] for key in keys]).astype(np.float64)
 
     def _frame(self, row: int, view: int, read: Callable[[int], SceneViews]) -> SeenScene:
-        """What the frame from one view says alone of what lies on a line of sight; kept packed,
-        a hundredth or so.
-        """
+        """Return what the frame from one view shows, kept packed."""
         if (row, view) not in self._frames:
             asked = sight_lines(GRID, self.store.sphere.poses[:, :3, 3].tobytes()).asked
             seen = SeenScene(Occupancy.unseen(GRID, asked)).seen(read(row).scene_view(view))

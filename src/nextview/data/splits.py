@@ -1,5 +1,6 @@
-"""Which objects train and which validate: by object, stratified by class, identical meshes
-together. And samples.
+"""Split objects into training and validation; draw samples.
+
+Splits are stratified by class, and copies of a mesh stay together.
 """
 
 from pathlib import Path
@@ -17,8 +18,9 @@ Floats = NDArray[np.floating]
 
 
 def duplicate_groups(measured: Floats) -> Indices:
-    """A number for each object, (N,), the same for those whose depth-entropies, (N, V), are:
-    copies of one mesh.
+    """Return a number for each object, (N,), that its copies share.
+
+    Copies have the same depth entropies, (N, V).
     """
     return np.unique(measured, axis=0, return_inverse=True)[1].ravel()
 

@@ -1,5 +1,6 @@
-"""The view store: every view of every object of a dataset, in one Zarr group, one chunk an
-object.
+"""The view store: every view of every object of a dataset, in one Zarr group.
+
+An object is one chunk of each array.
 """
 
 import re
@@ -48,9 +49,7 @@ Pixels = Annotated[int, Meta(ge=1, le=100_000)]
 
 
 class Attributes(msgspec.Struct, omit_defaults=True):
-    """The objects of a store, its views, and how it was rendered: through a ``sensor``, of a
-    ``scene`` (pixels).
-    """
+    """The objects and views of a store, and how it was rendered."""
 
     format: Literal[2]
     names: Annotated[list[Name], Meta(min_length=1)]
@@ -421,16 +420,15 @@ class ViewStore:
         return sorted(file.parent.name for file in self.path.glob("measures/*/zarr.json"))
 
     def measure(self, name: str = "depth_entropy") -> NDArray[np.float32]:
-        """A view measure of all objects, (N, V) float32; anything where an object is not
-        rendered.
+        """Return a measure of all views, (N, V) float32.
+
+        Values of objects that are not rendered are undefined.
         """
         return self.rows(f"measures/{name}")
 
 
 def opened(path: Path) -> ViewStore:
-    """A store to work on object by object: opened once for each process, and anew when its
-    attributes change.
-    """
+    """Open a store once in each process, and again when its attributes change."""
     about = (path / "zarr.json").stat()
     return _opened(path, about.st_ino, about.st_mtime_ns)
 

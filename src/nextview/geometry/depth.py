@@ -1,5 +1,6 @@
-"""Depth images in object radii, 0 where there is no object: their points, and how they look
-under a headlight.
+"""Depth images in object radii: their points, and their look under a headlight.
+
+A depth of 0 means that there is no object.
 """
 
 from functools import lru_cache
@@ -15,8 +16,9 @@ POINTS = 1024  # points in the partial cloud of one view (thesis, section 4.1.2)
 
 
 def object_depth(depth: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Depth with 0 where a sensor gives NaN, infinity, a negative or a huge number; itself if
-    there is none.
+    """Return the depth with 0 for NaN, infinity, negative and huge numbers.
+
+    If there are none, the array itself is returned.
     """
     if depth.min() >= 0 and depth.max() < FARTHEST:  # not so if there is a NaN
         return depth

@@ -1,6 +1,4 @@
-"""What a file holds that is not the mesh its name promises: a packed file, a web page, another
-format.
-"""
+"""Recognise files that are not meshes: packed files, web pages, other formats."""
 
 import re
 

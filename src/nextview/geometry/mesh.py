@@ -32,8 +32,10 @@ does.
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh in the object frame: z up, bounding-box centre at the origin, farthest vertex
-    at radius 1.
+    """A triangle mesh in the object frame.
+
+    In this frame z points up, the bounding-box centre is at the origin, and the farthest vertex has
+    radius 1.
 
     Attributes:
         vertices: (V, 3) float64, object radii.

@@ -167,9 +167,7 @@ def _coordinates(words: list[bytes], vertex: int) -> Iterator[float]:
 
 
 def _shape(positions: array, corners: array, sizes: array, max_faces: int) -> Shape:
-    """Vertices and triangles of coordinates, three after three, and of polygons, as
-    ``triangulate`` takes them.
-    """
+    """Return vertices and triangles from flat coordinates and polygons; see ``triangulate``."""
     vertices = np.array(positions).reshape(-1, 3)
     return vertices, triangulate(
         vertices, np.array(corners, np.int64), np.array(sizes, np.int64), max_faces
@@ -216,9 +214,7 @@ def _glb_parts(data: bytes) -> list[tuple[NDArray[np.float64], Any]]:
 
 
 def _check_glb(data: bytes) -> None:
-    """Hold what the JSON announces against the file's size, and refuse what trimesh would read
-    as another shape.
-    """
+    """Check what the JSON announces, and refuse what trimesh would misread."""
     if data[:4] != b"glTF" or int.from_bytes(data[8:12], "little") != len(data):
         raise MeshError("it does not begin with glTF, or is not as long as it announces")
     gltf = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])

@@ -1,5 +1,6 @@
-"""The parts of a mesh, and what is likely to be wrong with a scan: a table in it, pieces that
-float, a lost shape.
+"""The parts of a mesh, and the likely faults of a scan.
+
+The faults are a table in it, loose pieces, and a lost shape.
 """
 
 from dataclasses import dataclass
@@ -138,8 +139,7 @@ def keep_largest_part(
 
 
 def refuse_lost_shape(vertices: NDArray[np.float64], radius: float, name: str) -> None:
-    """Refuse an object that single precision, far from the origin, has rounded until its shape was
-    lost.
+    """Refuse an object far from the origin whose shape single precision has lost.
 
     Args:
         vertices: (V, 3), as they stand in the file.
@@ -198,8 +198,9 @@ def mesh_doubts(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> tu
 
 
 def _plane_times(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> float:
-    """How many times as large as the rest a mesh is because of one plane that reaches beyond it on
-    all sides.
+    """Return how many times a plane makes a mesh larger than the rest of it.
+
+    The plane has to reach beyond the rest on all sides.
 
     1 if there is no such plane, or nothing beside it.
     """

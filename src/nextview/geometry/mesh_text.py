@@ -42,8 +42,7 @@ def encoding_of(data: bytes) -> tuple[str, int]:
 
 
 def plain_text(data: bytes) -> bytes:
-    r"""A text file in an encoding of which ASCII is a part, without a byte-order mark, every line
-    ended by ``\n``.
+    r"""Decode a text file and end every line with a line feed.
 
     Args:
         data: the file's bytes, in UTF-8, UTF-16, UTF-32 or any eight-bit encoding.
@@ -68,8 +67,9 @@ def plain_text(data: bytes) -> bytes:
 
 
 def lines_of_words(text: bytes) -> Iterator[list[bytes]]:
-    """The words of each line that has any, without comments (#), one line at a time for the sake
-    of memory.
+    """Yield the words of each line that has any, without comments (#).
+
+    It goes line by line to save memory.
     """
     for line in io.BytesIO(text):
         words = line.partition(b"#")[0].split()

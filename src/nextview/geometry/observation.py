@@ -25,8 +25,9 @@ RIGID = 1e-3
 
 @dataclass(frozen=True)
 class SceneView:
-    """All that one frame shows, the object and what stands around it, in the object frame and
-    object radii.
+    """All that one frame shows, the object and its surroundings.
+
+    It is given in the object frame and object radii.
 
     Its pinhole and distance may be others than those of its observation. ObservationError: no
     images of one shape.
@@ -125,16 +126,15 @@ class Observation:
 
     @cached_property
     def points(self) -> NDArray[np.float32]:
-        """On the visible surface, (1024, 3) float32, object frame, object radii; all zero if
-        nothing is visible.
+        """Points on the visible surface, (1024, 3) float32, object frame, object radii.
+
+        They are all zero if nothing is visible.
         """
         return visible_points(self.depth, self.pose, self.intrinsics)
 
     @cached_property
     def picture(self) -> NDArray[np.uint8]:
-        """The image; where the camera has none, the depth as a headlight would show it. (H, W)
-        uint8.
-        """
+        """The image, (H, W) uint8; without one, the depth under a headlight."""
         return headlight(self.depth, self.intrinsics) if self.image is None else self.image
 
 
@@ -147,9 +147,7 @@ def _own(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def enough_shows(mask: NDArray[np.bool_]) -> bool:
-    """Whether the pixels that show the object, (H, W) bool, are enough to say anything of it:
-    see LEAST_SHARE.
-    """
+    """Return whether enough pixels show the object, (H, W) bool; see LEAST_SHARE."""
     least = max(LEAST_PIXELS, LEAST_SHARE * mask.size)
     n = np.count_nonzero(mask)
     if not least <= n < SPECKS * least:
@@ -174,8 +172,9 @@ class Camera(Protocol):
 
 
 def checked_pose(pose: Any) -> NDArray[np.float64]:
-    """A camera-to-world pose, (4, 4) float64, OpenCV axes, object radii; ObservationError if no
-    camera has it.
+    """Check a camera-to-world pose, (4, 4) float64, OpenCV axes, object radii.
+
+    ObservationError if no camera has it.
     """
     pose = numbers(pose, "the pose").astype(np.float64, copy=False)
     if pose.shape != (4, 4):

@@ -1,5 +1,4 @@
-"""Read PLY files: text and binary, triangles, polygons of any number of corners, and triangle
-strips.
+"""Read PLY files: text and binary, polygons of any size, and triangle strips.
 
 Trimesh does not read binary files in which the polygons have different numbers of corners, and
 takes strips for points; meshio does not read strips either. A text file is read as a binary one
@@ -137,9 +136,7 @@ def read_ply(
 
 
 def _check_rows(element: Element, there: NDArray[np.int64], wanted: NDArray[np.int64]) -> None:
-    """Refuse rows of a text that have more or fewer numbers than the header and their lists say;
-    in bytes, (rows,).
-    """
+    """Refuse rows with more or fewer numbers than the header announces."""
     wrong = np.flatnonzero(there != wanted)
     if len(wrong):
         row = int(wrong[0])
@@ -150,9 +147,7 @@ def _check_rows(element: Element, there: NDArray[np.int64], wanted: NDArray[np.i
 
 
 def _open(data: bytes) -> tuple[bool, list[Element], bytes]:
-    """Whether a file is text, its elements that have rows and columns, and the bytes after its
-    header.
-    """
+    """Return whether a file is text, its elements that have rows, and its body."""
     encoding, mark = encoding_of(data)
     data = data[mark:] if encoding == "utf-8" else plain_text(data)
     first = re.match(rb"ply[ \t]*(\r?\n|\r)", data)
@@ -234,8 +229,9 @@ def _bad_line(words: list[str]) -> MeshError:
 
 
 def _numbers_of_rows(body: bytes, rows: int) -> tuple[bytes, NDArray[np.int64]]:
-    """The numbers of a text file's rows, a line each, as doubles, and how many bytes of these
-    each row has, (rows,).
+    """Return the numbers of a text file's rows, and the bytes of each row, (rows,).
+
+    The numbers are doubles, a line for each row.
     """
     text = plain_text(body)
     characters = np.frombuffer(text, np.uint8)
@@ -256,8 +252,9 @@ def _numbers_of_rows(body: bytes, rows: int) -> tuple[bytes, NDArray[np.int64]]:
 def _read_element(
     data: bytes, at: int, element: Element
 ) -> tuple[Scalars, Lists, NDArray[np.int64]]:
-    """The columns of an element whose rows begin at a byte, and the bytes of each row: (rows,), or
-    () if all are equal.
+    """Read the columns of an element, and the bytes of each row.
+
+    These are (rows,), or () if all are equal.
 
     Args:
         data: the bytes that the rows stand in.
@@ -315,8 +312,9 @@ def _gathered(data: bytes, places: NDArray[np.int64], kind: np.dtype) -> NDArray
 def _table(
     data: bytes, at: int, element: Element, lengths: dict[str, int]
 ) -> tuple[Scalars, Lists, NDArray[np.int64]] | None:
-    """As ``_read_element``, at full speed, where all lists of a column have one length; None
-    where they have not.
+    """Read an element whose lists of a column all have one length; None if they do not.
+
+    This is ``_read_element`` at full speed.
     """
     width = sum(column.kind.itemsize * lengths.get(column.name, 1) for column in element.properties)
     width += sum(column.count.itemsize for column in element.lists if column.count is not None)
@@ -346,9 +344,7 @@ def _table(
 def _walk(
     data: bytes, at: int, element: Element, rows: int
 ) -> tuple[dict[str, NDArray[np.int64]], NDArray[np.int64]]:
-    """Where each list of some rows starts, in bytes, and its length, (rows, 2) by column; and
-    where each row ends.
-    """
+    """Return start and length of each list, (rows, 2) by column, and the end of each row."""
     steps = []
     skipped = 0
     for column in element.properties:
@@ -399,9 +395,7 @@ def _vertices(columns: Scalars) -> NDArray[np.float64]:
 
 
 def _corners(element: str, lists: dict[str, Lists]) -> Corners:
-    """The vertices that the rows of an element name, one row after the other, and how many each
-    row names.
-    """
+    """Return the vertices that the rows of an element name, and how many each names."""
     columns = lists.get(element, {})
     if not columns:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -419,9 +413,7 @@ def _corners(element: str, lists: dict[str, Lists]) -> Corners:
 
 
 def _strips(corners: NDArray[np.int64], sizes: NDArray[np.int64], max_faces: int) -> Corners:
-    """The triangles of strips: of each three vertices in a row, every second one wound the other
-    way.
-    """
+    """Return the triangles of strips, with every second one wound the other way."""
     check_faces(
         int(np.maximum(sizes - 2, 0).sum()) - 3 * int((corners == STRIP_END).sum()), max_faces
     )

@@ -64,9 +64,7 @@ def resting_poses(mesh: Mesh) -> NDArray[np.float64]:
 
 
 def _stable_poses(mesh: Mesh) -> tuple[Vectors, Vectors]:
-    """The directions that point up when the mesh lies on each stable face, (N, 3), and their
-    shares of throws, (N,).
-    """
+    """Return the up directions of all stable poses, (N, 3), and their shares of throws, (N,)."""
     from trimesh import Trimesh
     from trimesh.poses import compute_stable_poses
 
@@ -179,8 +177,9 @@ def _points_on(mesh: Mesh, count: int, rng: Generator) -> Vectors:
 
 
 def _best_rotation(points: Vectors, targets: Vectors) -> Vectors:
-    """The rotation, (3, 3), that brings centred points, (N, 3), nearest to as many targets
-    (Kabsch, 1976).
+    """Return the rotation, (3, 3), that maps points closest to targets (Kabsch, 1976).
+
+    Both are centred, (N, 3).
     """
     left, _, right = np.linalg.svd(points.T @ targets)
     no_mirror = np.diag([1.0, 1.0, np.linalg.det(left @ right)])

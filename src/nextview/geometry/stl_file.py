@@ -58,9 +58,7 @@ def read_stl(
 
 
 def _begins_as_text(data: bytes) -> bool:
-    """Whether a file begins with the word solid, in any encoding, and without the zeros of a
-    binary header.
-    """
+    """Return whether a file begins with the word solid and is not binary."""
     encoding, mark = encoding_of(data)
     head = data[mark : mark + 4 * HEADER_BYTES].decode(encoding, "replace")[:HEADER_BYTES]
     return head.lstrip()[:5].lower() == "solid" and "\0" not in head

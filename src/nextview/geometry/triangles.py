@@ -122,8 +122,9 @@ def triangulate(
 
 
 def _polygons_by_size(sizes: NDArray[np.int64]) -> list[tuple[int, NDArray[np.int64]]]:
-    """Polygons with one number of corners, three or more, and their indices; many of them are in
-    several groups.
+    """Yield the polygons of each number of corners, three or more, and their indices.
+
+    Very many polygons are split into several groups.
     """
     order = np.argsort(sizes, kind="stable")
     bounds = np.flatnonzero(np.diff(sizes[order])) + 1
@@ -156,9 +157,7 @@ def _fan_is_right(points: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _clip_ears(points: NDArray[np.float64]) -> NDArray[np.int64] | None:
-    """Triangles of one polygon, (K, 3), as indices of its corners, (T, 3); None if it has no
-    area to be cut.
-    """
+    """Cut a polygon, (K, 3), into triangles, (T, 3) corner indices; None without area."""
     from mapbox_earcut import triangulate_float64
 
     with np.errstate(over="ignore", invalid="ignore"):

@@ -1,5 +1,4 @@
-"""Candidate viewpoints around an object: where they are, which are neighbours, what it costs to
-move.
+"""Candidate viewpoints around an object, their neighbours, and the cost of moving.
 
 The world is z up, the object sits at the origin inside the unit sphere, and every viewpoint looks
 at the origin. On a ``ViewSphere`` they lie on rings of equal elevation, evenly spaced in azimuth;
@@ -132,8 +131,7 @@ def azimuth_of(directions: Float) -> Float:
 
 
 def direction_of(pose: Float) -> Float:
-    """Unit vector from the origin towards a camera, (3,); pose camera-to-world, (4, 4), object
-    frame.
+    """Return the unit vector, (3,), from the origin to a camera-to-world pose, (4, 4).
 
     Straight above the origin the azimuth is that from which a level camera would see the same
     picture.
@@ -188,9 +186,7 @@ class Viewpoints:
         return _fixed(self.travel_between(self.directions[:, None], self.directions[None, :]))
 
     def cells(self, directions: Float) -> tuple[Float, Float]:
-        """Where directions, (..., 3), lie on the grid whose cells travel is counted in: row and
-        column, (...) each.
-        """
+        """Return row and column of directions, (..., 3), on the grid that travel is counted in."""
         return elevation_of(directions) / CELL[0], azimuth_of(directions) / CELL[1]
 
     def travel_between(self, a: Float, b: Float) -> Float:
@@ -246,8 +242,9 @@ class Directions(Viewpoints):
 
     @classmethod
     def fibonacci(cls, n: int) -> "Directions":
-        """n views spread evenly over the upper half (Fibonacci lattice; Swinbank and Purser,
-        QJRMS 132, 2006).
+        """Spread n views evenly over the upper hemisphere.
+
+        They lie on a Fibonacci lattice (Swinbank and Purser, QJRMS 132, 2006).
         """
         whole(n, "the number of viewpoints", 1, MOST)
         height = (np.arange(n) + 0.5) / n
@@ -286,8 +283,9 @@ class ViewSphere(Viewpoints):
 
     @classmethod
     def named(cls, name: str) -> "ViewSphere":
-        """The thesis's layouts: "40" (5 rings of 8, section 4.1.1) and "12" (one ring at 45
-        degrees).
+        """Return a layout of the thesis: "40" (5 rings of 8) or "12" (one ring at 45 degrees).
+
+        See section 4.1.1.
         """
         if name not in LAYOUTS:
             raise UsageError(
@@ -342,24 +340,27 @@ class ViewSphere(Viewpoints):
 
     @cached_property
     def windows(self) -> Index:
-        """Views around each view: all rings x azimuth -1, 0, +1 with wrap-around, shape (V,
-        rings, 3), int64.
+        """The local window of each view, (V, rings, 3) int64.
+
+        It holds all rings at azimuth -1, 0 and +1, with wrap-around.
         """
         columns = (self.azimuth_index[:, None] + np.array([-1, 0, 1])) % self.azimuths
         return _fixed(np.arange(self.rings)[None, :, None] * self.azimuths + columns[:, None, :])
 
     @cached_property
     def travel(self) -> Float:
-        """Distance between views in grid cells (Euclidean over ring and azimuth, table 9), shape
-        (V, V), float64.
+        """Distance between views in grid cells, (V, V) float64.
+
+        It is Euclidean over ring and azimuth (table 9).
         """
         rings = self.ring[:, None] - self.ring[None, :]
         steps = np.abs(self.azimuth_index[:, None] - self.azimuth_index[None, :])
         return _fixed(np.hypot(rings, np.minimum(steps, self.azimuths - steps)))
 
     def cells(self, directions: Float) -> tuple[Float, Float]:
-        """Ring and azimuth step at which directions lie, between those of the views; beyond the
-        last ring, at it.
+        """Return the ring and azimuth step of directions, with fractions.
+
+        Beyond the last ring it is that ring.
         """
         order = np.argsort(self.elevations, kind="stable")
         rings = np.interp(elevation_of(directions), np.radians(self.elevations)[order], order)

@@ -101,8 +101,10 @@ class Policy(Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of maps that it wants in the evidence, "azimuth_bins", "joint", "observations",
-        "outlook", "visibility".
+        """Names of what the policy needs.
+
+        These are maps in the evidence, "azimuth_bins", "joint", "observations", "outlook" and
+        "visibility".
         """
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -122,25 +124,19 @@ class ValuesViews(Protocol):
     """A policy that can show what it decides by. Optional: nothing but pictures depends on it."""
 
     def view_values(self, state: EpisodeState) -> Float:
-        """What each candidate view is valued at, (B, V) float64; NaN for those that are not
-        considered.
-        """
+        """Return the value of each candidate view, (B, V) float64; NaN if not considered."""
 
 
 @runtime_checkable
 class ScoresViews(Protocol):
-    """A policy on a grid that goes to the free view with the best score less weighted travel;
-    see ``off_grid``.
-    """
+    """A policy on a grid that maximises the score less weighted travel; see ``off_grid``."""
 
     @property
     def travel_weight(self) -> float:
         """Of a grid cell of travel."""
 
     def scores(self, state: EpisodeState) -> Float:
-        """The score of each view before travel counts, (B, V) float64; NaN for those that are
-        not considered.
-        """
+        """Return the score of each view without travel, (B, V) float64; NaN if not considered."""
 
 
 def travel_from(sphere: Viewpoints, state: EpisodeState) -> Float:

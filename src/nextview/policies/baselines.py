@@ -1,5 +1,4 @@
-"""Policies that ask no network: by where the camera has been, by what shows, and views that were
-settled beforehand.
+"""Policies without networks: by the path so far, by visibility, and fixed views.
 
 The thesis's baselines (section 5.3, figure 11) are ``Random``, ``Furthest`` and ``Unidirectional``.
 """
@@ -54,9 +53,7 @@ class Random(Baseline):
 
 
 class RandomAll(Baseline):
-    """Any unvisited view of the whole sphere, with equal chance: the far views that a local
-    window rules out.
-    """
+    """Any unvisited view of the whole sphere, with equal probability."""
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """Draw any free view.
@@ -72,9 +69,7 @@ class RandomAll(Baseline):
 
 
 class Furthest(Baseline):
-    """The unvisited view of the local window with the largest grid distance; equal ones with
-    equal chance.
-    """
+    """The unvisited view of the local window with the largest travel; ties are drawn."""
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """Choose the view of the local window with the longest travel; ties are drawn.
@@ -119,9 +114,7 @@ class Unidirectional(Baseline):
 
 @dataclass(frozen=True)
 class Spread:
-    """The unvisited view farthest on the sphere from all visited ones; equal ones with equal
-    chance.
-    """
+    """The unvisited view farthest from all visited ones; ties are drawn."""
 
     sphere: Viewpoints
     scope: Scope = "global"
@@ -147,8 +140,9 @@ class Spread:
 
 @dataclass(frozen=True)
 class Visibility:
-    """The free view from which most of the object should show, less the weighted travel; equal
-    ones by chance.
+    """The free view with the highest expected visible share, less weighted travel.
+
+    Ties are drawn.
     """
 
     sphere: Viewpoints

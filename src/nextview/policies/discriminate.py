@@ -1,6 +1,4 @@
-"""The policy that tells taught things apart: it looks where the things that are believed most
-look least alike.
-"""
+"""The policy for taught things: it looks where the most likely ones look least alike."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,8 +19,7 @@ LEADING = 24
 
 @dataclass(frozen=True)
 class Rivals:
-    """The two classes believed most, and the remembered view of each that is nearest to each of
-    V candidate views.
+    """The two most likely classes, and their remembered views from V candidates.
 
     Attributes:
         classes: that believed most first, (2,).
@@ -119,8 +116,9 @@ class Discriminate:
         return np.stack(worth) - self.travel_weight * travel_from(self.viewpoints, state)
 
     def _worth(self, joint: Float, here: float) -> Float:
-        """Expected log-belief in the true class after each view, (V,), from the belief (H,
-        azimuths) seen from here.
+        """Return the expected log-belief in the true class after each view, (V,).
+
+        The belief is (H, azimuths), seen from here.
         """
         flat = joint.ravel()
         leading = (
@@ -144,9 +142,7 @@ class Discriminate:
     def _remembered(
         self, azimuth: NDArray[np.int64], here: float
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Ring (V,) and azimuth bin (n, V) of the remembered views nearest to each view, by the
-        bins seen from here.
-        """
+        """Return ring, (V,), and azimuth bin, (n, V), of the nearest remembered views."""
         ahead = np.rint((self.viewpoints.azimuth - here) / (2 * np.pi) * AZIMUTHS).astype(np.int64)
         ring = np.abs(np.degrees(self.viewpoints.elevation)[:, None] - RINGS).argmin(1)
         return ring, (azimuth[:, None] + ahead) % AZIMUTHS

@@ -1,5 +1,4 @@
-"""The policy that has learned what a view from each viewpoint brings, and weighs it against the
-travel there.
+"""The policy that predicts the value of each view and weighs it against the travel.
 
 It decides by numbers that do not depend on where the object's azimuth zero is. It knows the ring
 (from gravity), never the absolute azimuth: all views are written as cells (see
@@ -56,9 +55,7 @@ def maps_of(inputs: Sequence[str]) -> tuple[str, ...]:
 
 
 def ordered(inputs: Sequence[str]) -> tuple[str, ...]:
-    """Some inputs, each once, in the order of ``features``, whatever theirs: the maps stand
-    behind the place.
-    """
+    """Sort inputs in the order of ``features``, each once; maps follow the place."""
     *before, azimuth_bin = INPUTS
     return tuple(
         name for name in (*before, *maps_of(inputs), azimuth_bin, VISIBILITY) if name in inputs
@@ -90,9 +87,7 @@ def origin(sphere: ViewSphere, state: EpisodeState, frame: Frame) -> Index:
 
 
 def _bin_belief(sphere: ViewSphere, state: EpisodeState) -> Float:
-    """Belief in the azimuth bin that is seen from the current view, for each class, (B, C,
-    azimuths).
-    """
+    """Return the belief in the azimuth bin seen now, for each class, (B, C, azimuths)."""
     if state.azimuth_bins is None or state.azimuth_bins.shape[2] != sphere.azimuths:
         raise PolicyError(
             f"this policy needs a recogniser that discriminates {sphere.azimuths} azimuth bins"
@@ -199,8 +194,7 @@ def mirrored_features(
 
 @dataclass(frozen=True)
 class Gain:
-    """The unvisited view whose predicted value, less the travel weight of the way there, is
-    highest.
+    """The unvisited view with the highest predicted value less weighted travel.
 
     Small networks learn by replay of predictions what the belief in the true class becomes after
     each possible next
@@ -250,8 +244,9 @@ class Gain:
         return (*maps_of(self.inputs), *(name for name, taken in others.items() if taken))
 
     def gains(self, state: EpisodeState) -> Float:
-        """The predicted value of each view, (B, V) float64; only differences between views mean
-        anything.
+        """Return the predicted value of each view, (B, V) float64.
+
+        Only differences between views have a meaning.
         """
         cells = self.score(
             features(self.sphere, state, self.inputs, self.frame).astype(np.float32)
@@ -263,9 +258,7 @@ class Gain:
         )
 
     def view_values(self, state: EpisodeState) -> Float:
-        """Predicted gain of each view less the weighted travel there, (B, V); differences
-        between views count.
-        """
+        """Return the predicted value of each view less weighted travel, (B, V)."""
         return self.gains(state) - self.travel_weight * travel_from(self.sphere, state)
 
     def scores(self, state: EpisodeState) -> Float:

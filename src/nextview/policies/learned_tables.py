@@ -1,5 +1,4 @@
-"""Policies that follow a table learned from predictions. They know the ring (from gravity), never
-the object's azimuth.
+"""Policies with tables learned from predictions; they know the ring, not the azimuth.
 
 So a place is a *cell*: its ring, and how many azimuth steps it lies ahead of the camera, ``cell =
 ring * azimuths + steps``. What no table says is left to the view farthest from all visited.
@@ -31,8 +30,9 @@ def cells_to(sphere: ViewSphere) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class FixedSequence:
-    """The same moves for every object: a list of cells, each seen from the view before, for each
-    ring to start from.
+    """The same moves for every object: a list of cells for each first ring.
+
+    A cell is relative to the view before.
 
     Attributes:
         moves: cells, (rings, K).
@@ -122,8 +122,7 @@ class FixedRing:
 
 @dataclass(frozen=True)
 class ClassTable:
-    """The unvisited cell with the highest value for the class believed and the ring that the
-    camera is on.
+    """The unvisited cell with the highest value for the believed class and current ring.
 
     Attributes:
         values: by believed class, current ring and cell, (classes, rings, V).

@@ -11,8 +11,9 @@ from nextview.policies.base import EpisodeState, best_in_window, best_view, in_w
 
 
 def local_peaks(maps: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Cells of maps, (B, rows, columns), that no neighbour exceeds (3x3 maximum filter; nothing
-    beyond the border).
+    """Return the cells of maps, (B, rows, columns), that no neighbour exceeds.
+
+    Neighbours are 3x3, and there are none beyond the border.
     """
     # As SciPy's maximum_filter; recognising an object imports no SciPy, which keeps its start
     # short.
@@ -23,16 +24,15 @@ def local_peaks(maps: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 
 def peaks_first(maps: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Scores that put every local peak before every other cell, each group by value; same shape
-    as the maps.
-    """
+    """Return scores that put peaks before all other cells, each group by value."""
     maps = np.asarray(maps, np.float64)
     return maps + (np.ptp(maps, axis=(1, 2), keepdims=True) + 1.0) * local_peaks(maps)
 
 
 def sphere_peaks(values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The same of maps of the whole sphere, (B, rings, azimuths): the last azimuth is next to
-    the first.
+    """Return such scores for maps of the whole sphere, (B, rings, azimuths).
+
+    The last azimuth is next to the first.
     """
     values = np.asarray(values, np.float64)
     round_once = np.concatenate([values[..., -1:], values, values[..., :1]], 2)
@@ -44,8 +44,7 @@ def sphere_peaks(values: NDArray[np.floating]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class MapPeak:
-    """Go to the highest unvisited peak of a predicted map, or the deepest valley where the
-    belief says so.
+    """The highest unvisited peak of a predicted map, or its deepest valley.
 
     Attributes:
         map_name: in the evidence, (B, rings, 3).
@@ -97,8 +96,7 @@ class MapPeak:
 
 @dataclass(frozen=True)
 class SpherePeak:
-    """Go to the highest unvisited peak of a predicted map of the whole sphere, then to the highest
-    other view.
+    """The highest unvisited peak of a predicted map of the sphere, then any highest view.
 
     As in Parisotto, Mukherjee and Kasaei, "MORE: simultaneous multi-view 3D object recognition and
     pose estimation" (Intelligent Service Robotics 16, 2023). But here the map is predicted anew

@@ -1,5 +1,4 @@
-"""A policy that knows one grid of views, asked about views that lie anywhere from a camera that
-stands anywhere.
+"""Use a policy of one grid of views with any views and any camera position.
 
 All that a policy on a grid is told counts azimuth from the camera. So the grid is turned until a
 column of it passes through the camera; the policy values the turned grid, and between its views the
@@ -83,9 +82,7 @@ class OffGrid:
         )
 
     def view_values(self, state: EpisodeState) -> Float:
-        """What the policy values each view at, interpolated, (B, V); all NaN where it values
-        nothing.
-        """
+        """Return the interpolated value of each view, (B, V); all NaN without values."""
         if not isinstance(self.policy, ValuesViews):
             return np.full(state.visited.shape, np.nan)
         if self._on_grid(state):
@@ -107,9 +104,7 @@ class OffGrid:
         )
 
     def _turned(self, state: EpisodeState) -> tuple[EpisodeState, Float]:
-        """The state on the turned grid, and how many steps of azimuth each view lies ahead of
-        the camera, (B, V).
-        """
+        """Return the state on the turned grid, and the steps from camera to view, (B, V)."""
         n = self.grid.azimuths
         rows = np.arange(len(state.current))[:, None]
         here = self._here(state)
@@ -160,8 +155,9 @@ class OffGrid:
         )
 
     def _between(self, values: Float, ahead: Float) -> Float:
-        """Values of the turned grid's views, (B, grid), between which the views lie, (B, V); NaN
-        beside a NaN.
+        """Interpolate values of the turned grid, (B, grid), at the views, (B, V).
+
+        It is NaN beside a NaN.
         """
         n = self.grid.azimuths
         order = np.argsort(self.grid.elevations, kind="stable")

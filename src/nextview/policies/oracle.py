@@ -1,6 +1,4 @@
-"""Policies that see the truth: the ceiling of what can be gained, and the thesis's own choice,
-named for what it is.
-"""
+"""Policies that use the truth: upper bounds, and the choice of the thesis."""
 
 from dataclasses import dataclass
 
@@ -15,8 +13,7 @@ from nextview.recognition.belief import PLAIN_SUM, Calibration, of_true_class
 
 @dataclass(frozen=True)
 class OracleValley:
-    """The map's peak, or its valley where the *true* class asks for it, as the thesis did
-    (section 4.2.3).
+    """The map's peak, or its valley if the *true* class asks for it (section 4.2.3).
 
     Attributes:
         labels: of each episode, (E,).
@@ -50,8 +47,7 @@ class OracleValley:
 
 @dataclass(frozen=True)
 class OracleMeasure:
-    """The unvisited view with the highest true value of a measure, or the highest peak of its map
-    of the sphere.
+    """The unvisited view with the highest true value, or true peak, of a measure.
 
     With viewpoint entropy this is the choice of Shui et al. (thesis, section 3.5), from a first
     view that is drawn; with the fused descriptor that of Ding et al.; with peaks of the
@@ -90,8 +86,7 @@ class OracleMeasure:
 
 @dataclass(frozen=True)
 class OracleGain:
-    """The view after which the true class is believed most: the ceiling of choosing one view
-    ahead.
+    """The view after which the belief in the true class is highest: one step ahead.
 
     Attributes:
         log_evidence: of every view of every object, so that it adds up, (N, V, D).
@@ -126,9 +121,7 @@ class OracleGain:
         return best_in_window(self.sphere, state, gain.reshape(b, -1, 3))
 
     def _gains(self, state: EpisodeState, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Logarithm of the belief in the truth after a view of each view, or each of the window,
-        in some episodes.
-        """
+        """Return the log-belief in the truth after each view, or each of the window."""
         objects = self.objects[state.episodes[rows]]
         current = state.current[rows]
         log_evidence = self.log_evidence[objects].astype(np.float64)

@@ -1,6 +1,4 @@
-"""The card of a policy that was learned from predictions: one JSON file, table and all; weights
-are ONNX beside it.
-"""
+"""The card of a learned policy: a JSON file with its table; weights are ONNX beside it."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,9 +19,7 @@ Sha256 = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")]
 
 
 class LearnedFrom(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Predictions that a policy was learned from: the hash of their file; name and hash of each
-    model, by kind.
-    """
+    """Predictions that a policy was learned from: hash of the file, and the models."""
 
     sha256: Sha256
     models: dict[str, tuple[str, str]]
@@ -49,9 +45,7 @@ class PolicyCard(
     tag_field="schema",
     tag=1,
 ):
-    """One policy that was learned, for viewpoints on rings; its weights, if any, are the ONNX
-    file beside it.
-    """
+    """A learned policy for viewpoints on rings, with an ONNX file if it has weights."""
 
     kind: Literal["fixed-sequence", "fixed-ring", "class-table", "gain"]
     scope: Scope

@@ -218,9 +218,7 @@ def with_cards(name: str, cards: Mapping[str, Path]) -> str:
 
 
 def _of_memory(card: Path, sphere: Viewpoints, classes: tuple[str, ...] | None) -> Policy:
-    """The policy that tells the things of a memory apart: by their surfaces, or else by what is
-    remembered of them.
-    """
+    """Return the policy for a memory: by surfaces, or else by remembered views."""
     by_pictures = Discriminate.from_card(card, sphere, classes)
     _, memory = open_memory(card)
     return DiscriminateGeometry(sphere) if memory.surfaces.counts.any() else by_pictures

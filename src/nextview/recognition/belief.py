@@ -165,8 +165,9 @@ LARGEST_NUMBER = (
 
 
 class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """How far to trust a sum of logits. Views of one object err together, so k of them are not k
-    pieces of evidence.
+    """How far the sum of the logits of several views can be trusted.
+
+    Views of one object share their errors, so k views are not k independent pieces of evidence.
 
     The sum over k views is divided by ``temperature * (1 + correlation * (k - 1))``: what the
     variance of a sum of k equally correlated terms grows by, beyond k. Correlation 0 trusts the
@@ -198,9 +199,7 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
 
     @property
     def threshold_decay(self) -> float:
-        """How fast the threshold for stopping comes down with the views, see ``Stopping``: not
-        at all for things.
-        """
+        """Decay of the stopping threshold, see ``Stopping``; 0 for things."""
         return 0.0 if self.hypotheses else self.correlation
 
     def temperature_after(self, n_views: NDArray | int) -> Any:
@@ -243,9 +242,7 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         return logs + agreement
 
     def _pointing(self, total: Floating, n_views: NDArray | int, classes: int) -> Float:
-        """Log-evidence of the azimuths to which azimuth bin 0 points, (..., azimuth bins,
-        hypotheses).
-        """
+        """Log-evidence of the directions of azimuth bin 0, (..., azimuth bins, hypotheses)."""
         correlation = self.correlation if self.bin_correlation is None else self.bin_correlation
         sums = np.asarray(total, np.float64)[..., classes:]
         pointing = sums.reshape(*sums.shape[:-1], -1, len(self.hypotheses) or classes)
@@ -336,9 +333,7 @@ PLAIN_SUM = Calibration()  # trusts the sum of the logits as it stands, as the t
 
 
 class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
-    """How likely each size is for an object of each class; it is added to the logits of views
-    whose scale is known.
-    """
+    """How likely each size is for each class; added to the logits if the scale is known."""
 
     radii_m: tuple[float, ...]  # object radii, metres, ascending, (R,)
     log_density: tuple[tuple[float, ...], ...]  # that of their logarithm, (C, R)
@@ -399,8 +394,9 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
         return (np.log(radius) < low - np.log(much)) | (np.log(radius) > high + np.log(much))
 
     def logits(self, radii: Floating) -> NDArray[np.float32]:
-        """What is added to the logits, (B, C) float32, for object radii in metres, (B,); zero
-        where these are NaN.
+        """Return what is added to the logits, (B, C) float32; zero for NaN radii.
+
+        The radii are in metres, (B,).
         """
         at = np.log(np.where(np.isfinite(radii), radii, 1.0))
         grid, table = self._table
@@ -503,8 +499,9 @@ class Stopping:
 
 @dataclass(frozen=True)
 class FixedLength(Stopping):
-    """Stop after ``max_views`` views and never before, however sure the belief is; the threshold
-    counts for nothing.
+    """Stop after ``max_views`` views and never before.
+
+    Belief and threshold do not matter.
     """
 
     def threshold_at(self, n_views: NDArray | int) -> Float:

@@ -1,6 +1,4 @@
-"""Run the networks with ONNX Runtime: the recogniser, map networks, and any file that a card
-describes.
-"""
+"""Run networks with ONNX Runtime: the recogniser, map networks and memories."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -218,8 +216,9 @@ class NetworkRecogniser:
         return self.card.name
 
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
-        """Evidence of B views from one camera; views in which nothing is seen are marked, see
-        ``Evidence.seen``.
+        """Return the evidence of B views from one camera.
+
+        Views in which nothing is seen are marked, see ``Evidence.seen``.
         """
         inputs = from_observations(self.card.input, observations)
         elevations = np.array([elevation_of(direction_of(o.pose)) for o in observations])
@@ -257,8 +256,9 @@ class NetworkRecogniser:
         return Evidence(outputs["logits"], azimuth_bins=outputs.get(BINS_OUTPUT))
 
     def novelty_scores(self, observations: Sequence[Observation]) -> NDArray[np.float64]:
-        """How novel B views are, (B,), by the features that know no classes; ModelError if that
-        was not fitted.
+        """Return the novelty scores of B views, (B,).
+
+        ModelError if no score was fitted.
         """
         if not isinstance(self.novelty, Novelty):
             raise ModelError(f"{self.card.path}: has no novelty score of views")
@@ -278,9 +278,7 @@ class NetworkRecogniser:
 
 
 class Features:
-    """The bundled network that knows no classes: views to embeddings, unit vectors that alike
-    views share.
-    """
+    """The bundled network without classes; it maps views to embeddings, unit vectors."""
 
     def __init__(self, threads: int = 0) -> None:
         self.card = find_card(FEATURES)
@@ -298,8 +296,9 @@ class Features:
 
 
 class MapNetwork:
-    """Predicts the local map around each view from the geometry seen, or from its partial cloud, as
-    its card says.
+    """Predicts the local map around each view.
+
+    Its input is the geometry seen or the partial cloud, as its card says.
 
     ``rings`` is how many rings of views the map has, None if its file leaves that open. Arguments
     as of ``NetworkRecogniser``.
@@ -352,8 +351,9 @@ class Models:
         return names_of(self.maps)
 
     def valley_classes(self, map_name: str) -> tuple[int, ...]:
-        """Classes (indices) for which a map's valley is the better view, as its card says; none
-        without that map.
+        """Return the classes for which the valley of a map is the better view.
+
+        They are indices, as the map's card says; none without that map.
         """
         network = self.maps.get(map_name)
         valleys = () if network is None else network.card.valleys(self.classes)

@@ -33,8 +33,9 @@ def maps_among(needs: Sequence[str]) -> list[str]:
 
 
 def in_order(maps: Iterable[str]) -> list[str]:
-    """Names of maps, each once: local windows before whole spheres, of each the thesis's first,
-    then by alphabet.
+    """Sort names of maps: local windows first, those of the thesis first, then by name.
+
+    Each occurs once.
     """
     own = list(MAP_NAMES.values())
 

@@ -1,6 +1,4 @@
-"""The card of a model: what it is, how it was made, how good it is, and which file holds its
-weights.
-"""
+"""The card of a model: content, origin, scores, and the file of its weights."""
 
 import glob
 from collections.abc import Sequence
@@ -37,9 +35,7 @@ SHORT_HASH = 16  # hexadecimal digits of the SHA-256 of a memory that its file's
 
 
 class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a network learned from, in words, the settings of each training, and every command
-    that made it.
-    """
+    """What a network was trained on, the settings of each training, and all commands."""
 
     data: str = ""
     recipes: tuple[dict[str, Any], ...] = ()
@@ -47,8 +43,9 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Symmetry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One symmetry of a thing: turned about an axis through the centroid of its surface, it is the
-    same.
+    """A symmetry of a thing: a rotation about an axis that leaves it unchanged.
+
+    The axis goes through the centroid of its surface.
 
     Attributes:
         axis: Unit vector in the frame of the scan file.
@@ -153,9 +150,7 @@ class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def poses(self) -> tuple[int, ...]:
-        """The index of the thing that each resting pose is of, in order: what ``Memory.thing``
-        holds.
-        """
+        """The index of the thing of each resting pose, as in ``Memory.thing``."""
         return tuple(index for index, thing in enumerate(self.things) for _ in range(thing.poses))
 
 
@@ -167,8 +162,7 @@ class ModelCard(
     tag_field="schema",
     tag=SCHEMA,
 ):
-    """One model; as a file, a JSON object of these fields beside the file of the same name with its
-    weights.
+    """The card of a model, a JSON file beside the file with its weights.
 
     That is an ONNX file; of a memory of taught things, which is a recogniser too, a safetensors
     file. ModelError: a recogniser without classes, sizes of other classes than these, a network of
@@ -260,14 +254,13 @@ class ModelCard(
 
     @property
     def maps(self) -> tuple[str, ...]:
-        """Names of the maps that a map network predicts: of the local window and, if it knows
-        it, of the sphere.
-        """
+        """Names of the maps that a map network predicts, of the window and of the sphere."""
         return (self.kind, self.kind + SPHERE)[: 2 if self.output == "sphere" else 1]
 
     def valleys(self, classes: Sequence[str]) -> tuple[str, ...]:
-        """The classes for which the valley of its map is the better view: as was fitted, or else
-        all or none.
+        """Return the classes for which the valley of its map is the better view.
+
+        Without a fit they are all or none.
         """
         return (
             tuple(classes)
@@ -333,8 +326,9 @@ class _Peek(msgspec.Struct):
 
 
 def _peek(path: Path) -> _Peek:
-    """What a JSON file says that it is; an empty answer if it is damaged, as reading it as a
-    card will say why.
+    """Return what a JSON file says that it is; nothing if it is damaged.
+
+    The reason is given when it is read as a card.
     """
     regular_file(path, "a card", ModelError, LARGEST_RECORD)
     try:
@@ -344,8 +338,9 @@ def _peek(path: Path) -> _Peek:
 
 
 def is_memory(card: Path) -> bool:
-    """Whether a card is that of a memory of things: by what it says, or, where it is damaged, by
-    the file beside it.
+    """Return whether a card is that of a memory of things.
+
+    If the card is damaged, the file beside it decides.
     """
     if not card.is_file():
         return False
@@ -385,8 +380,9 @@ def find_card(model: str | Path) -> ModelCard:
 
 @dataclass(frozen=True)
 class Collection:
-    """Cards of models that belong together: maps by their names, policies, without the bundled
-    ones, by theirs.
+    """Cards of models that belong together: maps and policies by their names.
+
+    Bundled policies are not among them.
     """
 
     recogniser: Path

@@ -1,6 +1,4 @@
-"""What the networks take of a view: geometry, a grey image or a cloud, of live views and of
-those of a store.
-"""
+"""Inputs of the networks: geometry, a grey image or a cloud, of live or stored views."""
 
 from collections.abc import Sequence
 from typing import Any, Literal

@@ -1,5 +1,6 @@
-"""How novel an object is to a recogniser, and whether it is of any class it knows
-(out-of-distribution detection).
+"""How novel an object is, and whether it is of a known class.
+
+This is out-of-distribution detection.
 """
 
 from __future__ import annotations
@@ -34,8 +35,9 @@ WINDOW = 7
 
 @dataclass(frozen=True)
 class Quantiles:
-    """The distribution of a novelty score over objects of known classes: the mean over the views of
-    an object.
+    """The distribution of a novelty score over objects of known classes.
+
+    The score of an object is the mean over its views.
 
     Attributes:
         quantiles: scores of known objects after 1, 2, ... views, ascending, at even steps of
@@ -121,8 +123,7 @@ class Quantiles:
 
 @dataclass(frozen=True)
 class Novelty(Quantiles):
-    """A novelty score of views by the features that know no classes, and its distribution over
-    objects of known ones.
+    """A novelty score by features that know no classes, and its distribution.
 
     The score of a view is its distance to the tenth nearest of the known views (Sun et al.,
     "Out-of-Distribution Detection with Deep Nearest Neighbors", ICML 2022), standardised over views
@@ -228,8 +229,9 @@ def values_of(scores: Sequence[ViewScore], whole: bool = False) -> list[float]:
 
 
 def hidden_share(scene: SceneView | None) -> float:
-    """Share of an object's outline beside which something nearer begins, or the picture ends, 0
-    to 1.
+    """Return the share of an object's outline that borders on something nearer.
+
+    The border of the picture counts as well; 0 to 1.
     """
     if scene is None:
         return 0.0

@@ -1,6 +1,4 @@
-"""Teach things: from a folder of meshes or captured frames to a memory that recognises them,
-without PyTorch.
-"""
+"""Teach things: from scans or captured frames to a memory, without PyTorch."""
 
 import glob
 import hashlib
@@ -290,8 +288,7 @@ def learn_things(
 
 
 def _check_places(out: Path, keeps: bool, overwrite: bool) -> None:
-    """Refuse, before any work is done, a folder that cannot be written, or a memory that must not
-    be replaced.
+    """Check, before any work, that the outputs can be written.
 
     Raises:
         UsageError: there is a memory, and it is neither to be kept nor to be replaced.
@@ -362,9 +359,7 @@ PER_THING = ("held_out", "held_out_views", "radii", "pictures")
 def _teach(
     sources: Sequence[ThingSource], work: Work, taught: list[Pair], left_out: list[str]
 ) -> Iterator[int]:
-    """Teach things side by side, each into a file of its own; what is there from a run that was
-    stopped is taken.
-    """
+    """Teach things in parallel, each into its own file; finished ones are kept."""
     waiting = []
     for source in sources:
         stamp = _stamp(source, work.how)
@@ -435,17 +430,16 @@ def _files_of(path: Path) -> Iterator[Path]:
 
 
 def _part_of(part: Path, source: ThingSource) -> Path:
-    """Where what is remembered of a thing is kept until all are taught; names may be too long
-    for a file's.
+    """Return the file of an unfinished run in which a thing is kept.
+
+    Its name has a limited length.
     """
     name = source.name.encode(errors="surrogateescape")
     return part / f"{hashlib.sha256(name).hexdigest()[:32]}.safetensors"
 
 
 def _finished(file: Path, stamp: str) -> Arrays | None:
-    """What an earlier run that was stopped has left of a thing; None if nothing, or it was of
-    something else.
-    """
+    """Return a thing that an interrupted run has taught; None if it cannot be used."""
     try:
         arrays = load_file(file)
     except (OSError, SafetensorError):  # missing, or damaged: it is made again
@@ -562,9 +556,7 @@ def _verified(
 def _shown(
     folder: Path, things: Sequence[int], known: int, rng: np.random.Generator, work: Work
 ) -> list[Shown]:
-    """Show things to the memory in a folder, side by side; sorted, so that nothing depends on
-    who is done first.
-    """
+    """Show things to the memory in parallel; sorted, so that the order does not matter."""
     items = to_be_shown(things, known, rng)
     found = dict[tuple[int, int], list[Shown]]()
 
@@ -584,9 +576,7 @@ def _shown(
 
 
 def _with_verification(card: ModelCard, memory: Memory, verified: VerifiedFit) -> ModelCard:
-    """A card that says what was fitted to the surfaces; its residuals are of all things, 0
-    without geometry.
-    """
+    """Return a card with the fits to the surfaces; residuals are 0 without geometry."""
     about = card.memory
     assert about is not None
     verification = verified.verification
@@ -610,8 +600,9 @@ def _by_views(shares: Sequence[float]) -> dict[str, float]:
 
 
 def _fitted(taught: Sequence[Pair], label: NDArray[np.int64]) -> tuple[Memory, Fit]:
-    """The memory of things, and what is fitted to all of them together; ``label`` is the class
-    of each.
+    """Return the memory of all things, and what is fitted to them together.
+
+    ``label`` is the class of each thing.
     """
     poses = [len(arrays["views"]) for _, arrays in taught]
     thing = np.repeat(np.arange(len(taught)), poses)
@@ -644,8 +635,9 @@ def _card(
     fit: Fit,
     commands: tuple[str, ...],
 ) -> ModelCard:
-    """The card of a memory, still without the hash of its file; ``commands`` made what it held
-    before.
+    """Return the card of a memory, without the hash of its file.
+
+    ``commands`` produced the earlier content of the memory.
     """
     poses = np.bincount(memory.thing)
     things = tuple(

@@ -33,8 +33,7 @@ Pictures = Mapping[str, NDArray[np.uint8]]
 
 
 def draw_learned(path: Path, pictures: Pictures, fit: Fit) -> None:
-    """Write the picture: the things, the share named right by the number of views, and the pairs
-    confused most.
+    """Draw the things, the accuracy by the number of views, and the confused pairs.
 
     It is as high as what is on it.
 

@@ -1,6 +1,4 @@
-"""What is fitted to a memory as a whole: how much a likeness weighs, a head for classes, sizes,
-and novelty.
-"""
+"""Fits to a whole memory: weight of a likeness, a head for classes, sizes, novelty."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,8 +26,9 @@ FAR = -1e3
 
 @dataclass(frozen=True)
 class Fit:
-    """What was fitted; ``accuracy`` after as many held-out views as VIEWS says; ``confused``
-    (thing, thing, share).
+    """What was fitted to a memory, with the accuracy on held-out views.
+
+    ``accuracy`` is after the numbers of views in VIEWS; ``confused`` holds (thing, thing, share).
 
     Attributes:
         usual: see ``recognition.novelty.Quantiles``.
@@ -111,8 +110,9 @@ def fit_memory(
 
 
 def _usual(logs: Float, truth: Index) -> Float:
-    """How much more novel than all the things of each class are, (C,), by log-belief, (T, draws,
-    C); 0 if not known.
+    """Return the usual excess novelty of each class, (C,); 0 if it is not known.
+
+    The input is the log-belief, (T, draws, C).
 
     Half of it: eight views, through one setup of a sensor, do not tell more.
     """
@@ -140,8 +140,9 @@ def _heads(
     held_out: Float,
     judged: Index,
 ) -> tuple[NDArray[np.float32], tuple[Float, Float]]:
-    """What heads that have not seen a thing say of its held-out views, (T, K, C); and the head
-    of all things.
+    """Return the logits of held-out views by heads that have not seen the thing, (T, K, C).
+
+    The head of all things is returned as well.
     """
     classes = int(label.max()) + 1
     f = views.shape[-1]
@@ -159,8 +160,9 @@ def _heads(
 
 
 def _ridge(x: Float, y: Index, classes: int) -> tuple[Float, Float]:
-    """Ridge regression from views, (H, n, F), of classes (H,), to one-hot classes, each class
-    weighted evenly.
+    """Fit ridge regression from views, (H, n, F), to one-hot classes, (H,).
+
+    Classes have equal weight.
     """
     h, n, f = x.shape
     rows = x.reshape(h * n, f)
@@ -188,9 +190,7 @@ def _sums(
 def _belief(
     sums: dict[int, Float], classes: int, hypotheses: Index, correlation: float
 ) -> list[NDArray[np.float64]]:
-    """Log-belief by sums of log-evidence of so many views, up to a constant, (T, draws, classes)
-    each.
-    """
+    """Return the log-belief from sums of log-evidence, (T, draws, classes), up to a constant."""
     calibration = Calibration(1.0, 1.0, None, correlation, tuple(hypotheses.tolist()))
     return [calibration.log_belief(total, k, classes) for k, total in sums.items()]
 
@@ -198,9 +198,7 @@ def _belief(
 def _confused(
     logs: Float, truth: Index, judged: Index, label: Index
 ) -> tuple[tuple[int, int, float], ...]:
-    """Pairs of things by the share of the cases in which one is named as the class of the other,
-    the worst first.
-    """
+    """Return pairs of things by how often one is named as the other, worst first."""
     answers = logs.argmax(-1)
     pairs = dict[tuple[int, int], float]()
     first = {int(c): int(np.flatnonzero(label == c)[0]) for c in np.unique(label)}

@@ -43,9 +43,7 @@ def check_sizes(paths: Sequence[Path], radii: NDArray[np.floating], unit: str | 
 
 
 def _all_odd(paths: Sequence[Path], radii: NDArray[np.floating], unit: str, median: float) -> str:
-    """The sentence about things that are all too large or too small: the unit that would make
-    them usual.
-    """
+    """Return a sentence about things of odd size, with the unit that makes them usual."""
     middle = int(np.nanargmin(np.abs(radii - median)))
     size = f"has a radius of {_length(float(radii[middle]))} if --unit {unit} is right"
     who = (

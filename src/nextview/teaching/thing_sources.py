@@ -1,6 +1,4 @@
-"""Which things a folder teaches: mesh files, class folders of them, and folders of captured
-depth frames.
-"""
+"""Find the things of a folder: mesh files, class folders, and captured frames."""
 
 import os
 from dataclasses import dataclass
@@ -119,9 +117,7 @@ def _captures(folder: Path) -> list[Path]:
 
 
 def _to_be_taught(entries: list[Entry]) -> tuple[list[Entry], list[Entry]]:
-    """Those that are taught, and those of other splits: a test is of things that nobody was
-    taught.
-    """
+    """Return the entries to teach, without those of test and validation splits."""
     if not any(entry.split == "train" for entry in entries):
         return entries, []
     taught = [entry for entry in entries if entry.split in ("train", "")]

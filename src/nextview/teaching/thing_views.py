@@ -1,6 +1,4 @@
-"""Look at one thing from everywhere, without and with a sensor's errors, and note what its views
-are like.
-"""
+"""Render a thing from everywhere, clean and through a sensor, and compute its features."""
 
 import zlib
 from collections.abc import Iterator, Mapping
@@ -154,9 +152,7 @@ def teach(path: Path, name: str, how: TeachingOptions, threads: int = 1) -> Arra
 
 
 def _surface(mesh: Mesh, to_mesh: NDArray[np.float64]) -> Arrays:
-    """The surface of a mesh in the axes of its file, which ``to_mesh`` turns into its own;
-    nothing without a unit.
-    """
+    """Return the surface of a mesh in the axes of its file; nothing without a unit."""
     if mesh.metres is None:
         return {}
 
@@ -176,8 +172,9 @@ def of_surface(surface: Surface) -> Arrays:
 
 
 def _around(clean: Parts, sensed: Parts) -> NDArray[np.float32]:
-    """Embeddings of the views of the grid, (rings, azimuths, F): the mean without and with a
-    sensor's errors.
+    """Return embeddings of the grid of views, (rings, azimuths, F).
+
+    They are the mean of clean and sensed views.
     """
     ideal = np.concatenate(list(clean)).reshape(len(RINGS), AZIMUTHS, -1)
     through = np.zeros_like(ideal)
@@ -209,8 +206,9 @@ def _seen(camera: Camera, poses: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def _of_capture(capture: Capture) -> Arrays:
-    """Of captured frames: each cell of the grid is what the nearest of them shows. Every fourth is
-    held out.
+    """Return what captured frames show, for each cell of the grid by its nearest frame.
+
+    Every fourth frame is held out.
 
     Its surface, and its resting pose, are in the frame of the world in which it was captured.
     """
@@ -264,8 +262,9 @@ def _features() -> Features:
 
 
 def embeddings(observations: list[Observation]) -> NDArray[np.float32]:
-    """Embeddings of views from one camera, unit vectors, (B, F) float32; zero where nothing is
-    seen.
+    """Return embeddings of views from one camera, unit vectors, (B, F) float32.
+
+    They are zero where nothing is seen.
     """
     network = _features()
     inputs = from_observations(network.card.input, observations)

@@ -1,6 +1,4 @@
-"""What is fitted to the surfaces of taught things: how much geometry counts, and how well known
-things fit.
-"""
+"""Fits to the surfaces of taught things: weight of geometry, and usual residuals."""
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
@@ -228,9 +226,7 @@ def fit_verification(shown: Sequence[Shown], labels: Index) -> VerifiedFit:
 
 
 def _weights(shown: Sequence[Shown]) -> EvidenceWeights:
-    """The weights that suit what was shown, drawn towards the defaults: few things do not tell
-    much.
-    """
+    """Fit the weights to the shown things, shrunk towards the defaults."""
     count = len({one.judged.truth for one in shown})
     if count < 2:  # whatever the weights are, a thing alone is named right
         return EvidenceWeights()
@@ -269,9 +265,7 @@ def _residuals(shown: Sequence[Shown], labels: Index) -> KnownResiduals | None:
 
 
 def _right(shown: Sequence[Shown], labels: Index) -> tuple[Index, Float, Index]:
-    """Of what was named right by the best explanation: the thing, the residual and the number of
-    views.
-    """
+    """Return thing, residual and number of views of the cases that were named correctly."""
     right = [one for one in shown if labels[one.named] == one.judged.truth]
     things = np.array([one.named for one in right], np.int64)
     residuals = np.array([one.residual for one in right], np.float64)
@@ -368,9 +362,7 @@ def _accuracy(shown: Sequence[Shown], answers: Sequence[int]) -> tuple[float, ..
 
 
 def _confused(shown: Sequence[Shown], answers: Sequence[int]) -> tuple[tuple[int, int, float], ...]:
-    """Pairs of classes by the share of the cases in which one is named as the other, the worst
-    first.
-    """
+    """Return pairs of classes by how often one is named as the other, worst first."""
     truths = [one.judged.truth for one in shown if one.views == 2]
     named = [answer for one, answer in zip(shown, answers, strict=True) if one.views == 2]
     pairs = dict[tuple[int, int], float]()

@@ -1,6 +1,4 @@
-"""The networks: ResNet with torchvision's parameter names, PointNet with its two transforms, and
-a ResNet of maps.
-"""
+"""The networks: ResNet (torchvision's names), EfficientNet-Lite0, PointNet, map ResNet."""
 
 from nextview.checks import extras
 from nextview.geometry.viewsphere import ViewSphere
@@ -107,9 +105,7 @@ class RecogniserNetwork(nn.Module):
 
 
 class LiteNet(RecogniserNetwork):
-    """EfficientNet-Lite0: EfficientNet-B0 without squeeze and excitation, with ReLU6 for swish
-    (TensorFlow, 2020).
-    """
+    """EfficientNet-Lite0: B0 without squeeze and excitation, with ReLU6 (TensorFlow, 2020)."""
 
     name = "EfficientNet-Lite0"
 
@@ -155,9 +151,7 @@ RESNETS = {
 
 
 class Residual(nn.Module):
-    """A shortcut around two 3x3 convolutions; or, ``narrow``, around 1x1, 3x3 with the stride,
-    and 1x1.
-    """
+    """A shortcut around two 3x3 convolutions, or if ``narrow`` around 1x1, 3x3 and 1x1."""
 
     def __init__(self, inputs: int, width: int, stride: int, narrow: bool) -> None:
         super().__init__()
@@ -245,9 +239,7 @@ def _dense(between: tuple[nn.Module, ...]) -> nn.Sequential:
 
 
 class PointLayer(nn.Module):
-    """The same fully connected layer, with batch norm over all points, for every point of clouds
-    (B, P, inputs).
-    """
+    """A fully connected layer with batch norm for every point of clouds, (B, P, inputs)."""
 
     def __init__(self, inputs: int, outputs: int, relu: bool = True) -> None:
         super().__init__()
@@ -261,9 +253,7 @@ class PointLayer(nn.Module):
 
 
 class Transform(nn.Module):
-    """T-Net: a k x k matrix from a cloud of k-dimensional points (B, P, k), beginning as the
-    identity.
-    """
+    """A T-Net: a k x k matrix from a cloud, (B, P, k), that starts as the identity."""
 
     def __init__(self, k: int) -> None:
         super().__init__()
@@ -280,9 +270,7 @@ class Transform(nn.Module):
 
 
 class PointNet(nn.Module):
-    """PointNet (Qi et al., CVPR 2017) that predicts a map (rings x columns) from a cloud (B, P,
-    3) in [0, 1].
-    """
+    """PointNet (Qi et al., CVPR 2017): a map, rings x columns, from a cloud, (B, P, 3)."""
 
     def __init__(self, rings: int, columns: int = 3, dropout: float = 0.3) -> None:
         super().__init__()
@@ -305,8 +293,9 @@ class PointNet(nn.Module):
 
 
 class ViewMap(nn.Module):
-    """A ResNet that predicts a map of rings x columns values in 0 .. 1 from a view, (B,
-    channels, H, W) in 0 .. 1.
+    """A ResNet that predicts a map, rings x columns in 0 to 1, from a view.
+
+    The view is (B, channels, H, W) in 0 to 1.
     """
 
     def __init__(self, rings: int, columns: int, depth: int, channels: int) -> None:
@@ -349,8 +338,9 @@ def map_columns(recipe: MapRecipe, sphere: ViewSphere) -> list[int]:
 
 
 def orthogonality(matrix: Tensor) -> Tensor:
-    """How far matrices (B, k, k) are from orthogonal: mean Frobenius norm of I - A A^T (thesis,
-    equation 2).
+    """Return how far matrices, (B, k, k), are from orthogonal.
+
+    It is the mean Frobenius norm of I - A A^T (thesis, equation 2).
     """
     gram = torch.bmm(matrix, matrix.transpose(1, 2))
     return (gram - torch.eye(matrix.shape[1], device=matrix.device)).flatten(1).norm(dim=1).mean()

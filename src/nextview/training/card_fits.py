@@ -1,6 +1,4 @@
-"""What is fitted into a card from held-out predictions: calibration and promised error rates,
-sizes, valleys.
-"""
+"""Fits of calibration, error rates, sizes and valleys to held-out predictions."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,8 +53,7 @@ def fit_calibration(
     delta: float = 0.1,
     seed: int = 0,
 ) -> FittedCalibration:
-    """Calibrate a recogniser: how far to trust the sum of several views, and which error rates can
-    be promised.
+    """Calibrate a recogniser: correlation of several views, and error rates.
 
     Both go into its card; nextview predict takes them into predictions made before, without
     predicting again. The size of the objects is not used.
@@ -114,8 +111,7 @@ def _check_recogniser(path: Path, card: ModelCard, predictions: Path, table: Pre
 
 @dataclass(frozen=True)
 class Walks:
-    """Walks over all objects of a set: as many in the local window as over the sphere, those
-    last.
+    """Random walks over all objects: half in the local window, half over the sphere.
 
     Attributes:
         objects: (walks,).
@@ -154,8 +150,9 @@ class Walks:
         return np.arange(1, self.totals.shape[1] + 1)
 
     def loss(self, calibration: Calibration) -> float:
-        """Mean negative log-likelihood of the true class over all numbers of views, classes
-        weighted evenly.
+        """Return the mean negative log-likelihood over all numbers of views.
+
+        Classes have equal weight.
         """
         logs = calibration.log_belief(self.totals, self.numbers, len(self.data.classes))
         weights = self.data.weights[self.objects]
@@ -265,8 +262,9 @@ def fit_risk(
 
 
 def _promise(sure: Float, wrong: NDArray[np.bool_], weights: Float, delta: float) -> Float:
-    """Promised error rate of each threshold, (T,), from confidences and mistakes (walks * N,
-    views).
+    """Return the guaranteed error rate of each threshold, (T,).
+
+    Confidences and mistakes are (walks * N, views).
     """
     promised = np.ones(len(THRESHOLDS))
     worst = 0.0

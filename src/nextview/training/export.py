@@ -1,6 +1,4 @@
-"""From finished training runs to a model that ships: an ONNX file with half-precision weights,
-and its card.
-"""
+"""Export finished runs: an ONNX file with half-precision weights, and its card."""
 
 import logging
 import warnings
@@ -49,9 +47,7 @@ SMALL = 2**17
 
 
 class ShippedRecogniser(nn.Module):
-    """The recogniser as it ships: raw input bytes in; the mean logits out, and the features of
-    all networks.
-    """
+    """The exported recogniser: from input bytes to the mean logits and all features."""
 
     def __init__(self, networks: Sequence[nn.Module]) -> None:
         super().__init__()
@@ -74,9 +70,7 @@ class ShippedRecogniser(nn.Module):
 
 
 class ShippedMap(nn.Module):
-    """A map network as it ships: the map of the window, and that of the sphere, (B, rings,
-    azimuths), if it has it.
-    """
+    """The exported map network: the map of the window and, if it has it, of the sphere."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
@@ -213,8 +207,9 @@ def export_recogniser(
     overwrite: bool = False,
     track: Track = silently,
 ) -> Exported:
-    """Export a trained recogniser: ONNX, with a card of its validation scores. Calibrate it with
-    nextview fit.
+    """Export a trained recogniser to ONNX with a card of its validation scores.
+
+    Calibrate it afterwards with nextview fit calibration.
 
     Args:
         run: folder made by nextview train recogniser.
@@ -361,9 +356,7 @@ def _training(
 
 
 def _export(candidate: _Candidate, out: Path, bits: int, overwrite: bool, track: Track) -> Exported:
-    """Write ONNX file and card, once the file answers as the network does; both appear at the
-    end.
-    """
+    """Write ONNX file and card once the file agrees with the network; both or neither."""
     name = candidate.card.name
     sample = candidate.sample
     if Path(name).name != name:

@@ -1,6 +1,4 @@
-"""The predictions that something may be fitted to: never of the test split, nor of objects the
-recogniser learned.
-"""
+"""Predictions for fits: never of the test split, nor of the recogniser's training objects."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

@@ -1,6 +1,4 @@
-"""From predictions to the gain policy: its networks, their training, and its card with the ONNX
-file beside it.
-"""
+"""Train the gain policy from predictions, and write its card and its ONNX file."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from copy import deepcopy
@@ -59,9 +57,7 @@ to the largest answer beyond 1. For gains a fiftieth of the lowest travel weight
 
 
 class Perceptrons(nn.Module):
-    """Several perceptrons, averaged over an object and its mirror: features (B, D) to the value
-    of cells (B, V).
-    """
+    """Perceptrons averaged over an object and its mirror image: (B, D) to cells (B, V)."""
 
     def __init__(
         self,
@@ -314,8 +310,9 @@ def train_gain(
     overwrite: bool = False,
     track: Track = silently,
 ) -> TrainedGain:
-    """Train the gain policy, which predicts what a view from each viewpoint brings. When stopped,
-    it begins anew.
+    """Train the gain policy, which predicts the value of each view.
+
+    An interrupted training starts over.
 
     Args:
         predictions: of training objects that the recogniser has not seen (nextview predict
@@ -386,9 +383,7 @@ class _Data:
 def _sources(
     predictions: Path, validation: Path | None, sensed: Sequence[Path], recipe: GainRecipe
 ) -> tuple[Predictions, Predictions, list[Predictions], list[tuple[Path, Predictions]]]:
-    """What is learned from and what it is judged on, the first through sensors, and all with their
-    files, checked.
-    """
+    """Open and check what is learned from and what it is judged on."""
     table = Predictions.load(predictions).deduplicate()
     other = table if validation is None else Predictions.load(validation).deduplicate()
     if (other.classes, other.sphere) != (table.classes, table.sphere):
@@ -460,8 +455,9 @@ def _load(
 
 
 def _shapes(p: Predictions) -> NDArray[np.floating]:
-    """Rows that are the same where the shape is, (N, ...): by what is seen of it, or in scenes
-    by its name.
+    """Return rows that are equal for equal shapes, (N, ...).
+
+    Shapes are compared by their views, in scenes by their names.
     """
     if scenes_of(p) is None:
         return p.depth_entropy

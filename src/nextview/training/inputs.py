@@ -1,6 +1,4 @@
-"""The networks' inputs of a whole store: computed once and kept beside the store, each view
-packed for itself.
-"""
+"""Network inputs of a whole store, computed once and kept beside it."""
 
 import os
 import time
@@ -27,9 +25,7 @@ AGAIN = "delete it, and it is made again"
 
 @dataclass(frozen=True)
 class PackedViews:
-    """Views of all objects, (N, V, C, H, W) uint8, read like an array: ``views[i, v]``,
-    ``views[i, 2:5]``.
-    """
+    """Views of all objects, (N, V, C, H, W) uint8, read like an array: ``views[i, 2:5]``."""
 
     packed: NDArray[np.uint8]
     places: NDArray[np.int64]

@@ -1,6 +1,4 @@
-"""The stage from a view store to a trained map network: it learns one value for every view of an
-object.
-"""
+"""Train a map network, which predicts one value for every view, from a view store."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -42,9 +40,7 @@ Seen = NDArray[Any] | PackedViews  # of N objects from V views, what the network
 
 
 class Windows(OwnBatches):
-    """Batches of (what the network sees, map (B, rings, columns)) from values (N, V) of some
-    objects, drawn anew.
-    """
+    """Batches of inputs and maps, (B, rings, columns), drawn from values, (N, V)."""
 
     def __init__(
         self,
@@ -131,9 +127,7 @@ def peak_loss(logits: Tensor, goal: Tensor, reach: int) -> Tensor:
 
 
 class MapModule(L.LightningModule):
-    """AdamW on the squared error, plus the regulariser of the PointNet's transforms (thesis,
-    section 2.2.3).
-    """
+    """AdamW on the squared error, plus the PointNet's regulariser (thesis, section 2.2.3)."""
 
     def __init__(self, recipe: MapRecipe, sphere: ViewSphere, steps: int) -> None:
         super().__init__()
@@ -197,8 +191,7 @@ def train_map(
     hardware: Hardware = Hardware(),
     track: Track = silently,
 ) -> list[Path]:
-    """Train a network that predicts a measure of the views around one. Resumes if OUT holds a run
-    that was cut off.
+    """Train a network that predicts a measure of the views around one; resumes.
 
     Args:
         store: view store made by nextview render, with the 40 views and the measure (nextview

@@ -46,9 +46,7 @@ class StoredInputs:
 
 
 class Views(OwnBatches):
-    """Batches of (input (B, C, S, S) uint8, label (B,), and azimuth bin (B,) where sources have
-    it), new each epoch.
-    """
+    """Batches of input, (B, C, S, S) uint8, label and azimuth bin, new in each epoch."""
 
     def __init__(
         self,
@@ -102,8 +100,9 @@ class Views(OwnBatches):
 
 
 def augment(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Vary inputs (B, C, S, S) in 0 .. 1: mirror, shift, stretch, roll, hide a part, add noise;
-    and which were.
+    """Mirror, shift, stretch, roll, hide and add noise to inputs, (B, C, S, S) in 0 to 1.
+
+    Which of them were mirrored is returned as well.
     """
     (b, _, _, s), on = x.shape, {"device": x.device}
     scale = torch.empty(b, 2, **on).uniform_(0.8, 1.25)
@@ -218,9 +217,7 @@ class RecogniserModule(L.LightningModule):
 
 
 class ValidationViews(OwnBatches):
-    """Every fifth view of the validation objects, shifted by one from object to object: all
-    views get their turn.
-    """
+    """Every fifth view of the validation objects, shifted by one from object to object."""
 
     def __init__(
         self, inputs: NDArray[np.uint8] | PackedViews, objects: Indices, labels: Indices
@@ -347,8 +344,7 @@ def train_recogniser(
     hardware: Hardware = Hardware(),
     track: Track = silently,
 ) -> list[Path]:
-    """Train the recogniser on a store's training split. Resumes if OUT holds a run that was cut
-    off.
+    """Train the recogniser on the training split of a store; resumes.
 
     Args:
         store: view store made by nextview render.

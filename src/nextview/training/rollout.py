@@ -1,6 +1,4 @@
-"""Decision states on the way of a policy, and the value of every next view there, by replay of
-predictions.
-"""
+"""Replay predictions: the states that a policy meets, and the value of each next view."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -28,9 +26,7 @@ OBJECTIVES = ("belief", "log-belief", "right")
 
 @dataclass(frozen=True)
 class ReplayTable:
-    """What held-out models say of N objects, by a calibrated recogniser, and the scenes that
-    these stand in.
-    """
+    """Outputs of held-out models for N objects, calibrated, and their scenes."""
 
     data: Predictions
     scenes: SceneSight | None = None
@@ -180,8 +176,9 @@ def candidate_values(table: ReplayTable, moment: DecisionState, kind: str) -> Fl
 
 
 class Value(NamedTuple):
-    """Mean objective, and travel in cells, after 2, 3, ... views, (views - 1,); classes weighted
-    evenly.
+    """Mean objective and travel in cells after 2, 3, ... views, (views - 1,).
+
+    Classes have equal weight.
     """
 
     mean: Float

@@ -1,6 +1,4 @@
-"""A training run, which all networks share: its folder, checkpoints, exact epochs after a
-resume, first weights.
-"""
+"""Training runs: folder, checkpoints, exact resumption, and initial weights."""
 
 import csv
 import io
@@ -48,9 +46,7 @@ N = TypeVar("N", bound=nn.Module)
 
 
 class OwnBatches(IterableDataset):
-    """A data set that makes its own batches, from the epoch and the share of each batch that is
-    this device's.
-    """
+    """A data set that makes its own batches from the epoch and the device's share."""
 
     epoch = 0
     share = slice(None)
@@ -87,9 +83,7 @@ def _loader(batches: IterableDataset) -> DataLoader:
 
 
 class StepSeed(L.Callback):
-    """Seeds torch by epoch, step and device, so that a resumed run augments as an uninterrupted
-    one would.
-    """
+    """Seeds torch by epoch, step and device, so that a resumed run draws the same."""
 
     def on_train_batch_start(
         self, trainer: L.Trainer, pl_module: Any, batch: Any, batch_idx: int
@@ -107,8 +101,9 @@ class StepSeed(L.Callback):
 
 
 class WholeCheckpoints(TorchCheckpointIO):
-    """Lightning moves checkpoints from the system's temporary folder: a kill in that copy would
-    cost the old one.
+    """Writes checkpoints in place, so that a kill never costs the old one.
+
+    Lightning would copy them from the system's temporary folder.
     """
 
     def save_checkpoint(
@@ -138,9 +133,7 @@ def save_whole(values: dict[str, Any], path: Path) -> None:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """What ``save_whole`` wrote, by torch's reader that makes nothing but tensors and
-    containers.
-    """
+    """Read what ``save_whole`` wrote; only tensors and containers are created."""
     try:
         with warnings.catch_warnings():
             # Torch warns of pickles that are not its own before it refuses them.
@@ -156,9 +149,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 class Log(L.Callback):
-    """A row for every epoch in log/metrics.csv and in the checkpoint; Lightning's own log begins
-    anew on a resume.
-    """
+    """Writes a row per epoch to log/metrics.csv, and keeps the rows over a resume."""
 
     def __init__(self, out: Path) -> None:
         self.path = out / "log/metrics.csv"
@@ -212,9 +203,7 @@ class Checkpoint(ModelCheckpoint):
 
 
 class Patience(EarlyStopping):
-    """Stops when the score has not improved for so many epochs; a run that was stopped so stays
-    stopped.
-    """
+    """Stops after some epochs without improvement; a resumed run stays stopped."""
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Stop a resumed run whose patience was exhausted before.

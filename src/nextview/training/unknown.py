@@ -1,6 +1,4 @@
-"""Learn to notice objects of no known class, from views of known objects and of other objects of
-the same classes.
-"""
+"""Fit the novelty score of a recogniser to views of its known objects."""
 
 import logging
 import zlib
@@ -71,8 +69,7 @@ def fit_unknown(
     workers: int | None = None,
     track: Track = silently,
 ) -> FittedUnknown:
-    """Teach a recogniser to notice objects of no class that it knows, at a false-alarm rate that
-    can be chosen.
+    """Teach a recogniser to notice objects of unknown classes at a chosen false-alarm rate.
 
     It remembers views of its training objects. How novel other views of known classes are is
     measured on the objects that its card calls held out. All objects are turned about the vertical
@@ -165,8 +162,9 @@ def _looked_at(held_out: frozenset[str], sensor: str, seed: int, entry: Entry) -
 
 
 def _random_views(camera: Camera, wanted: int, rng: Generator) -> Float32:
-    """Embeddings of so many views from random directions, (views, F); fewer where the object is
-    often not seen.
+    """Return embeddings of views from random directions, (views, F).
+
+    They are fewer where the object is often not seen.
     """
     tries = 4 * wanted
     elevations = rng.uniform(0, MAX_ELEVATION, tries)

@@ -95,9 +95,7 @@ def class_card(label: str) -> str:
 
 
 def warm(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A grey picture, (H, W), black where nothing is, in the colours of the things and the
-    ground, (H, W, 3).
-    """
+    """Colour a grey picture, (H, W), as (H, W, 3): things on a ground; black is empty."""
     wood = np.minimum(np.array(rgb(WOOD)) * np.minimum(picture[..., None] / 200, 1.15), 255)
     return np.where(picture[..., None] > 0, wood, rgb(GROUND)).astype(np.uint8)
 

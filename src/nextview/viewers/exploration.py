@@ -1,6 +1,4 @@
-"""What is explored, without any page: an object, one or two walks around it, and what their
-policies value.
-"""
+"""The state of the explorer: an object, one or two walks, and the policies' values."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -32,9 +30,7 @@ Float = NDArray[np.float64]
 
 
 class StoredViews:
-    """A camera before one object of a view store: it answers with the stored view nearest to the
-    one asked for.
-    """
+    """A camera that answers with the nearest stored view of an object."""
 
     def __init__(self, store: ViewStore, row: int) -> None:
         self.sphere = store.sphere
@@ -54,9 +50,7 @@ class StoredViews:
 
 @dataclass(frozen=True)
 class ShownObject:
-    """An object by its name; ``open`` reads it: a mesh, or a camera where there are only stored
-    views.
-    """
+    """An object by its name; ``open`` reads its mesh, or a camera of its stored views."""
 
     name: str
     open: Callable[[], Mesh | Camera]
@@ -142,15 +136,14 @@ class Walk:
 
     @property
     def values(self) -> Float | None:
-        """The policy's values of the views, (V,), NaN for those not considered; None if there
-        are none yet.
-        """
+        """The policy's values of the views, (V,), NaN if not considered; None before a view."""
         return self.views[-1].values if self.views else None
 
     @property
     def rivals(self) -> Rivals | None:
-        """The two taught things believed most, and how they differ from each view; None before a
-        view, or untaught.
+        """The two most likely taught things, and how they differ from each view.
+
+        None before the first view, and for models without a memory.
         """
         recogniser = self.session.models.recogniser
         seen = [view for view in self.views if view.observation.seen]
@@ -257,8 +250,9 @@ def remembered_picture(
 
 
 class Exploration:
-    """An object among some, a camera before it, a walk for each of one or two policies; options
-    of nextview.load.
+    """An object among some, its camera, and a walk for each of one or two policies.
+
+    Options are those of ``nextview.load``.
     """
 
     def __init__(
@@ -342,15 +336,11 @@ class Exploration:
         return bool(walks)
 
     def preview(self, where: Float) -> Observation:
-        """What would be seen from a position, (3,), object radii, without noise; nothing is
-        taken.
-        """
+        """Return what would be seen from a position, (3,), object radii, without noise."""
         return self._camera(self._opened).observe(self.pose_towards(where))
 
     def pose_towards(self, position: Float) -> Float:
-        """A level pose, (4, 4), in the direction of a position, (3,), as far away as the
-        candidate views are.
-        """
+        """Return a level pose, (4, 4), in the direction of a position, at the usual distance."""
         length = np.linalg.norm(position)
         return level_pose(
             position / length if length > 0 else np.array([1.0, 0, 0]),

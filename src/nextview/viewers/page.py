@@ -1,6 +1,4 @@
-"""The explorer's page: what is clicked and dragged goes to an ``Exploration``, and what follows
-is drawn.
-"""
+"""The explorer's page: passes clicks to an ``Exploration`` and draws its state."""
 
 import errno
 import re
@@ -193,9 +191,7 @@ class Page:
         self._act(lambda: self._drawn(lambda: self.exploration.walks[walk].look(where)), None)
 
     def _drag(self, walk: int, place: NDArray[np.float64], let_go: bool) -> None:
-        """Show what would be seen while a camera is dragged, as often as there is time; look
-        where it is let go.
-        """
+        """Show a preview while a camera is dragged, and take the view where it is released."""
         if let_go:
             self._preview.visible = False
             self._look(walk, self.exploration.pose_towards(place))

@@ -1,6 +1,4 @@
-"""A session as a recording for the Rerun viewer: what was seen from where, and what was made of
-it.
-"""
+"""Record a session for the Rerun viewer."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,8 +22,7 @@ TIMELINE = "step"
 
 
 class Recorder:
-    """Writes a file as a session goes on; put it among ``Session.observers``, or call it with a
-    session yourself.
+    """Records a session; add it to ``Session.observers``, or call it with a session.
 
     On the timeline ``step`` the file holds, in the object frame and object radii:
 

@@ -1,6 +1,4 @@
-"""A walk in 3D: the object, the candidate views in the colours of their values, the path and the
-camera.
-"""
+"""A walk in 3D: the object, the candidate views by value, the path and the camera."""
 
 from collections.abc import Callable
 from typing import Any
@@ -126,9 +124,7 @@ class WalkScene:
         )
 
     def _colour(self, walk: Walk) -> None:
-        """Candidates by value; those visited dark and small, the next one in the accent colour
-        and large.
-        """
+        """Colour the candidates by value; visited ones dark and small, the next one large."""
         values = np.full(len(walk.sphere), np.nan) if walk.values is None else walk.values.copy()
         values[walk.visited] = np.nan
         for view, (ball, colour) in enumerate(zip(self._balls, heat(values), strict=True)):
@@ -142,9 +138,7 @@ class WalkScene:
                 ball.scale = scale
 
     def _draw_path(self, walk: Walk) -> None:
-        """The places where the camera stood, numbered, and great circles between them; those
-        that are new.
-        """
+        """Draw new camera positions with their numbers, and great circles between them."""
         distance = walk.sphere.distance
         places = [view.direction for view in walk.views]
         for step in range(self._drawn, len(places)):
@@ -160,8 +154,9 @@ class WalkScene:
 
 
 def _rings(places: Float) -> NDArray[np.float32]:
-    """Level circles below views, (V, 3), as segments, (S, 2, 3); none for views that lie on no
-    rings.
+    """Return level circles below views, (V, 3), as segments, (S, 2, 3).
+
+    There are none for views that lie on no rings.
     """
     around = np.linspace(0, 2 * np.pi, 97)
     heights = np.unique(np.round(places[:, 2], 3))
