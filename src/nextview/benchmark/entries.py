@@ -227,21 +227,25 @@ def fixed_views(
     match = re.fullmatch(rf"({'|'.join([*FIXED, 'true-[a-z0-9_]+'])})-(\d+)", name)
     if not match:
         return None
+
     p = specs.predictions
     objects = specs.objects
     kind = match[1]
     k = int(match[2])
+
     if not 1 <= k <= len(p.sphere):
         raise EntryError(
             f"{name}: the sphere has {len(p.sphere)} views, so between 1 and {len(p.sphere)} can be"
             " taken"
         )
+
     if kind == "orbit":
         return orbit(p.sphere, specs.starts, k)
     if kind == "random-fixed":
         return ranked(rng.random((len(objects), len(p.sphere))), k)
     if kind.startswith("true-"):
         return ranked(true_measure(p, kind.removeprefix(TRUE)).astype(np.float64), k)[objects]
+
     if kind in ("high-entropy", "low-entropy"):
         values = p.depth_entropy.astype(np.float64)
     else:

@@ -243,18 +243,22 @@ def replayed(
             len(p),
         )
         split = None
+
     p = p if split is None else p.of_split(split)
     p = p.deduplicate() if split == "train" else p
+
     for name in rules.maps:
         if name not in p.maps:
             known = ", ".join((*INPUTS, *in_order(p.maps)))
             raise PredictionsError(
                 f"these predictions hold no map {name!r}; inputs are some of {known}"
             )
+
     if ("azimuth_bin" in rules.inputs or rules.frame == "object") and p.azimuth_bins is None:
         raise PredictionsError(
             "these predictions hold no azimuth bins, which the inputs or the frame need"
         )
+
     p = replace(p, maps={name: p.maps[name] for name in rules.maps})
     return Task(p.labels, p.classes, p.sphere, p.calibration, p.evidence, rules, balanced)
 
@@ -339,20 +343,24 @@ class Cohort:
         classes = len(task.classes)
         objects = self.objects[running]
         views = self.episodes.current[running]
+
         step = self.episodes.update(task.observe(objects, views))
         n_seen = np.maximum(step.seen, 1)
         self._visited[running, views] = True
         visited = self._visited[running]
         labels = task.labels[objects]
+
         azimuth_bins = calibration.azimuth_bins(step.total, n_seen, classes, sphere.azimuth[views])
         state = EpisodeState(views, visited, step.belief, step.evidence, k, running, azimuth_bins)
         value = value_of(
             calibration.log_belief(step.total, n_seen, classes), labels, task.rules.objective
         )
+
         change = value - self._value[running] if k > 1 else np.zeros(len(running))
         self._value[running] = value
         reached = cells_from(sphere)[origin(sphere, state, task.rules.frame)]
         self._reached = reached[~step.stopped]
+
         info = {
             "object": objects,
             "view": views,
@@ -482,12 +490,14 @@ class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         """Return the next observation of each episode, of a new one where an episode ended."""
         if not self._cohorts:
             raise SessionError("no episode is under way; call reset")
+
         actions = rows(actions, self.num_envs, len(self.task.sphere), "actions")
         wheres = [members[cohort.episodes.running] for cohort, members in self._cohorts]
         parts = [
             cohort.step(actions[where])
             for (cohort, _), where in zip(self._cohorts, wheres, strict=True)
         ]
+
         order = np.argsort(np.concatenate(wheres))
         names = ("observation", "change", "price", "ended")
         joined = {
@@ -497,20 +507,24 @@ class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
             name: np.concatenate([part.info[name] for part in parts])[order]
             for name in parts[0].info
         }
+
         seen = Seen(**joined, info=info)
         self._cohorts = [
             (cohort, members) for cohort, members in self._cohorts if len(cohort.episodes.running)
         ]
+
         over = np.flatnonzero(seen.ended)
         if len(over) == 0:
             return seen, info
         last = seen.observation.copy()
         now = {name: values.copy() for name, values in info.items()}
+
         fresh = self.task.begin(len(over), self.np_random)
         self._cohorts.append((fresh, over))
         seen.observation[over] = fresh.first.observation
         for name, values in fresh.first.info.items():
             now[name][over] = values
+
         return seen, now | {
             "final_obs": last,
             "_final_obs": seen.ended,
@@ -560,17 +574,20 @@ class RecogniseMeshEnv(TaskEnv):
         given = Rules(**rules)
         found = find_models(models)
         sphere = ViewSphere.named(viewpoints)
+
         self._models = Models(
             NetworkRecogniser(found.recogniser), open_maps(found.maps, given.maps)
         )
         classes = self._models.classes
         calibration = self._models.recogniser.calibration
+
         objects: list[tuple[str, Callable[[], Mesh]]] = [
             (name, partial(sample_mesh, name)) for name in SAMPLES
         ]
         if meshes is not None:
             entries = [e for e in list_dataset(Path(meshes)) if split in (None, e.split)]
             objects = [(e.label, partial(load_mesh, e.path)) for e in entries]
+
         if not objects:
             raise DatasetError(
                 f"{meshes}: holds no meshes of the split {split!r}; split=None takes all that"
@@ -581,6 +598,7 @@ class RecogniseMeshEnv(TaskEnv):
                 raise DatasetError(
                     f"the recogniser knows no class {label!r}; it knows {', '.join(classes)}"
                 )
+
         labels = np.array([classes.index(label) for label, _ in objects])
         self._camera = lru_cache(CAMERAS)(
             lambda k: SimulatedCamera(objects[k][1](), size, sphere.distance)
@@ -588,6 +606,7 @@ class RecogniseMeshEnv(TaskEnv):
         super().__init__(
             Task(labels, classes, sphere, calibration, self._rendered, given, balanced)
         )
+
         self._depth = depth
         if depth:
             image = gymnasium.spaces.Box(0, np.float32(sphere.distance + 1), (size, size))

@@ -154,11 +154,13 @@ def _accuracy(p: Predictions, judged: dict[int, NDArray], weights: Float) -> pd.
     clean = np.where(p.conflicting, 0.0, 1.0)
     by_shape = {} if p.of_size is None else _judged(p.by_shape())
     best = published_recognisers(comparable_classes(p), len(p.sphere))
+
     rows = []
     for n_views, logits in judged.items():
         scored = {"accuracy": logits, "clean_accuracy": logits}
         if by_shape:
             scored["shape_accuracy"] = by_shape[n_views]
+
         right = np.stack([(x.argmax(2) == p.labels[:, None]).mean(1) for x in scored.values()], 1)
         bottom = np.stack([clean if measure == "clean_accuracy" else one for measure in scored], 1)
         for label, over, value, low, high in _means(
@@ -181,6 +183,7 @@ def _accuracy(p: Predictions, judged: dict[int, NDArray], weights: Float) -> pd.
                         beside,
                     )
                 )
+
     return pd.DataFrame(
         rows,
         columns=["n_views", "label", "measure", "objects", "value", "low", "high", "published"],
@@ -197,6 +200,7 @@ def _fusion(
         metrics.calibration_error(c.ravel(), r.ravel())
         for c, r in zip(confidence, right, strict=True)
     ]
+
     return pd.DataFrame(
         {
             "n_views": np.arange(1, len(right) + 1),

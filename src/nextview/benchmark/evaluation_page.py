@@ -127,6 +127,7 @@ def page(e: Evaluation, p: Predictions, settings: dict[str, Any]) -> str:
     counts = e.accuracy.query("n_views == 1 and measure == 'accuracy' and label != ''").set_index(
         "label"
     )["objects"]
+
     made = {
         **origin(p, settings),
         "calibration": (
@@ -136,6 +137,7 @@ def page(e: Evaluation, p: Predictions, settings: dict[str, Any]) -> str:
         "bootstrap": f"{settings['samples']} samples of objects; seed {settings['seed']}",
         "calibration error": "15 bins of equal width (Guo et al. 2017)",
     }
+
     return render(
         "evaluate.html",
         p=p,

@@ -193,6 +193,7 @@ def confusion_matrix(counts: NDArray, classes: Sequence[str], title: str) -> Fig
     share = counts / np.maximum(counts.sum(1, keepdims=True), 1)
     figure, axes = new_figure(4.6, 4.4)
     axes.imshow(share, cmap="Blues", vmin=0, vmax=1)
+
     few = len(classes) <= 15
     ticks = np.arange(len(classes))
     names = [words(name) for name in classes]
@@ -201,6 +202,7 @@ def confusion_matrix(counts: NDArray, classes: Sequence[str], title: str) -> Fig
         axes.text(
             j, i, f"{100 * share[i, j]:.0f}", color="white" if share[i, j] > 0.55 else INK, **text
         )
+
     size = 8.5 if few else 5
     axes.set_xticks(ticks, names, rotation=50, ha="right", rotation_mode="anchor", fontsize=size)
     axes.set_yticks(ticks, names, fontsize=size)
@@ -208,6 +210,7 @@ def confusion_matrix(counts: NDArray, classes: Sequence[str], title: str) -> Fig
     axes.tick_params(length=0)
     axes.set(xlabel="answer", ylabel="true class")
     axes.set_title(title, fontsize=10, loc="left")
+
     return figure
 
 
@@ -263,11 +266,13 @@ def _reliability(curves: dict[str, tuple[pd.DataFrame, dict]], when: str, title:
         xlim=(0, 1.03), ylim=(0, 1.03), xlabel=f"confidence {when}", ylabel="share that was right"
     )
     axes.set_aspect("equal")
+
     for label, (table, look) in curves.items():
         rows = table[table["answers"] >= 20]
         axes.plot(rows["confidence"], rows["accuracy"], linewidth=1.1, label=label, **look)
         size = 8 + 220 * rows["answers"] / rows["answers"].sum()
         colour = look["color"]
+
         axes.scatter(
             rows["confidence"],
             rows["accuracy"],
@@ -277,6 +282,7 @@ def _reliability(curves: dict[str, tuple[pd.DataFrame, dict]], when: str, title:
             linewidths=0,
             clip_on=False,
         )
+
     legend(axes, title)
     return figure
 
@@ -303,6 +309,7 @@ def fusion_curve(e: Evaluation) -> Figure:
     """Draw accuracy, with intervals, and confidence against the number of fused views."""
     figure, axes = new_figure(4.6, 3.5)
     table = e.fusion
+
     axes.fill_between(
         table["n_views"], table["low"], table["high"], color=BLUE, alpha=0.15, linewidth=0
     )
@@ -318,6 +325,7 @@ def fusion_curve(e: Evaluation) -> Figure:
     axes.plot(
         table["n_views"], table["confidence"], color=ACCENT, linestyle=":", label="mean confidence"
     )
+
     published = e.accuracy.query("n_views == 1 and label == '' and measure == 'accuracy'")[
         "published"
     ].iloc[0]
@@ -331,6 +339,7 @@ def fusion_curve(e: Evaluation) -> Figure:
             clip_on=False,
             label="published, one view",
         )
+
     axes.set_xscale("log")
     ticks = [k for k in (1, 2, 3, 5, 10, 20, 40, 80) if k <= len(table)]
     axes.set_xticks(ticks, [str(k) for k in ticks])

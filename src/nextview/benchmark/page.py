@@ -66,6 +66,7 @@ def render(template: str, **given: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+
     pages.tests["oracle"] = knows_truth
     pages.filters |= {
         "percent": percent,
@@ -76,6 +77,7 @@ def render(template: str, **given: Any) -> str:
         "between": lambda number: f"{100 * number.low:.1f} {NONE} {percent(number.high)}",
         "p_value": lambda p: NONE if np.isnan(p) else "< 0.001" if p < 0.001 else f"{p:.3f}",
     }
+
     return pages.get_template(template).render(given)
 
 

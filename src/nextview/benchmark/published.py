@@ -83,6 +83,7 @@ def published(
     n = published_classes(classes)
     if n is None:
         return None
+
     over_classes = measure.startswith("class_")
     kind = measure.removeprefix("class_")
     if policy in FIVE_VIEWS and kind == "accuracy":
@@ -96,12 +97,14 @@ def published(
         column = {name: rows[name][COLUMNS[policy]] for name in classes}
     else:
         return None
+
     if label is not None:
         return column[label]
     if over_classes:
         return float(np.mean(list(column.values())))
     if policy in FIVE_VIEWS or n != 10:
         return None
+
     row = "instance_accuracy" if kind == "accuracy" else "instance_travel"
     return read_table("table5_nbv_modelnet10")[row][COLUMNS[policy]]
 
@@ -145,6 +148,7 @@ def published_map(
     column = {"mse": "loss"}.get(kind, kind)
     if n is None or column not in ("loss", "d0", "d_le_1", "d_lt_2"):
         return None
+
     if label is None and over_classes == (kind != "mse"):
         for row in read_rows("table4_map_prediction"):
             if (row["model"].lower(), int(row["classes_train"]), int(row["classes_test"])) == (
@@ -153,6 +157,7 @@ def published_map(
                 n,
             ):
                 return float(row[column])
+
     if (name, n) == (LEM, 10) and (label is not None or over_classes):
         rows = read_table("table7_lem_per_class_modelnet10")
         return (

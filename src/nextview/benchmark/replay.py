@@ -196,6 +196,7 @@ def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcome:
     if stopping is None or paths.fixed:
         confident = np.zeros(len(e), bool)
         at = count - 1
+
     else:
         last = min(paths.views.shape[1], stopping.max_views)
         seen = paths.seen[:, :last]
@@ -206,10 +207,12 @@ def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcome:
                     "a stopping rule of your own needs whole beliefs: replay with beliefs=True"
                 )
             beliefs = paths.confidences[:, :, None]
+
         there = (np.diff(seen, prepend=0) > 0) & (paths.views[:, :last] >= 0)
         reached = stopping.reached(beliefs[:, :last], np.maximum(seen, 1)) & there
         confident = np.asarray(reached.any(1))
         at = np.where(confident, reached.argmax(1), np.minimum(count, last) - 1)
+
     moved = paths.travel[e, at], paths.arc[e, at]
     views = np.where(np.arange(paths.views.shape[1]) <= at[:, None], paths.views, -1)
     return Outcome(paths.answers[e, at], paths.confidences[e, at], at + 1, confident, *moved, views)

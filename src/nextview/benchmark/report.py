@@ -64,14 +64,17 @@ def report(
     check_new(path, overwrite)
     if figures is not None:
         check_new(figures, overwrite, folder=True)
+
     loaded = load(results)
     if loaded.tables.sweep.empty:
         raise ResultsError(
             f"{results}: holds fixed views only; a report needs a policy that chooses"
         )
+
     views, why_not = pictures_of(loaded.predictions, store)
     with new_file(path, overwrite) as part:
         part.write_text(page(loaded, views, why_not), encoding="utf-8")
+
     if figures is not None:
         at = board.headline_threshold(loaded.settings["thresholds"])
         tables = loaded.tables
@@ -189,10 +192,12 @@ def _figures(results: Results, best: str, at: float) -> dict[str, Figure]:
         measure: draw.threshold_curve(results, measure)
         for measure in ("class_accuracy", "accuracy")
     }
+
     varying = [
         budget for budget in ("n_views", "travel_all") if sweep[budget].max() > sweep[budget].min()
     ]
     figures |= {budget: draw.budget_curve(results, budget) for budget in varying}
+
     ran = [
         n
         for n in dict.fromkeys((reference, best, *draw.ceiling(results)))
@@ -285,6 +290,7 @@ def _images(store: ViewStore, name: str, views: list[int]) -> dict[str, str]:
     """Return images of views as data URIs; in scenes the target has a colour of its own."""
     row = store.names.index(name)
     images: NDArray = store.image(row)
+
     if store.attributes.scene:
         scene = scene_views(store, row)
         shade = (
@@ -293,6 +299,7 @@ def _images(store: ViewStore, name: str, views: list[int]) -> dict[str, str]:
         images = np.where(
             scene.owner[..., None] > 0, OWNERS[scene.owner] * (0.35 + 0.65 * shade), 255
         ).astype(np.uint8)
+
     found = {}
     for view in views:
         file = BytesIO()

@@ -118,10 +118,12 @@ def run_benchmark(
     track(run_grid(grid, names), len(names), "replaying policies")
     if not grid.paths:
         raise EntryError("\n".join(grid.failures.values()))
+
     rng = np.random.default_rng([settings.seed, 1])
     tables = summarise(
         grid, settings.reference, settings.samples, rng, promised, sorted(set(settings.views))
     )
+
     table = grid.specs.predictions
     made = asdict(settings) | {
         "command": command(),
@@ -136,6 +138,7 @@ def run_benchmark(
         "threshold_decay": grid.threshold_decay,
         "valley_classes": [table.classes[i] for i in grid.specs.valley_classes(LEM)],
     }
+
     with new_folder(out, overwrite, last="benchmark.json", withdraw=True) as part:
         _write_episodes(part / "episodes.parquet", grid)
         for name, frame in vars(tables).items():

@@ -159,19 +159,23 @@ def _summary(
         i for i, key in enumerate(keys) if key[2] in ("accuracy", "travel_moved", "n_views")
     ]
     keys += [(keys[i][0], keys[i][1], f"class_{keys[i][2]}") for i in of_class]
+
     over_objects = st.estimate(top, bottom, weights)
     over_classes = st.estimate(top[:, of_class], bottom[:, of_class], weights, labels)
     value, drawn = (
         np.concatenate(both, -1) for both in zip(over_objects, over_classes, strict=True)
     )
+
     numbers = zip(keys, value, *st.interval(drawn), strict=True)
     rows = [(*key, *number, published(key[0], key[1], key[2], classes)) for key, *number in numbers]
+
     for policy, threshold, ends in cells:
         right = grid.right(ends.answer)
         error = metrics.calibration_error(ends.confidence, right.ravel())
         between = np.std([right[:, labels == label].mean() for label in np.unique(labels)])
         rows.append((policy, threshold, "calibration_error", error, np.nan, np.nan, None))
         rows.append((policy, threshold, "class_accuracy_std", between, np.nan, np.nan, None))
+
     columns = ["policy", "threshold", "measure", "value", "low", "high", "published"]
     return _frame(rows, columns), {key: drawn[:, i] for i, key in enumerate(keys)}
 
@@ -180,6 +184,7 @@ def _per_class(grid: Grid, cells: list[Cell], weights: Float) -> pd.DataFrame:
     p = grid.specs.predictions
     classes = comparable_classes(grid.specs.predictions)
     keys, top, bottom = _columns(grid, cells, ("accuracy", "travel_moved"))
+
     rows = []
     for index in np.unique(p.labels):
         here = p.labels == index
@@ -190,6 +195,7 @@ def _per_class(grid: Grid, cells: list[Cell], weights: Float) -> pd.DataFrame:
         ):
             beside = published(policy, threshold, measure, classes, label)
             rows.append((policy, threshold, label, measure, *number, beside))
+
     return _frame(
         rows, ["policy", "threshold", "label", "measure", "value", "low", "high", "published"]
     )
@@ -204,6 +210,7 @@ def _tests(
     for (policy, threshold), measure in product(right, TESTED):
         if policy == reference or (reference, threshold) not in right:
             continue
+
         ours = (policy, threshold, measure)
         theirs = (reference, threshold, measure)
         difference = np.array([value[ours] - value[theirs]])
@@ -211,11 +218,13 @@ def _tests(
         found = np.stack([difference, *st.interval(samples), st.bootstrap_p(difference, samples)])[
             :, 0
         ]
+
         tested = measure == "accuracy"
         paired = (
             st.mcnemar(right[policy, threshold], right[reference, threshold]) if tested else np.nan
         )
         rows.append((*ours, *found, paired))
+
     table = _frame(
         rows, ["policy", "threshold", "measure", "difference", "low", "high", "p", "mcnemar"]
     )

@@ -80,6 +80,7 @@ def stored_rows(p: Predictions, name: str) -> NDArray:
             "these predictions do not say which view store they were made from, so they lack "
             + name
         )
+
     try:
         store = ViewStore.open(p.store)
         store.array(name)

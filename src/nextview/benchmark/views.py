@@ -70,16 +70,19 @@ def measured(
     references = [name for name in references if name in names]
     weights = resample(len(grid.specs.predictions), samples, np.random.default_rng([grid.seed, 1]))
     rows: list[tuple] = []
+
     for k in n_views:
         ends = [after(grid.paths[name], k) for name in names]
         right = dict(zip(names, (grid.right(e.answer) for e in ends), strict=True))
         columns = {(name, "accuracy"): r.mean(0) for name, r in right.items()}
         travel = (e.travel.reshape(grid.runs, -1).mean(0) for e in ends)
         columns |= {(name, "travel"): mean for name, mean in zip(names, travel, strict=True)}
+
         for name, reference in product(names, references):
             columns[name, f"to_{reference}"] = (
                 columns[name, "accuracy"] - columns[reference, "accuracy"]
             )
+
         top = np.stack(list(columns.values()), 1)
         low, high = interval(ratio(top, np.ones_like(top), weights))
         value = dict(zip(columns, top.mean(0), strict=True))
@@ -91,10 +94,12 @@ def measured(
                 else np.nan
             )
             rows.append((name, k, measure, value[name, measure], low[i], high[i], p))
+
         gap = value[CEILING, f"to_{references[0]}"] if CEILING in names and references else 0.0
         for name in names:
             share = value[name, f"to_{references[0]}"] / gap if gap > 0 else np.nan
             rows.append((name, k, "share_of_gap", share, np.nan, np.nan, np.nan))
+
     table = pd.DataFrame(rows, columns=COLUMNS[:-1])
     table["p_holm"] = holm(
         np.where(~table["policy"].map(knows_truth).astype(bool), table["p"], np.nan)

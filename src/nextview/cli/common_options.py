@@ -110,10 +110,12 @@ class ObjectOptions:
                 option = field.name.replace("_", "-")
                 kind = "mesh files" if folder else "folders of captured views"
                 raise UsageError(f"{path}: --{option} is for {kind}, and this is none")
+
         if folder:
             return self._captured(path)
         if isinstance(self.up, tuple):
             raise UsageError(f"{path}: the up axis of a mesh file is y or z, not {self.up}")
+
         mesh = load_mesh(path, self.up, self.unit, self.max_faces, self.largest_part)
         for sentence in mesh_warnings(mesh):
             console.print(f"{path}: {sentence}", style="yellow", soft_wrap=True)

@@ -113,12 +113,14 @@ def _pose_in_words(result: Recognition) -> list[str]:
             if result.why_no_pose
             else []
         )
+
     others = [each for each in result.pose_candidates if not np.array_equal(each.pose, result.pose)]
     rows = [" ".join(f"{value:9.4f}" for value in row) for row in result.pose]
     lines = [
         f"From the frame of its scan into {result.poses_in}, metres ({result.pose_uncertainty}):",
         *rows,
     ]
+
     if others:
         alike = ", ".join(
             f"{printable(each.thing)} {each.probability:.2f}" for each in others[:SHOWN_POSES]
@@ -148,6 +150,7 @@ def episode_as_json(
         if view.azimuth_bins is not None and view.observation.seen:
             bins = view.azimuth_bins[view.belief.argmax()]
             best = {"degrees": 360 * int(bins.argmax()) / len(bins), "belief": bins.max()}
+
         one: dict[str, Any] = {
             "view": view.index,
             "elevation": view.angles[0],
@@ -170,6 +173,7 @@ def episode_as_json(
             "travel_radians": view.arc,
         }
         views.append(one | {"warnings": [warning.message for warning in view.warnings]})
+
     parts = ("answer", "confidence", "beliefs", "most_like", "unknown", "novelty", "radius")
     whole = {"name": name} | {part: getattr(result, part) for part in parts}
     whole |= _pose_as_json(result)
@@ -195,12 +199,14 @@ def _pose_as_json(result: Recognition) -> dict[str, Any]:
         }
         for each in result.pose_candidates
     ]
+
     symmetry = result.symmetry
     axes = (
         None
         if symmetry is None
         else [{"axis": each.axis, "order": each.order} for each in symmetry]
     )
+
     return {
         "pose": result.pose,
         "pose_of": result.pose_of,

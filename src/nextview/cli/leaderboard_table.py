@@ -29,6 +29,7 @@ def print_leaderboard(results: Results) -> None:
     tables = results.tables
     reference = results.settings["reference"]
     console = Terminal()
+
     if not tables.sweep.empty:
         at = board.headline_threshold(results.settings["thresholds"])
         console.print(_policies(board.leaderboard(tables, at), at, reference))
@@ -40,10 +41,12 @@ def print_leaderboard(results: Results) -> None:
         for sentence in (board.nothing_differs(tables, at, reference), few):
             if sentence:
                 console.print(sentence)
+
     if not tables.views.empty:
         print(markdown(as_rows(tables.views)), end="")
     if sentence := board.level_differences(tables, reference):
         console.print(sentence)
+
     for r in board.promised_risks(tables):
         if r.broken:
             wrong = (
@@ -90,6 +93,7 @@ def print_evaluation(found: Evaluation) -> None:
         "without duplicates": "clean_accuracy",
         "size not known": "shape_accuracy",
     }
+
     shown = Table("share of right answers", "one view", f"all {views} views")
     for heading, measure in (lines | {"mean of classes": "class_accuracy"}).items():
         if (1, "", measure) in right:
@@ -97,6 +101,7 @@ def print_evaluation(found: Evaluation) -> None:
                 heading, *(_cell(right[n_views, "", measure], 3) for n_views in (1, views))
             )
     console.print(shown)
+
     headings = {
         "mse": "MSE",
         "d0": "d = 0",
@@ -104,6 +109,7 @@ def print_evaluation(found: Evaluation) -> None:
         "d_lt_2": "d < 2",
         "regret": "regret",
     }
+
     maps = found.maps[(found.maps["by"] == "network") & (found.maps["label"] == "")]
     scores = numbers(maps, "map", "measure")
     names = maps["map"].unique()
@@ -114,6 +120,7 @@ def print_evaluation(found: Evaluation) -> None:
         )
     if len(names):
         console.print(shown)
+
     for name, why in found.left_out.items():
         console.print(f"{name}: {why}")
 

@@ -29,20 +29,24 @@ def main(arguments: list[str] | None = None) -> None:
 def _run(arguments: list[str]) -> None:
     if arguments == ["--version"]:
         return print(f"nextview {__version__}")
+
     words = list(takewhile(lambda word: not word.startswith("-"), arguments[:2]))
     for count in range(len(words), 0, -1):
         if (name := " ".join(words[:count])) in COMMANDS:
             return _call(name, arguments[count:])
+
     group = words[0] if words else ""
     listed = {
         name: command.line
         for name, command in COMMANDS.items()
         if f"{name} ".startswith(f"{group} ".lstrip())
     }
+
     if len(words) == 2 or not listed:
         name = " ".join(words) if listed else group
         near = did_you_mean(name, [*COMMANDS, *(name.split()[0] for name in COMMANDS)])
         raise UsageError(f"there is no command {name!r}{near or '; nextview --help lists all'}")
+
     usage = f"nextview {group} COMMAND".replace("  ", " ")
     print(f"usage: {usage} [ARGUMENTS]\n\n{ABOUT}\n")
     for name, line in listed.items():

@@ -45,6 +45,7 @@ def predict(
     """
     if out.suffix != ".npz":
         raise UsageError(f"{out}: predictions are one .npz file; end the name in .npz")
+
     found = find_models(models)
     cards = {}
     for item in found.maps if maps is None else maps:
@@ -55,11 +56,13 @@ def predict(
                 f" {', '.join(found.maps)}"
             )
         cards[name] = find_card(card or found.maps[name])
+
     what = find_card(recogniser or found.recogniser), cards, split, held_out, not by_shape
     follow(
         predicting.predict(store, out, *what, **vars(workers), overwrite=overwrite),
         f"predicting {store.name}",
     )
+
     for line in summed_up(Predictions.load(out)):
         console.print(line)
     console.print(

@@ -61,9 +61,11 @@ def recognise(
         raise UsageError(
             "--figure and --record are of one object; give them with one file or folder"
         )
+
     check_file(output.figure, output.overwrite)
     check_file(output.record, output.overwrite, (".rrd",))
     system = load(**vars(looking))
+
     failed = []
     for one in (path, *more):
         name = one.name if source.sensor is None else f"{one.name} through {source.sensor}"
@@ -74,6 +76,7 @@ def recognise(
                 raise
             failed.append(str(error))
             console.print(f"left out: {error}", style="yellow", soft_wrap=True)
+
     if failed:
         raise UsageError(f"{len(failed)} of {1 + len(more)} were left out, see above")
 

@@ -58,12 +58,14 @@ def scenes(
             raise UsageError("--levels and --held-out are for cluttered tables, not for --room")
         _draw_rooms(meshes, out, scenes, split, unit, seed, workers)
         return
+
     if unit is not None:
         raise UsageError("--unit is for --room: on cluttered tables lengths are in object radii")
     total = len(scene_drawing.tasks(meshes, out, levels, scenes, seed, split, held_out))
     drawn = scene_drawing.draw_scenes(
         meshes, out, levels, scenes, seed, split, **vars(workers), held_out=held_out
     )
+
     failed = track_all(drawn, total, f"drawing {out.name}")
     if len(failed) == total:
         raise DatasetError(f"{out}: none of the {total} scenes can be drawn; see the reasons above")

@@ -107,14 +107,17 @@ def check(
     """
     views = ViewStore.open(store)
     done = int(views.done.sum())
+
     damaged = track_all(view_store.check(store, **vars(workers)), done, f"checking {store.name}")
     for reason in views.attributes.failures.values():
         console.print(f"left out: {reason}", style="yellow")
+
     missing = len(views) - done - len(views.attributes.failures)
     console.print(
         f"{store}: {done - len(damaged)} objects are sound, {len(damaged)} damaged, {missing} not"
         " rendered"
     )
+
     if damaged:
         raise DatasetError(
             f"{store}: {len(damaged)} of {done} objects are damaged; remove the store and render"

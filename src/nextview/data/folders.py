@@ -371,6 +371,7 @@ def _note_file(content: _Content, root: Path, place: Path, suffixes: tuple[str, 
     suffix = place.suffix.lower()
     wanted = suffix in suffixes
     shape = wanted or suffix in OTHER_SHAPES
+
     if place.name.startswith("."):
         if shape:
             content.left_out.append((place, HIDDEN))

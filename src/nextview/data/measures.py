@@ -130,11 +130,13 @@ def names_of(names: Sequence[str], meshes: bool) -> tuple[str, ...]:
         return tuple(
             name for name, measure in all_measures().items() if meshes or measure.needs == "depth"
         )
+
     names = tuple(
         dict.fromkeys(
             each for name in names for each in (all_measures() if name == "all" else (name,))
         )
     )
+
     for name in names:
         if find_measure(name).needs == "mesh" and not meshes:
             raise MeasureError(

@@ -113,6 +113,7 @@ def _plan(
         *(line for card in own for line in card.training.commands),
         command(),
     ]
+
     return replace(
         Predictions.of_objects_in(store, objects, recogniser.classes),
         models={
@@ -148,12 +149,14 @@ def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> 
     inputs = {spec: from_store(spec, store, i) for spec in specs}
     batches = [slice(start, start + BATCH) for start in range(0, len(store.sphere), BATCH)]
     elevation = store.sphere.elevation
+
     found: dict[str, Any] = {}
     for name, network in maps.items():
         answers = [network.from_inputs(inputs[network.card.input][batch]) for batch in batches]
         for kind in answers[0]:
             values = np.concatenate([answer[kind] for answer in answers])
             found[f"map/{name}{kind.removeprefix(network.card.kind)}"] = values
+
     evidence = [
         recogniser.from_inputs(inputs[recogniser.card.input][batch], elevation[batch])
         for batch in batches
@@ -162,9 +165,13 @@ def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> 
     bins = [e.azimuth_bins for e in evidence if e.azimuth_bins is not None]
     if bins:
         found["azimuth_bins"] = np.concatenate(bins)
+
+    # a view in which nothing is seen says nothing
     nothing = np.array([not enough_shows(depth > 0) for depth in store.read("depth", i)])
     for name in {"azimuth_bins", "logits"} & found.keys():
         found[name][nothing] = 0
+
+    # complete or not at all
     aside = file.with_name(f"{i}.part.npz")
     np.savez(aside, **found)
     aside.replace(file)

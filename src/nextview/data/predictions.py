@@ -75,10 +75,12 @@ class Predictions:
         v = len(self.sphere)
         c = len(self.classes)
         h = len(self.calibration.hypotheses) or c
+
         if n == 0:
             raise PredictionsError("these predictions hold no objects")
         if c == 0:
             raise PredictionsError("these predictions name no classes")
+
         bins = () if self.azimuth_bins is None else self.azimuth_bins.shape[-1:]
         shapes: dict[str, tuple[int, ...]] = {
             "logits": (n, v, c),
@@ -89,6 +91,7 @@ class Predictions:
             "azimuth_bins": (n, v, h, *bins),
             "of_size": (n, c),
         }
+
         for name, values in (
             self._arrays() | {f"map {name}": values for name, values in self.maps.items()}
         ).items():
@@ -107,6 +110,7 @@ class Predictions:
             if values.dtype.kind == "f" and not np.isfinite(values).all():
                 bad = self.names[int(np.isfinite(values.reshape(n, -1)).all(1).argmin())]
                 raise PredictionsError(f"{name} of object {bad} is not a finite number")
+
         if not all(isinstance(name, str) for name in (*self.names, *self.classes, *self.models)):
             raise PredictionsError("a name in these predictions is no text")
         if len(set(self.names)) < n:
@@ -269,9 +273,11 @@ class Predictions:
             raise DatasetError(
                 f"{store.path}: the recogniser does not know the class {unknown[0]!r}"
             )
+
         group = duplicate_groups(store.measure())
         several = np.zeros((group.max() + 1, len(store.classes)), bool)
         several[group, store.labels] = True
+
         return cls(
             logits=np.zeros((len(objects), len(store.sphere), len(classes)), np.float32),
             maps={},
@@ -304,6 +310,7 @@ class Predictions:
             f"valley/{name}": np.array(classes, np.str_)
             for name, classes in self.valley_classes.items()
         }
+
         arrays |= {
             "format": FORMAT,
             "names": np.array(self.names),
@@ -318,6 +325,7 @@ class Predictions:
             ),
             "commands": np.array(self.commands, np.str_),
         }
+
         with new_file(Path(path), overwrite) as part, part.open("wb") as file:
             np.savez_compressed(file, **arrays)
 

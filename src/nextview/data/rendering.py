@@ -110,10 +110,12 @@ def render_object(camera: Camera, sphere: ViewSphere, size: int) -> dict[str, np
     image = np.empty((len(sphere), size, size), np.uint8)
     depth = np.empty((len(sphere), size, size), np.uint16)
     points = np.empty((len(sphere), POINTS, 3), np.float32)
+
     for view, pose in enumerate(sphere.poses):
         observation = camera.observe(pose)
         image[view], points[view] = observation.picture, observation.points
         depth[view] = np.rint(observation.depth / DEPTH_UNIT).clip(max=np.iinfo(np.uint16).max)
+
     return {
         "image": image,
         "depth": depth,
@@ -254,8 +256,10 @@ def _check(path: Path, sphere: ViewSphere, size: int, options: RenderOptions) ->
     whole(options.seed, "the seed", 0, 2**63 - 1)
     whole(options.noise_seed or 0, "the seed of the noise", 0, 2**63 - 1)
     number(options.deform.stretch, "a stretch", 0)
+
     if options.unit not in (None, *UNITS):
         raise UsageError(f"the unit is one of {', '.join(UNITS)}, not {options.unit}")
+
     if options.meshes is not None and options.deform != Deform():
         raise UsageError(
             "scenes are rendered as they are: objects in them are neither stretched nor rotated"
@@ -264,9 +268,11 @@ def _check(path: Path, sphere: ViewSphere, size: int, options: RenderOptions) ->
         raise UsageError(
             "scenes are rendered as they are: the largest part is of a folder of meshes"
         )
+
     if sphere.distance + 1 > FARTHEST:
         most = f"{FARTHEST:.2f} object radii, so the distance can be {FARTHEST - 1:.2f} at most"
         raise DatasetError(f"{path}: depth is stored up to {most}, not {sphere.distance:g}")
+
     if options.sensor is None:
         return None
     if (size, sphere.distance) != (SIZE, DISTANCE):

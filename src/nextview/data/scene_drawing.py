@@ -127,6 +127,7 @@ def draw_scenes(
     dataset = Path(dataset)
     out = Path(out)
     wanted = tasks(dataset, out, levels, scenes, seed, split, held_out)
+
     there = next(out.rglob(f"*@*{SUFFIX}"), None)
     if there is None:
         check_new(out, folder=True)
@@ -134,15 +135,18 @@ def draw_scenes(
         raise DatasetError(
             f"{there}: was drawn with another seed; give another folder or the same seed"
         )
+
     done = {task for task in wanted if task.path.exists()}
     yield from ((task.name, None) for task in wanted if task in done)
     todo = [task for task in wanted if task not in done]
+
     files: dict[str, list[str]] = {}
     for entry in list_dataset(dataset):
         files.setdefault(entry.split, []).append(entry.path.relative_to(dataset).as_posix())
     meshes = {
         name: Meshes(dataset.absolute(), tuple(sorted(found))) for name, found in files.items()
     }
+
     with writing(out):
         for task, result in each(partial(_draw, meshes, seed), todo, workers, scheduler):
             reason = f"{task.name}: {result}" if isinstance(result, WorkerDied) else result
@@ -183,11 +187,13 @@ def tasks(
     if scenes is not None:
         whole(scenes, "the number of scenes at each level", 1, MOST_SCENES)
     whole(seed, "a seed", 0, 2**31 - 1)
+
     found: list[Task] = []
     entries = select(list_dataset(dataset), dataset, split, held_out)
     for one in dict.fromkeys(entry.split for entry in entries):
         mine = [entry for entry in entries if entry.split == one]
         order = np.random.default_rng([seed, *one.encode()]).permutation(len(mine))
+
         for number in range(len(mine) if scenes is None else scenes):
             entry = mine[order[number % len(mine)]]
             for level in levels:
@@ -196,6 +202,7 @@ def tasks(
                 found.append(
                     Task(entry.path.relative_to(dataset).as_posix(), one, level, name, path)
                 )
+
     return found
 
 
@@ -230,6 +237,7 @@ def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) ->
     others = [file for file in meshes.files if file != target]
     others = [others[i] for i in rng.permutation(len(others))[:POOL]]
     hiding = _Hiding(mesh)
+
     for _ in range(LAYOUTS_TRIED):
         placed = _layout(
             mesh,
@@ -240,6 +248,7 @@ def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) ->
             LEVELS[level] + rng.uniform(-SPREAD, SPREAD),
             rng,
         )
+
         if placed is not None:
             scene = Scene(mesh, tuple(item for _, item in placed))
             objects = tuple(thing for thing, _ in placed if isinstance(thing, Placement))
@@ -262,6 +271,7 @@ class _Hiding:
         eyes = []
         rays = []
         views = []
+
         for view, pose in enumerate(GRID.poses):
             seen = camera.observe(pose)
             rows, columns = np.nonzero(seen.depth)
@@ -272,6 +282,7 @@ class _Hiding:
             rays.append(seen.depth[rows, columns, None] * ahead @ pose[:3, :3].T)
             eyes.append(np.broadcast_to(pose[:3, 3], rays[-1].shape))
             views.append(np.full(len(rows), view))
+
         self.eyes, self.rays = (np.concatenate(rows).astype(np.float32) for rows in (eyes, rays))
         self.views = np.concatenate(views)
         self.whole = np.maximum(np.bincount(self.views, minlength=len(GRID)), 1)
@@ -316,12 +327,14 @@ def _layout(
     floor = float(mesh.vertices[:, 2].min())
     placed: list[Thing] = []
     free = np.ones(len(hiding.views), bool)
+
     for _ in range(TRIES):
         share = hiding.share(free)
         if len(placed) >= FEWEST + walls and share <= goal + TOLERANCE:
             return placed
         if len(placed) == MOST:
             return None
+
         short = (
             bool(others)
             and sum(isinstance(thing, Placement) for thing, _ in placed) < FEWEST_OBJECTS
@@ -330,6 +343,8 @@ def _layout(
         item = _stood(thing, folder, floor)
         if item is None or np.abs(item.footprint).max() > TABLE:
             continue
+
+        # it overlaps with what is there
         if (
             min(
                 separation(item.footprint, other)
@@ -338,6 +353,7 @@ def _layout(
             < GAP
         ):
             continue
+
         left = free & ~hiding.by(item, free)
         if goal - TOLERANCE <= hiding.share(left) <= share - LEAST[level] * (not short):
             placed.append((thing, item))

@@ -231,6 +231,7 @@ class ViewStore:
             raise DatasetError(
                 f"{self.path}: the array {name} cannot be opened ({error})"
             ) from None
+
         shape, dtype, _ = self._layout(name)
         wanted = ((len(self), *shape), (1, *shape), dtype)
         if (
@@ -238,6 +239,7 @@ class ViewStore:
             or (array.shape, array.chunks, str(array.dtype)) != wanted
         ):
             raise DatasetError(f"{self.path}: the array {name} is not one of {wanted[0]} {dtype}")
+
         return array
 
     def _remedy(self, name: str) -> str:

@@ -52,6 +52,7 @@ def read_off(data: bytes, max_faces: int = MAX_FACES) -> Shape:
     text = plain_text(data)
     if b"#" in text:
         text = re.sub(rb"#[^\n]*", b"", text)
+
     header = OFF_HEADER.match(text)
     if header is None:
         raise MeshError("it does not begin with OFF")
@@ -59,11 +60,13 @@ def read_off(data: bytes, max_faces: int = MAX_FACES) -> Shape:
         raise MeshError(
             f"it begins with {header[0].strip().decode()}, a kind of OFF that is not read here"
         )
+
     counts = OFF_COUNTS.match(text, header.end())
     if counts is None:
         raise MeshError("the counts of vertices and faces are missing")
     n_vertices = int(counts[1])
     n_faces = int(counts[2])
+
     body = text[counts.end() :]
     plain = _plain_off(body, n_vertices, n_faces)
     return plain or _off_by_lines(body, n_vertices, n_faces, max_faces)
@@ -82,14 +85,17 @@ def _plain_off(body: bytes, n_vertices: int, n_faces: int) -> Shape | None:
         or re.search(rb"\n[ \t]*\n", body)
     ):
         return None
+
     middle = int(ends[n_vertices - 1])
     try:
         vertices = numbers(body[:middle])
         faces = whole_numbers(body[middle:])
     except ValueError:
         return None
+
     if len(vertices) != 3 * n_vertices or len(faces) != 4 * n_faces or (faces[::4] != 3).any():
         return None
+
     triangles = faces.reshape(-1, 4)[:, 1:]
     return None if triangles.max() >= n_vertices else (vertices.reshape(-1, 3), triangles)
 
@@ -219,6 +225,8 @@ def _check_glb(data: bytes) -> None:
         raise MeshError("it does not begin with glTF, or is not as long as it announces")
     gltf = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
     accessors, nodes, views = (gltf.get(key, []) for key in ("accessors", "nodes", "bufferViews"))
+
+    # what trimesh would allocate without reading it
     taken = [
         a["count"]
         for a in accessors
@@ -226,12 +234,15 @@ def _check_glb(data: bytes) -> None:
     ]
     if sum(taken) > len(data) or sum(view["byteLength"] for view in views) > 2 * len(data):
         raise MeshError("it announces more numbers than its bytes hold")
+
     if any("uri" in buffer for buffer in gltf.get("buffers", [])):
         raise MeshError("it keeps numbers outside of its binary part, which is not read here")
+
     roots = gltf["scenes"][gltf.get("scene", 0)].get("nodes", []) if "scenes" in gltf else []
     placed = [*roots, *(child for node in nodes for child in node.get("children", []))]
     if len(placed) != len(set(placed)) or len(nodes) > GLB_NODES or min(placed, default=0) < 0:
         raise MeshError(f"a node is in its scene twice, or there are more than {GLB_NODES:,}")
+
     for part in (part for mesh in gltf.get("meshes", []) for part in mesh["primitives"]):
         used = [accessors[part[key]] for key in ("indices",) if key in part]
         used.append(accessors[part["attributes"]["POSITION"]])

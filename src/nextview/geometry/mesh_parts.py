@@ -182,6 +182,7 @@ def mesh_doubts(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> tu
     parts = Parts.of(vertices, faces)
     size = _size(vertices)
     times = size / _size(parts.points_of(parts.main))
+
     if times >= FAR_PARTS:
         largest = (
             f"it has {len(parts.areas):,} parts, and is {times:.1f} times as large as its main part"
@@ -194,6 +195,7 @@ def mesh_doubts(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> tu
         doubts.append(
             f"{plane}: is it a table? Cut it off, or use --largest-part if it is a part of its own"
         )
+
     return tuple(doubts)
 
 

@@ -320,6 +320,7 @@ def _table(
     width += sum(column.count.itemsize for column in element.lists if column.count is not None)
     if at + element.rows * width > len(data):
         return None
+
     scalars: Scalars = {}
     lists: Lists = {}
     for column in element.properties:
@@ -327,17 +328,20 @@ def _table(
             scalars[column.name] = np.ndarray(element.rows, column.kind, data, at, width)
             at += column.kind.itemsize
             continue
+
         length = lengths[column.name]
         counts = np.ndarray(element.rows, column.count, data, at, width)
         if (counts != length).any():
             return None
         at += column.count.itemsize
+
         size = column.kind.itemsize
         held = np.ndarray(
             (element.rows, length), column.kind, data, at if length else 0, (width, size)
         )
         lists[column.name] = (held.reshape(-1), counts.astype(np.int64))
         at += size * length
+
     return scalars, lists, np.array(width)
 
 
@@ -443,14 +447,17 @@ def _say_what_it_is(elements: list[Element], n_vertices: int) -> None:
         if element.name == "vertex"
         for column in element.properties
     }
+
     if "range_grid" in names:
         one_side = "a range grid, which is one depth image: it shows the object from one side"
         raise MeshError(
             f"it holds {one_side}; merge the grids of all sides to a mesh, or teach depth frames"
         )
+
     if "f_dc_0" in columns:
         raise MeshError(
             f"it holds {n_vertices:,} Gaussian splats and no faces; export a mesh from the splats"
             " first"
         )
+
     raise MeshError(no_faces(n_vertices, {"nx", "ny", "nz"} <= columns))

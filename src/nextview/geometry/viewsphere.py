@@ -54,12 +54,15 @@ def look_at_origin(elevation: ArrayLike, azimuth: ArrayLike, distance: float = D
     elevation, azimuth = np.broadcast_arrays(
         np.asarray(elevation, float), np.asarray(azimuth, float)
     )
+
     ce = np.cos(elevation)
     se = np.sin(elevation)
     ca = np.cos(azimuth)
     sa = np.sin(azimuth)
+
     outward = np.stack([ce * ca, ce * sa, se], -1)
     right = np.stack([-sa, ca, np.zeros_like(sa)], -1)
+
     pose = np.zeros((*elevation.shape, 4, 4))
     pose[..., :3, :] = np.stack(
         [right, np.cross(-outward, right), -outward, distance * outward], -1
@@ -388,6 +391,7 @@ def viewpoints_of(what: str | Viewpoints | Any) -> Viewpoints:
     """
     if isinstance(what, Viewpoints):
         return what
+
     if not isinstance(what, str):
         try:
             given = np.asarray(what, np.float64)
@@ -398,13 +402,16 @@ def viewpoints_of(what: str | Viewpoints | Any) -> Viewpoints:
         return Directions(
             given[:, :3, 3] if given.ndim == 3 and given.shape[1:] == (4, 4) else given
         )
+
     if fibonacci := re.fullmatch(r"fibonacci:(\d{1,5})", what):
         return Directions.fibonacci(int(fibonacci[1]))
     if rings := re.fullmatch(r"rings:(-?\d+(?:\.\d+)?(?:,-?\d+(?:\.\d+)?)*)x(\d{1,4})", what):
         return ViewSphere(tuple(map(float, rings[1].split(","))), int(rings[2]))
+
     if what not in LAYOUTS:
         others = "rings:ELEVATIONSxAZIMUTHS such as rings:0,30,60x12, and fibonacci:N"
         raise UsageError(
             f"no viewpoints are called {what!r}; there are {', '.join(LAYOUTS)}, {others}"
         )
+
     return LAYOUTS[what]

@@ -160,10 +160,12 @@ class Discriminate:
         of_class = np.bincount(self.classes, joint.sum(1))
         if len(of_class) < 2:
             return None
+
         two = np.argsort(-of_class, kind="stable")[:2]
         of_two = np.where((self.classes == two[:, None])[..., None], joint, -1)
         hypothesis, azimuth = np.divmod(of_two.reshape(2, -1).argmax(1), AZIMUTHS)
         ring, bins = self._remembered(azimuth, here)
+
         shown = self.views[hypothesis[:, None], ring, bins].astype(np.float64)
         return Rivals(
             two,

@@ -175,6 +175,7 @@ def mirrored_features(
     n = sphere.azimuths
     facets = 2 * classes + min(3, classes)
     window = np.arange(sphere.rings * 3).reshape(-1, 3)[:, ::-1].ravel()
+
     blocks = {
         "belief": np.arange(facets),
         "view": np.arange(facets),
@@ -184,6 +185,7 @@ def mirrored_features(
         ),
         VISIBILITY: mirrored(sphere),
     } | {name: mirrored(sphere) if name.endswith(SPHERE) else window for name in maps_of(inputs)}
+
     chosen = [blocks[name] for name in ordered(inputs)]
     begins = np.cumsum([0, *map(len, chosen)])
     return np.concatenate([begin + block for begin, block in zip(begins, chosen, strict=False)])

@@ -162,11 +162,16 @@ class OffGrid:
         n = self.grid.azimuths
         order = np.argsort(self.grid.elevations, kind="stable")
         heights = np.radians(self.grid.elevations)[order]
+
+        # the rows of the grid below and above each view
         row = np.interp(self.sphere.elevation, heights, np.arange(len(heights)))
         low = np.minimum(np.floor(row + 1e-9).astype(np.int64), len(heights) - 1)
         up = np.maximum(row - low, 0.0)
+
+        # the columns to the left and to the right
         left = np.floor(ahead + 1e-9).astype(np.int64)
         right = np.maximum(ahead - left, 0.0)
+
         rows = np.arange(len(values))[:, None]
         found = np.zeros(ahead.shape)
         for ring, of_ring in ((low, 1 - up), (np.minimum(low + 1, len(heights) - 1), up)):

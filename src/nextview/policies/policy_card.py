@@ -79,10 +79,12 @@ class PolicyCard(
         classes = found if isinstance(found, int) else len(found)
         if classes != len(self.classes):
             raise ModelError(f"the table is of {classes} classes, not {len(self.classes)}")
+
         if isinstance(table, GainTable):
             return read_gain(sphere, table, self.scope, weights, self.sha256)
         if self.kind == "fixed-ring":
             return FixedRing(sphere, table.ring, table.steps)
+
         try:
             if self.kind == "fixed-sequence":
                 return FixedSequence(sphere, np.array(table.moves, np.int64), self.scope)
@@ -132,6 +134,7 @@ def read_policy(path: Path, sphere: Viewpoints, classes: Sequence[str] | None = 
     """
     card = read_policy_card(path)
     weights = path.with_suffix(".onnx")
+
     if not isinstance(sphere, ViewSphere) or (card.elevations, card.azimuths) != (
         sphere.elevations,
         sphere.azimuths,
@@ -142,6 +145,7 @@ def read_policy(path: Path, sphere: Viewpoints, classes: Sequence[str] | None = 
         )
     if classes is not None and card.classes != tuple(classes):
         raise OtherUseError(f"{path}: was learned for other classes ({', '.join(card.classes)})")
+
     try:
         return card.make(sphere, weights)
     except (ModelError, PolicyError) as error:

@@ -80,13 +80,16 @@ def make_policy(
         return _at_travel_weight(
             make_policy(plain, sphere, valley_classes, classes, maps), name, travel_weight
         )
+
     if _on_grid(name, maps) and not isinstance(sphere, ViewSphere):
         raise PolicyError(f"policy {name} needs viewpoints on rings")
     if name in POLICIES:
         return POLICIES[name](sphere)
+
     by_map = map_policy(name, sphere, valley_classes, maps)
     if by_map is not None:
         return by_map
+
     card = _card(name)
     if card is not None and is_memory(card):
         return _of_memory(card, sphere, None if classes is None else tuple(classes))
@@ -99,9 +102,11 @@ def make_policy(
                 f"{name}: this policy values no views that could be weighed by what shows"
             )
         return VisibleGain(policy, policy.travel_weight)
+
     path = plugins(GROUP).get(name, name)
     if ":" in path:
         return _import_policy(path, sphere)
+
     if name == DISCRIMINATE:
         raise PolicyError(
             "the policy discriminate is for taught things: models ycb, or those of nextview learn"
@@ -110,6 +115,7 @@ def make_policy(
         raise PolicyError(
             f"{name} knows what no robot does: it takes part in nextview benchmark alone"
         )
+
     known = [*policy_names(), *map_policy_names(maps), *bundled_policies(), f"{VISIBLE}{DEFAULT}"]
     raise PolicyError(
         "no policy is called"

@@ -112,6 +112,7 @@ def run_onnx(
         raise ModelError(
             f"{path}: fails when it is run ({one_line(str(error), LONGEST)})"
         ) from None
+
     declared = {end.name: end.shape for end in session.get_outputs()}
     for name, values in zip(names, answers, strict=True):
         wanted = (len(inputs), *declared[name][1:])
@@ -124,6 +125,7 @@ def run_onnx(
             )
         if not np.isfinite(values).all():
             raise ModelError(f"{path}: gives {name} that are not finite numbers")
+
     return answers
 
 
@@ -167,6 +169,7 @@ def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
     """
     session = open_onnx(card.path, card.sha256, threads)
     kind = "tensor(float)" if card.input.kind == "cloud" else "tensor(uint8)"
+
     ends = {end.name: end for end in session.get_outputs()}
     shapes: dict[str, Shape] = {"map": (None, 3)} | (
         {"sphere": (None, None)} if card.output == "sphere" else {}
@@ -174,11 +177,13 @@ def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
     if card.is_recogniser:
         bins = {BINS_OUTPUT: (len(card.classes), card.azimuth_bins)} if card.azimuth_bins else {}
         shapes = {"logits": (len(card.classes),), **bins}
+
     taken = session.get_inputs()
     called = f" called {INPUT}" if card.is_recogniser else ""
     if len(taken) != 1 or (called and taken[0].name != INPUT):
         wants = ", ".join(end.name for end in taken) or "nothing"
         raise ModelError(f"{card.path}: takes {wants}, not one input{called}")
+
     check_end(card.path, taken[0], kind, card.input.shape)
     for name, shape in shapes.items():
         if name not in ends:
@@ -262,6 +267,7 @@ class NetworkRecogniser:
         """
         if not isinstance(self.novelty, Novelty):
             raise ModelError(f"{self.card.path}: has no novelty score of views")
+
         if self._known is None:
             self._known = Features(self._threads)
             known = self.novelty.neighbours.shape[1]
@@ -271,6 +277,7 @@ class NetworkRecogniser:
                 raise ModelError(
                     f"{file}: was fitted to {known} features, not {self._known.size}; {hint}"
                 )
+
         inputs = np.concatenate(
             [from_observations(self._known.card.input, [o]) for o in observations]
         )

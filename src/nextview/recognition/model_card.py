@@ -400,11 +400,13 @@ def find_models(models: str | Path) -> Collection:
     folder = Path(models)
     if str(models) in COLLECTIONS:
         return _with_memory(Collection(BUNDLED / f"{COLLECTIONS[str(models)]}.json", bundled, {}))
+
     if not folder.is_dir():
         known = ", ".join(COLLECTIONS)
         raise ModelError(
             f"{folder}: is neither a folder with models nor the name of bundled ones ({known})"
         )
+
     networks = dict[str, list[Path]]()
     policies = dict[str, Path]()
     for path in sorted(folder.glob("*.json")):
@@ -413,6 +415,7 @@ def find_models(models: str | Path) -> Collection:
             networks.setdefault(read_card(path).kind, []).append(path)
         else:
             policies[path.stem] = path
+
     for kind, paths in networks.items():
         if len(paths) > 1:
             raise ModelError(
@@ -421,6 +424,7 @@ def find_models(models: str | Path) -> Collection:
             )
     if "recogniser" not in networks:
         raise ModelError(f"{folder}: holds no card of a recogniser; nextview learn makes one")
+
     own = {kind: paths[0] for kind, paths in networks.items()}
     return _with_memory(Collection(own.pop("recogniser"), bundled | own, policies))
 

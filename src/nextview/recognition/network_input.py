@@ -55,6 +55,7 @@ def from_observations(spec: InputSpec, observations: Sequence[Observation]) -> N
         raise ObservationError("views are a list of Observations")
     if not observations:
         raise ObservationError("there is no view to look at")
+
     first = observations[0]
     for other in observations[1:]:
         if other.depth.shape != first.depth.shape or not np.array_equal(
@@ -63,6 +64,7 @@ def from_observations(spec: InputSpec, observations: Sequence[Observation]) -> N
             raise ObservationError(
                 "views that are handed in together are from one camera: of one size and one pinhole"
             )
+
     array = {"geometry": "depth", "image": "picture", "cloud": "points"}[spec.kind]
     views = np.stack([getattr(o, array) for o in observations])
     return _network_input(spec, views, np.stack([o.pose for o in observations]), first.intrinsics)

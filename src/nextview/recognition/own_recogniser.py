@@ -151,12 +151,14 @@ def own_recogniser(given: Any) -> Recogniser:
     if isinstance(given, str):
         name = given
         given = _named(given)
+
     if isinstance(given, NetworkRecogniser | OwnRecogniser):
         return given
     if isinstance(given, type):
         raise ModelError(
             f"a recogniser is an object, not the class {given.__name__}: call it first"
         )
+
     if callable(getattr(given, "belief", None)):
         return OwnJointRecogniser(given, name)
     if not callable(given):

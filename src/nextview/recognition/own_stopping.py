@@ -101,6 +101,7 @@ def own_stopping(rule: Rule | str, threshold: float, max_views: int) -> Stopping
     """
     found: Any = rule
     name = rule if isinstance(rule, str) else getattr(rule, "__name__", "a rule of your own")
+
     if isinstance(rule, str):
         if ":" not in rule:
             raise UsageError(
@@ -110,6 +111,7 @@ def own_stopping(rule: Rule | str, threshold: float, max_views: int) -> Stopping
             lambda said: UsageError(f"the stopping rule {rule} cannot be made ({said})")
         ):
             found = plugin(rule)
+
     if isinstance(found, type) and issubclass(found, Stopping):
         return found(threshold, max_views)
     if not callable(found):

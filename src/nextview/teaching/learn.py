@@ -644,10 +644,12 @@ def _card(
         Thing(source.name, str(source.path), int(count), _symmetries_of(arrays))
         for (source, arrays), count in zip(taught, poses, strict=True)
     )
+
     features = find_card(FEATURES)
     novelty, usual = (
         tuple(map(tuple, np.round(rows, 4).tolist())) for rows in (fit.quantiles, fit.usual)
     )
+
     return ModelCard(
         NAME,
         "recogniser",

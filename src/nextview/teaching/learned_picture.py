@@ -117,6 +117,7 @@ def _draw_pairs(
         else "no two things are confused"
     )
     page.text(MARGIN, top, heading, size=11, color=INK, weight="bold")
+
     each = (PAGE_WIDTH - 2 * MARGIN + GAP) / MOST_PAIRS
     for k, (first, second, share) in enumerate(pairs):
         left = MARGIN + k * each

@@ -217,18 +217,23 @@ def _of_capture(capture: Capture) -> Arrays:
     seen = [view for view in camera.object.observations if view.seen]
     if not seen:
         raise ObservationError(f"{capture.folder}: none of its frames shows an object")
+
     directions = np.stack([direction_of(view.pose) for view in seen])
     each = embeddings(seen)
     kept = np.arange(len(seen)) % 4 < 3 if len(seen) > 4 else np.ones(len(seen), bool)
     arc = angle_between(GRID.directions[:, None], directions[kept][None])
     views = np.where(arc.min(1)[:, None] < NEAR, each[kept][arc.argmin(1)], 0)
+
+    # the views that are held out
     rest = np.flatnonzero(~kept) if not kept.all() else np.arange(len(seen))
     held_out = np.resize(rest, HELD_OUT)
     angles = np.stack(
         [np.arcsin(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])], 1
     )
+
     found = camera.object.object_frame
     surface = fuse(camera.object.sightings, found.radius, capture.folder.name)
+
     return {
         "views": views.reshape(1, len(RINGS), AZIMUTHS, -1).astype(np.float16),
         "rotations": found.axes[None].astype(np.float32),

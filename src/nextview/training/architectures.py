@@ -117,6 +117,7 @@ class LiteNet(RecogniserNetwork):
         inputs = 32
         self.stem = nn.Conv2d(channels, inputs, 3, 2, 1, bias=False)
         self.norm0 = _norm(inputs)
+
         stages: list[nn.Module] = []
         for expansion, width, kernel, stride, length in STAGES:
             for index in range(length):
@@ -125,6 +126,7 @@ class LiteNet(RecogniserNetwork):
                 stages.append(InvertedBottleneck(inputs, expansion, width, kernel, step, skip))
                 inputs = width
         self.stages = nn.Sequential(*stages)
+
         self.head = nn.Conv2d(inputs, FEATURES, 1, bias=False)
         self.norm1 = _norm(FEATURES)
         self.relu = nn.ReLU6(inplace=True)
@@ -160,6 +162,7 @@ class Residual(nn.Module):
         kernels = [(3, width, stride), (3, width, 1)]
         if narrow:
             kernels = [(1, width, 1), (3, width, stride), (1, outputs, 1)]
+
         self.length = len(kernels)
         before = inputs
         for k, (kernel, after, step) in enumerate(kernels, 1):
@@ -168,6 +171,7 @@ class Residual(nn.Module):
             )
             self.add_module(f"bn{k}", nn.BatchNorm2d(after))
             before = after
+
         self.downsample = None
         if stride > 1 or inputs != outputs:
             self.downsample = nn.Sequential(

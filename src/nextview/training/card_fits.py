@@ -338,29 +338,35 @@ def fit_size(
     views = ViewStore.open(store)
     predicted = Predictions.load(predictions)
     table = predicted.deduplicate().by_shape()
+
     if np.isnan(views.radii[views.done]).any():
         raise DatasetError(
             f"{store}: does not know the unit of its meshes; tell it with nextview render --unit"
         )
+
     rows = views.rows_of(predicted.names)
     if (rows < 0).any():
         raise PredictionsError(
             f"{predictions}: holds {predicted.names[rows.argmin()]!r}, which {store} does not"
         )
+
     with card_to_fit(card) as (model, write):
         _check_recogniser(card, model, predictions, table)
         data = for_fitting(table)
         judged = views.rows_of(table.names)
+
         of_training = (
             views.done & (views.splits == "train") & np.isin(views.attributes.labels, table.classes)
         )
         taught = np.setdiff1d(np.flatnonzero(of_training), rows)
+
         classes = np.array(
             [table.classes.index(name) if name in table.classes else -1 for name in views.classes]
         )
         log_density = densities(
             views.radii[taught], classes[views.labels[taught]], len(table.classes)
         )
+
         size, before, after = fit_weight(data, views.radii[judged], log_density)
         about = f"{len(taught)} objects of the training split, weighed on {len(data)} others"
         write("size", about, [views, table], size=size)
@@ -450,17 +456,20 @@ def fit_valleys(
         card: of the map network; "valley_classes" is written into it.
     """
     table = Predictions.load(predictions)
+
     with card_to_fit(card, recogniser=False) as (model, write):
         if model.kind not in table.maps or table.models.get(model.kind) != (
             model.name,
             model.sha256,
         ):
             raise PredictionsError(f"{predictions}: holds no maps by {card}")
+
         kept = _held_out(predictions, table, card, model)
         by_class = valley_gains(kept.sphere, kept.logits, kept.maps[model.kind], kept.labels)
         classes = tuple(table.classes[c] for c, gain in by_class.items() if gain > 0)
         gains = {table.classes[c]: round(gain, 4) for c, gain in by_class.items()}
         judge = table.models.get("recogniser", ("a recogniser without a card", ""))[0]
+
         about = f"{len(kept)} objects of the training split, judged by {judge}"
         write("valleys", about, [table], valley_classes=classes, valley_gain=gains)
     return FittedValleys(classes, gains, len(kept))

@@ -142,19 +142,23 @@ def _shrink(graph: onnx.GraphProto, bits: int) -> None:
     for weight in graph.initializer:
         if weight.data_type != TensorProto.FLOAT or np.prod(weight.dims) < 1024:
             continue
+
         name = weight.name
         values = numpy_helper.to_array(weight)
         small = f"{name}_small"
+
         if bits == 16 or values.size < SMALL:
             weight.CopyFrom(numpy_helper.from_array(values.astype(np.float16), small))
             nodes.append(helper.make_node("Cast", [small], [name], to=TensorProto.FLOAT))
             continue
+
         scale = np.abs(values).max(tuple(range(1, values.ndim)), keepdims=True) / 127
         scale[scale == 0] = 1
         weight.CopyFrom(numpy_helper.from_array(np.rint(values / scale).astype(np.int8), small))
         scales.append(numpy_helper.from_array(scale.astype(np.float32), f"{name}_scale"))
         nodes.append(helper.make_node("Cast", [small], [f"{name}_steps"], to=TensorProto.FLOAT))
         nodes.append(helper.make_node("Mul", [f"{name}_steps", f"{name}_scale"], [name]))
+
     nodes += list(graph.node)
     graph.initializer.extend(scales)
     del graph.node[:]
@@ -230,11 +234,13 @@ def export_recogniser(
     views = ViewStore.open(store)
     runs = [read_run(each) for each in folders]
     recipes = [read_recipe(each, RecogniserRecipe) for each in folders]
+
     if len({(recipe.input, recipe.size) for recipe in recipes}) > 1:
         raise ModelError(
             f"{folders[0]} and the others do not take the same: geometry or image, of one size"
         )
     spec = InputSpec(recipes[0].input, recipes[0].size)
+
     held_out = frozenset.intersection(*(frozenset(each.held_out) for each in runs))
     validated = frozenset.intersection(*(frozenset(each.validation) for each in runs))
     validation = np.flatnonzero(np.isin(views.names, list(validated)))
@@ -242,10 +248,12 @@ def export_recogniser(
         raise ModelError(
             f"{folders[0]} and the others have no validation object of {store} in common"
         )
+
     networks = [
         run_network(each, recipe, views) for each, recipe in zip(folders, recipes, strict=True)
     ]
     shipped = ShippedRecogniser(networks).eval()
+
     card = ModelCard(
         name or f"recogniser-{views.dataset}",
         "recogniser",
@@ -258,6 +266,7 @@ def export_recogniser(
         note=note,
         held_out=tuple(sorted(held_out)),
     ).made_by(*views.commands, *(line for each in runs for line in each.commands), command())
+
     inputs = load_inputs(store, spec.size, spec.kind)
     judging = deduplicate(views, validation)
     sample = np.stack([inputs[i, 5] for i in validation[:: max(1, len(validation) // 8)][:8]])
@@ -310,14 +319,17 @@ def export_map(
     kind = map_name(recipe.measure)
     shape = (-1, views.sphere.rings, 3)
     good: Good = "peak" if recipe.measure == CONFIDENCE else find_measure(recipe.measure).good
+
     values, there = target_of(
         recipe.measure, views, None if predictions is None else Predictions.load(predictions)
     )
+
     validation = np.flatnonzero(
         views.done & there & (views.splits == "train") & np.isin(views.names, noted.held_out)
     )
     if len(validation) == 0:
         raise ModelError(f"{run}: was not trained on {store}")
+
     shipped = ShippedMap(load_run(map_network(recipe, views.sphere), run)).eval()
     spec = InputSpec(recipe.input, 0 if recipe.input == "cloud" else recipe.size)
     card = ModelCard(
@@ -335,6 +347,7 @@ def export_map(
         note=note,
         held_out=noted.held_out,
     ).made_by(*noted.commands, command())
+
     judging = deduplicate(views, validation)
     true = values[judging][:, views.sphere.windows].reshape(shape)
     seen = partial(from_store, spec, views)

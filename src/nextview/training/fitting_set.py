@@ -83,17 +83,20 @@ def load_sensed(paths: Sequence[Path], table: Predictions) -> list[Predictions]:
     for path in paths:
         other = Predictions.load(path).by_shape()
         row = {name: i for i, name in enumerate(other.names)}
+
         missing = [name for name in table.names if name not in row]
         if missing:
             raise PredictionsError(
                 f"{path}: lacks {len(missing)} of the {len(table)} objects, {missing[0]} among them"
             )
+
         if (other.classes, other.sphere, other.models) != (
             table.classes,
             table.sphere,
             table.models,
         ):
             raise PredictionsError(f"{path}: is of other models, classes or viewpoints")
+
         loaded.append(other.of_objects(np.array([row[name] for name in table.names])))
     return loaded
 

@@ -142,6 +142,7 @@ def walk(
             value = np.take_along_axis(candidate_values(table, moment, recipe.objective), view, 1)
             free = np.take_along_axis(state.free, view, 1)
             mean = (value * free).sum(1, keepdims=True) / np.maximum(free.sum(1, keepdims=True), 1)
+
             seen = features(sphere, state, recipe.inputs, recipe.frame)
             parts.append(
                 (seen.astype(np.float32), (value - mean).astype(np.float32), free, state.episodes)
@@ -166,26 +167,31 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
     n = len(data)
     c = len(data.classes)
     e = recipe.networks_per_fold
+
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     features_flip = mirrored_features(sphere, c, recipe.inputs, recipe.frame)
     widths = list(pairwise([len(features_flip), recipe.hidden, recipe.hidden, len(sphere)]))
     scales = [(2 / inputs) ** 0.5 for inputs, _ in widths[:-1]] + [0.0]
+
     first = [
         scale * torch.randn(e, *width, generator=generator)
         for scale, width in zip(scales, widths, strict=True)
     ]
     biases = [torch.zeros(e, 1, outputs) for _, outputs in widths]
     networks = Perceptrons(first, biases, features_flip, mirrored(sphere))
+
     drawn = rng.multinomial(n, np.full(n, 1 / n), size=e)
     weights = torch.from_numpy(drawn * data.weights).float()
     optimiser = torch.optim.AdamW(
         networks.parameters(), recipe.lr, weight_decay=recipe.weight_decay
     )
+
     batches = -(-recipe.episodes * (recipe.max_views - 1) * n // recipe.batch)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, recipe.lr, total_steps=recipe.epochs * batches
     )
     policies: list[Policy] = [(Random, RandomAll)[i % 2](sphere) for i in range(recipe.episodes)]
+
     for _ in range(recipe.epochs):
         *states, objects = walk(table, policies, recipe, rng)
         for batch in np.array_split(rng.permutation(len(objects)), batches):
@@ -195,6 +201,7 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
             value, free = (
                 torch.where(flipped, a[:, networks.cells_flip], a) for a in (value, free)
             )
+
             error = (((networks.each(seen) - value) ** 2) * free).sum(-1) / free.sum(-1).clamp(
                 min=1
             )
@@ -202,6 +209,7 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
             ((weights[:, objects[batch]] * error).sum() / len(batch)).backward()
             optimiser.step()
             schedule.step()
+
         policy = Gain(sphere, c, Score(deepcopy(networks)), recipe.inputs, frame=recipe.frame)
         policies[::2] = [policy] * len(policies[::2])
         yield policy
@@ -259,6 +267,7 @@ def write_gain(card: Path, policy: Gain, about: PolicyCard, features: NDArray[np
     weights = card.with_suffix(".onnx")
     networks = policy.score.networks
     expected = Score(deepcopy(networks).double())(features.astype(np.float64))
+
     with new_folder(card.parent, overwrite=True, last=card.name) as part:
         made = part / weights.name
         export_onnx(
@@ -269,14 +278,18 @@ def write_gain(card: Path, policy: Gain, about: PolicyCard, features: NDArray[np
             made,
             bits=32,
         )
+
         sha256 = sha256_of(made)
         answers = open_onnx(made, sha256, threads=1).run(
             ["cells"], {FEATURES_INPUT: features.astype(np.float32)}
         )[0]
+
+        # what is written has to answer as what was trained
         difference = float(np.abs(answers - expected).max())
         if not difference <= BOUND * max(1.0, float(np.abs(expected).max())):
             differ = f"differ by {difference:.2g} from the networks'"
             raise ModelError(f"{weights}: ONNX Runtime's answers {differ}; not written")
+
         table = msgspec.to_builtins(
             GainTable(policy.classes, policy.inputs, policy.travel_weight, policy.frame)
         )
@@ -390,10 +403,12 @@ def _sources(
         raise PredictionsError(
             f"{validation}: is of other classes or viewpoints than {predictions}"
         )
+
     if sensed and validation is not None:
         raise UsageError(
             "predictions through sensors choose with those that are learned from: no --validation"
         )
+
     variants = load_sensed(sensed, table)
     sources = (
         [(predictions, table)]
@@ -401,6 +416,7 @@ def _sources(
         else [(predictions, table), (validation, other)]
     )
     sources += zip(sensed, variants, strict=True)
+
     for path, p in sources:
         _check(path, p, recipe)
     return table, other, variants, sources

@@ -138,6 +138,7 @@ def load_inputs(path: Path, size: int, kind: InputKind = "geometry") -> PackedVi
     target = inputs_path(path, size, kind)
     store = ViewStore.open(path)
     file = target / "views.lz4"
+
     try:
         with np.load(target / "index.npz") as index:
             places = index["places"]
@@ -147,6 +148,7 @@ def load_inputs(path: Path, size: int, kind: InputKind = "geometry") -> PackedVi
             raise ValueError(f"{len(packed)} bytes of {places[..., 1].sum()}")
     except DAMAGED as error:
         raise DatasetError(f"{target}: is damaged ({error}); {AGAIN}") from None
+
     there = places[..., 1].all(1)
     if there.shape != (len(store),) or (store.done & ~there).any():
         raise DatasetError(f"{target}: lacks objects that {path} holds by now; {AGAIN}")

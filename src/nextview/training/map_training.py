@@ -155,15 +155,18 @@ class MapModule(L.LightningModule):
         predicted, *transforms = self(batch[0])
         predicted = predicted.float()
         true = batch[1]
+
         near = predicted[..., self.window]
         goal = true[..., self.window]
         error = F.mse_loss(near, goal)
         self.log("mse", error, prog_bar=True, on_step=False, on_epoch=True, sync_dist=True)
+
         if self.recipe.extent == "sphere":
             error = (error + F.mse_loss(predicted, true)) / 2
         if self.recipe.peak_weight:
             lost = peak_loss(near / self.recipe.peak_sharpness, goal, self.recipe.peak_reach)
             error = error + self.recipe.peak_weight * lost
+
         return error + self.recipe.orthogonality_weight * sum(
             orthogonality(t.float()) for t in transforms
         )
@@ -223,9 +226,11 @@ def train_map(
         seen = (
             views.rows("points") if cloud else ready_inputs(store, recipe.size, recipe.input, track)
         )
+
         windows, judging = (
             Windows(seen, values, views.sphere, part, recipe, part is training) for part in parts
         )
+
         L.seed_everything(recipe.seed, verbose=False)
         module = MapModule(recipe, views.sphere, recipe.epochs * len(windows))
         if weights and cloud:
@@ -236,6 +241,7 @@ def train_map(
                 weights,
                 head=weights.is_dir() and "measure" in read_run(weights).recipe,
             )
+
         return fit(module, windows, judging, out, "validation_mse", "min", hardware).net.eval()
 
     train_once(out, run, fitted)
@@ -268,11 +274,14 @@ def target_of(
             "a map of the confidence is learned from predictions: give those of the recogniser"
         )
         raise UsageError(of_them if predictions is None else alone)
+
     if predictions is None:
         return normalise_per_object(store.measure(measure)), store.done
+
     here = store.rows_of(predictions.names)
     if (here < 0).all() or predictions.sphere != store.sphere:
         raise PredictionsError(f"these predictions are not of the views of {store.path}")
+
     values = np.zeros((len(store), len(store.sphere)), np.float32)
     values[here[here >= 0]] = confidence_maps(predictions.logits, predictions.labels)[here >= 0]
     return values, values.any(1) & store.done

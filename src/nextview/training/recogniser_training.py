@@ -156,10 +156,12 @@ class RecogniserModule(L.LightningModule):
         x = batch[0].float() / 255
         label = batch[1]
         mirrored = torch.zeros_like(label, dtype=torch.bool)
+
         if self.recipe.augment:
             x, mirrored = augment(x)
         x = x.to(memory_format=torch.channels_last)
         logits, *likely = self.net(x)
+
         loss = F.cross_entropy(logits.float(), label, label_smoothing=self.recipe.smoothing)
         if likely:
             lost = side_loss(
@@ -171,6 +173,7 @@ class RecogniserModule(L.LightningModule):
                 "side_loss", lost, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(x)
             )
             loss = loss + self.recipe.azimuth_bins_weight * lost
+
         self.log(
             "loss",
             loss,

@@ -94,16 +94,19 @@ def rollout(
     data = table.data
     sphere = table.data.sphere
     everything = np.arange(len(table.data))
+
     starts = rng.integers(len(sphere), size=len(data))
     if table.scenes is not None:
         starts = np.where(
             table.scenes.reachable, rng.random(table.scenes.reachable.shape), -1
         ).argmax(1)
+
     constrain, visible = sight_of(table.scenes, everything)
     length = FixedLength(max_views=n_views)
     run = run_episodes(
         data.evidence, sphere, policy, starts, length, rng, data.calibration, constrain, visible
     )
+
     visited = np.zeros((len(data), len(sphere)), bool)
     travel = np.zeros(len(data))
     for k, step in enumerate(run.steps, 1):
@@ -116,6 +119,7 @@ def rollout(
         )
         state = constrain(replace(state, visibility=visible(state) if visibility else None))
         yield DecisionState(state, step.total, travel, step.seen)
+
         if k < len(run.steps):
             travel = travel + sphere.travel[step.views, step.next_views]
 

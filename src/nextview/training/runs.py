@@ -349,10 +349,12 @@ def new_run(
         DatasetError: the initial weights were trained on a part of the validation objects.
     """
     before = [line for source in made for line in source.commands]
+
     if weights is not None and weights.is_dir():
         earlier = read_run(weights)
         own = set(held_out)
         seen = sorted(own - set(earlier.held_out))
+
         if 0 < len(seen) < len(own):
             what = (
                 f"{len(seen)} of the {len(own)} objects that this network must not have seen,"
@@ -361,10 +363,12 @@ def new_run(
             raise ModelError(
                 f"{weights}: was trained on {what}; take its --seed and --validation-share"
             )
+
         before += earlier.commands
         weights /= "network.pt"
     if weights is not None and not weights.is_file():
         raise ModelError(f"{weights}: there is no such checkpoint")
+
     sha256 = None if weights is None else sha256_of(weights)
     names = tuple(held_out)
     return Run(asdict(recipe), sha256, names, names, tuple(dict.fromkeys((*before, command()))))
@@ -388,6 +392,7 @@ def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
         if (out / "run.json").exists():
             before = read_record(out / "run.json", Run, "a training run")
             recipe = msgspec.to_builtins(run.recipe)
+
             changed = [name for name, value in recipe.items() if before.recipe.get(name) != value]
             faults = [
                 f"another recipe ({name} was {before.recipe.get(name)}, not {recipe[name]})"
@@ -395,6 +400,7 @@ def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
             ]
             faults += ["other first weights"] * (before.weights != run.weights)
             faults += ["other objects"] * (before.held_out != run.held_out)
+
             if faults:
                 again = "give the same options to resume it, or another folder"
                 raise ModelError(f"{out}: holds a run of {faults[0]}; {again}")
@@ -410,6 +416,7 @@ def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
                     " empty one"
                 )
             write_record(out / "run.json", run)
+
         if not (out / "network.pt").exists():
             save_whole(train().state_dict(), out / "network.pt")
 

@@ -41,12 +41,14 @@ def walk_card(walk: Walk) -> str:
             f'{STYLE}<div class="nv"><p>No view was taken yet. The policy begins at view'
             f" {walk.start}.</p></div>"
         )
+
     view = walk.views[-1]
     classes = walk.session.models.classes
     best = int(view.belief.argmax())
     believed = f"{escape(classes[best])} <small>{view.belief[best]:.1%}</small>"
     believed = believed if view.observation.seen else "Nothing is seen"
     goes_on = "It would stop here." if walk.stopped else "Not sure enough yet: it would look again."
+
     parts = [
         f"<h3>{believed}</h3><p>{goes_on}</p>",
         _pose(walk),
@@ -154,6 +156,7 @@ def rivals_card(walk: Walk, view: int | None = None) -> str:
     at = walk.next_view if view is None else view
     if rivals is None or at is None:
         return ""
+
     both = [(name, _image(picture, 96)) for name, picture in walk.remembered(rivals, at)]
     differ = 1 - rivals.alike
     if isinstance(walk.sphere, ViewSphere):
@@ -163,6 +166,7 @@ def rivals_card(walk: Walk, view: int | None = None) -> str:
         both.append(
             ("how much they differ from each view", _image(heat(grid), CELL * grid.shape[1]))
         )
+
     known = not np.isnan(differ[at])
     said = (
         f"they differ by {differ[at]:.2f}, {np.nanmax(differ):.2f} at most"
@@ -207,6 +211,7 @@ def _beliefs(walk: Walk) -> str:
 def _steps(walk: Walk) -> str:
     classes = walk.session.models.classes
     rows = []
+
     for step, view in enumerate(walk.views, 1):
         best = int(view.belief.argmax())
         warnings = ", ".join(warning.name for warning in view.warnings)
@@ -220,4 +225,5 @@ def _steps(walk: Walk) -> str:
                 escape(warnings),
             )
         )
+
     return _table(rows)

@@ -149,6 +149,7 @@ class Walk:
         seen = [view for view in self.views if view.observation.seen]
         if not isinstance(recogniser, TaughtRecogniser) or not seen:
             return None
+
         evidence = recogniser([view.observation for view in seen])
         azimuths = azimuth_of(np.stack([view.direction for view in [*seen, self.views[-1]]]))
         total = log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuths[:-1]).sum(
@@ -157,6 +158,7 @@ class Walk:
         joint = recogniser.calibration.joint(
             total, len(seen), len(recogniser.classes), azimuths[-1:]
         )
+
         things = Discriminate(
             self.sphere, recogniser.memory.views, np.array(recogniser.calibration.hypotheses)
         )

@@ -214,6 +214,7 @@ class Page:
         """Other objects, or another number of walks."""
         for shown in (*self._scenes, *self._panels):
             shown.remove()
+
         n = len(self.exploration.walks)
         self._scenes = []
         self._cards = []
@@ -225,12 +226,14 @@ class Page:
             self._scenes.append(
                 WalkScene(self.server, f"/walk{k}", place, walk, self.exploration.mesh, look, drag)
             )
+
             panel = self.server.gui.add_panel()
             with panel.add_tab(walk.system.policy_name):
                 self._cards.append(self.server.gui.add_html(""))
             panel.dock_below(self._panels[-1]) if self._panels else panel.dock_right()
             panel.set_width(400)
             self._panels.append(panel)
+
         position = np.array([0.38 * (n < 2), -0.92, 0.42]) * (6.6 + 6.0 * (n - 1))
         at = np.array([0.0, 0.0, 0.75])
         if not np.allclose(self.server.initial_camera.position, position):
@@ -241,6 +244,7 @@ class Page:
             for camera in cameras:
                 camera.position = position
                 camera.look_at = at
+
         label = self.exploration.shown.label
         self._label.content = "" if label is None else class_card(label)
         self._draw()

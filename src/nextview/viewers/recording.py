@@ -62,16 +62,19 @@ class Recorder:
         step = len(session.views)
         view = session.views[-1]
         new = len(session.views) > len(self._shown)
+
         self._stream.set_time(TIMELINE, sequence=step)
         for k, earlier in enumerate(session.views):
             if k >= len(self._shown) or self._shown[k] is not earlier.observation:
                 self._log_place(k + 1, earlier)
         self._shown = [earlier.observation for earlier in session.views]
+
         if new:
             self._log_belief(session, view, step)
             self._log_surface(session)
         self._log_choice(session, view, step)
         self._stream.flush()
+
         if session.done:
             self._log_text(f"done: {session.result!r}")
             self.close()
@@ -116,11 +119,13 @@ class Recorder:
             self._stream.log(
                 f"belief/{rr.escape_entity_path_part(name)}", rr.Scalars(float(belief))
             )
+
         self._stream.log("belief_now", rr.BarChart(view.belief))
         self._stream.log("this_view_alone", rr.BarChart(view.alone))
         self._stream.log("threshold", rr.Scalars(float(session.stopping.threshold_at(step))))
         self._stream.log("travel/cells", rr.Scalars(view.travel))
         self._stream.log("travel/radians", rr.Scalars(view.arc))
+
         for name, values in view.maps.items():
             self._stream.log(f"maps/{name}", rr.Tensor(values, dim_names=("ring", "azimuth")))
         for warning in view.warnings:
@@ -132,6 +137,7 @@ class Recorder:
         """What the policy values the views at, and where it goes; again if it is asked again."""
         places = session.sphere.poses[:, :3, 3]
         visited = [earlier.index for earlier in session.views]
+
         values = np.full(len(places), np.nan) if view.values is None else view.values
         colours = heat(values)
         colours[visited] = rgb(INK)
@@ -140,14 +146,17 @@ class Recorder:
             places, colors=colours, radii=0.07, labels=names, show_labels=False
         )
         self._stream.log("world/candidates", candidates)
+
         considered = np.flatnonzero(np.isfinite(values))
         self._stream.log("values", rr.BarChart(values[considered], abscissa=considered))
+
         best = int(view.belief.argmax())
         to = view.next_view
         self._stream.log(
             "world/next",
             rr.Points3D(places[[] if to is None else [to]], colors=rgb(ACCENT), radii=0.1),
         )
+
         onward = "the end" if to is None else f"next view {to}"
         believed = f"{session.models.classes[best]} {view.belief[best]:.3f}"
         self._log_text(
@@ -163,6 +172,7 @@ def blueprint() -> rrb.Blueprint:
     """How the viewer arranges a recording at first."""
     camera = "world/camera"
     bars = {"belief": "belief_now", "this view alone": "this_view_alone", "values": "values"}
+
     images = [
         rrb.Spatial2DView(origin=camera, contents=[f"{camera}/{k}"], name=k)
         for k in ("image", "depth")
@@ -171,11 +181,13 @@ def blueprint() -> rrb.Blueprint:
     belief = rrb.TimeSeriesView(
         origin="/", contents=["belief/**", "threshold"], name="belief over the steps"
     )
+
     rows = images, charts, [belief, rrb.TimeSeriesView(origin="travel", name="travel")]
     scene = rrb.Spatial3DView(origin="world", name="object frame")
     log = rrb.TextLogView(origin="log")
     left = rrb.Vertical(scene, log, row_shares=[4, 1])
     right = rrb.Vertical(*(rrb.Horizontal(*row) for row in rows))
+
     return rrb.Blueprint(
         rrb.Horizontal(left, right), rrb.TimePanel(timeline=TIMELINE), collapse_panels=True
     )

@@ -44,6 +44,7 @@ class WalkScene:
         self._name = name
         self._drag = drag
         self.remove = server.scene.add_frame(name, show_axes=False, position=place).remove
+
         self._drawn = 0
         self._object: viser.MeshHandle | None = None
         if mesh is not None:
@@ -57,6 +58,7 @@ class WalkScene:
                 flat_shading=flat,
                 side="double",
             )
+
         floor = (-1.0 if mesh is None else float(mesh.vertices[:, 2].min())) - 0.03
         server.scene.add_cylinder(
             f"{name}/table",
@@ -67,6 +69,7 @@ class WalkScene:
             position=(0, 0, floor),
             cast_shadow=False,
         )
+
         places = walk.sphere.poses[:, :3, 3]
         server.scene.add_line_segments(f"{name}/rings", _rings(places), rgb(FAINT), thickness=0.015)
         plain: dict[str, Any] = {"subdivisions": 2, "cast_shadow": False, "receive_shadow": False}
@@ -76,6 +79,7 @@ class WalkScene:
         ]
         for view, ball in enumerate(self._balls):
             ball.on_click(lambda event, view=view: look(view))
+
         self._handle = server.scene.add_transform_controls(
             f"{name}/handle",
             0.7,
@@ -99,17 +103,20 @@ class WalkScene:
         if self._object is not None:
             self._object.visible = not hide_unseen
         self._colour(walk)
+
         points = walk.points
         name = self._name
         self._scene.add_point_cloud(
             f"{name}/seen", points, rgb(ACCENT), point_size=0.012, visible=len(points) > 0
         )
         self._draw_path(walk)
+
         if not walk.views:
             return
         observation = walk.views[-1].observation
         pose = observation.pose
         self._handle.position = tuple(pose[:3, 3])
+
         height, width = observation.depth.shape
         self._scene.add_camera_frustum(
             f"{name}/camera",
