@@ -278,7 +278,8 @@ class ObservedObject:
 
         noise = noise_of(frame)
         seen = frame.depth > 0 if frame.mask is None else (frame.depth > 0) & ~frame.mask
-        samples = sample(frame, seen, noise)
+        # Where no plane is looked for nothing else needs them.
+        samples = sample(frame, seen, noise) if self.support else None
         plane, up, rng = self._support(frame, samples)
 
         sightings, cell, two = self._find(frame, upright_axes(up), plane, samples, noise)
@@ -383,7 +384,7 @@ class ObservedObject:
         plausibility.refuse_far(frame, last, target, radius)
 
     def _support(
-        self, frame: Frame, samples: Samples
+        self, frame: Frame, samples: Samples | None
     ) -> tuple[Plane | None, Float, np.random.Generator]:
         """The support plane, where one is seen, the direction up, (3,), and the state of the random
         numbers after both were found.
@@ -395,7 +396,7 @@ class ObservedObject:
 
         rng = before.rng
         plane = None
-        if self.support:
+        if samples is not None:
             earlier = [s.plane for s in before.sightings if s.plane is not None]
             if earlier:
                 plane = segmentation.find_again(earlier[0], samples, self._near(samples))
@@ -530,7 +531,7 @@ class ObservedObject:
         )
 
     def _find(
-        self, frame: Frame, axes: Float, plane: Plane | None, samples: Samples, noise: Noise
+        self, frame: Frame, axes: Float, plane: Plane | None, samples: Samples | None, noise: Noise
     ) -> Found:
         if frame.mask is not None:
             mask = frame.mask
@@ -560,7 +561,7 @@ class ObservedObject:
                 raise ObservationError(
                     "nothing is seen where the object should be: a wrong pose, or a wrong box?"
                 )
-        elif plane is not None:
+        elif plane is not None and samples is not None:
             return self._on_the_plane(frame, axes, plane, samples, noise)
         else:
             raise ObservationError(NO_SUPPORT)

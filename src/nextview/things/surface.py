@@ -246,15 +246,19 @@ class SurfaceCaster:
         """
         rows, rays = directions.shape[:2]
         # A ray starts where it may enter the sphere around its surface, behind whatever stands
-        # before it on the grid.
+        # before it on the grid, and ends where it has left it.
         length = np.sqrt(np.einsum("hpi,hpi->hp", directions, directions))
         away = np.linalg.norm(origins - self.centres[things], axis=1) - 1.01 * self.radii[things]
         skipped = np.maximum(away, 0).astype(np.float32)[:, None] / length
 
         starts = (origins + self._shifts[things])[:, None] + skipped[..., None] * directions
         flat = np.ascontiguousarray(directions.reshape(-1, 3), np.float32)
+        ends = (np.float32(2.02) * self.radii[things])[:, None] / length
         hits = self._scene.run(
-            np.ascontiguousarray(starts.reshape(-1, 3), np.float32), flat, output=1
+            np.ascontiguousarray(starts.reshape(-1, 3), np.float32),
+            flat,
+            np.ascontiguousarray(ends.reshape(-1), np.float32),
+            output=1,
         )
 
         own = hits["geomID"].reshape(rows, rays) == np.asarray(things)[:, None]
