@@ -401,9 +401,7 @@ def _slope(q: Image) -> Image:
     return np.where(np.isfinite(smaller), smaller, 0.0)
 
 
-def shifted(
-    q: Image, slope: tuple[Image, Image], right: Index, down: Index
-) -> tuple[Image, Index]:
+def shifted(q: Image, slope: tuple[Image, Image], right: Index, down: Index) -> tuple[Image, Index]:
     """Each pixel shows the surface of another one nearby where its own ray meets it: edges move
     and planes stay. The other one is told, too, as row * width + column.
     """

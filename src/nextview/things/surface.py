@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,6 @@ FINEST_ERROR = 0.0004
 SURFACE_SAMPLES = 2000  # points at which the error of a simplified surface is measured
 LARGEST_ERROR = 5.0  # errors by which no point of a simplified surface is off
 NEARBY_SAMPLES = 50_000  # points of a simplified surface that others are looked for beside
-SPACING = 3.0  # distance between surfaces in a shared scene, in radii of the largest
 MISSED = np.float32(np.inf)  # depth along a ray that meets nothing
 
 
@@ -189,8 +189,8 @@ def _near_enough(surface: Surface, simplified: Surface, error: float) -> bool:
 class SurfaceCaster:
     """Casts rays at many surfaces in one call.
 
-    All surfaces stand in one Embree scene, far apart on a grid. A ray that is meant for one of them
-    starts near it, and what it meets of another one does not count.
+    Each surface gets an Embree scene of its own when it is first needed: of a thousand things few
+    are ever likely enough.
 
     Attributes:
         surfaces: the surfaces, by their number.
@@ -199,7 +199,7 @@ class SurfaceCaster:
     """
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
-        """Place the surfaces in a scene.
+        """Take over the surfaces.
 
         Args:
             surfaces: at least one.
@@ -207,26 +207,22 @@ class SurfaceCaster:
         self.surfaces = tuple(surfaces)
         self.centres = np.stack([surface.centre for surface in self.surfaces])
         self.radii = np.array([surface.radius for surface in self.surfaces], np.float32)
-
-        side = int(np.ceil(np.sqrt(len(self.surfaces))))
-        row, column = np.divmod(np.arange(len(self.surfaces)), side)
-        pitch = SPACING * self.radii.max()
-        places = np.stack([column - side / 2, row - side / 2, np.zeros(len(row))], 1) * pitch
-        # From its own frame to its place in the scene.
-        self._shifts = places.astype(np.float32) - self.centres
-
-        placed = zip(self.surfaces, self._shifts, strict=True)
-        self._scene = embree_scene(
-            [(surface.vertices + shift, surface.faces) for surface, shift in placed]
-        )
+        self._scenes: dict[int, Any] = {}
 
     def __reduce__(self) -> tuple[type["SurfaceCaster"], tuple[tuple[Surface, ...]]]:
-        """Pickled as its surfaces: Embree's scene is built again."""
+        """Pickled as its surfaces: Embree's scenes are built again."""
         return SurfaceCaster, (self.surfaces,)
 
     def __deepcopy__(self, memo: dict[int, object]) -> "SurfaceCaster":
-        """Itself: it never changes."""
+        """Itself: what it answers never changes."""
         return self
+
+    def _scene(self, thing: int) -> Any:
+        """The Embree scene of the surface of this number."""
+        if thing not in self._scenes:
+            surface = self.surfaces[thing]
+            self._scenes[thing] = embree_scene([(surface.vertices, surface.faces)])
+        return self._scenes[thing]
 
     def cast(
         self, things: NDArray[np.integer], origins: Float32, directions: Float32
@@ -244,28 +240,15 @@ class SurfaceCaster:
             nothing; and the unit normal of the surface there, towards the origin, (H, P, 3)
             float32, in the frame of the surface.
         """
-        rows, rays = directions.shape[:2]
-        # A ray starts where it may enter the sphere around its surface, behind whatever stands
-        # before it on the grid, and ends where it has left it.
-        length = np.sqrt(np.einsum("hpi,hpi->hp", directions, directions))
-        away = np.linalg.norm(origins - self.centres[things], axis=1) - 1.01 * self.radii[things]
-        skipped = np.maximum(away, 0).astype(np.float32)[:, None] / length
+        directions = np.ascontiguousarray(directions, np.float32)
+        starts = np.repeat(np.asarray(origins, np.float32)[:, None], directions.shape[1], 1)
+        depth = np.empty(directions.shape[:2], np.float32)
+        normals = np.empty(directions.shape, np.float32)
+        for row, thing in enumerate(np.asarray(things).tolist()):
+            hits = self._scene(thing).run(starts[row], directions[row], output=1)
+            depth[row] = np.where(hits["primID"] >= 0, hits["tfar"], MISSED)
+            normals[row] = hits["Ng"]
 
-        starts = (origins + self._shifts[things])[:, None] + skipped[..., None] * directions
-        flat = np.ascontiguousarray(directions.reshape(-1, 3), np.float32)
-        ends = (np.float32(2.02) * self.radii[things])[:, None] / length
-        hits = self._scene.run(
-            np.ascontiguousarray(starts.reshape(-1, 3), np.float32),
-            flat,
-            np.ascontiguousarray(ends.reshape(-1), np.float32),
-            output=1,
-        )
-
-        own = hits["geomID"].reshape(rows, rays) == np.asarray(things)[:, None]
-        hit = own & (hits["primID"].reshape(rows, rays) >= 0)
-        depth = np.where(hit, hits["tfar"].reshape(rows, rays) + skipped, MISSED)
-
-        normals = hits["Ng"].reshape(rows, rays, 3)
         towards = -np.sign(np.einsum("hpi,hpi->hp", normals, directions))
         scale = towards / (np.sqrt(np.einsum("hpi,hpi->hp", normals, normals)) + 1e-30)
         return depth, normals * scale[..., None]
