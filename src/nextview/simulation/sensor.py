@@ -405,7 +405,8 @@ def shifted(q: Image, slope: tuple[Image, Image], right: Index, down: Index) -> 
     """Each pixel shows the surface of another one nearby where its own ray meets it: edges move
     and planes stay. The other one is told, too, as row * width + column.
     """
-    row, column = np.indices(q.shape, sparse=True)
+    row = np.arange(len(q))[:, None]
+    column = np.arange(q.shape[1])
     at_row = np.clip(row + down, 0, len(q) - 1)
     at_column = np.clip(column + right, 0, q.shape[1] - 1)
     at = at_row * q.shape[1] + at_column  # one index into all rows: NumPy takes half the time
@@ -471,7 +472,9 @@ def in_shadow(q: Image, focal: float, baseline: float) -> NDArray[np.bool_]:
     # One index into all rows: NumPy takes half the time.
     first_index, last_index = (first_in_row + np.rint(at).astype(int) for at in (column, last))
     flat = lit.reshape(-1)
-    at, end, value = (of_all[seen] for of_all in (first_index, last_index, disparity))
+    at = first_index[seen]
+    end = last_index[seen]
+    value = disparity[seen]
     for _ in range(WIDEST):
         np.maximum.at(flat, at, value)
         wider = at + 1 < end
