@@ -35,7 +35,7 @@ from nextview.session.repeated import REPEATED, after_repeated, is_repeated
 from nextview.session.result import SUSPICIOUS, Recognition
 from nextview.session.surroundings import Surroundings
 from nextview.session.view import View
-from nextview.things.expected_views import Goal
+from nextview.things.expected_views import Goal, Outlook
 
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject
@@ -261,8 +261,7 @@ class Session:
     def _ranked(self, poses: ArrayLike | None, goal: Goal) -> tuple[RankedView, ...]:
         if not self.views:
             raise SessionError("what views would tell is not known before the first one")
-        step = self._episodes.steps[-1]
-        outlook = self._episodes.outlooks(step, np.ones(1, bool))[0]
+        outlook = self.outlook
         if outlook is None:
             raise SessionError(
                 "what views would tell is not known: no taught thing of known geometry explains"
@@ -279,6 +278,18 @@ class Session:
         radius = self.views[-1].observation.radius
         assert radius is not None  # else nothing was foreseen
         return rank_views(outlook, inside, radius, given, left, goal)
+
+    @property
+    def outlook(self) -> Outlook | None:
+        """What can be foreseen of other views: the leading hypotheses of known geometry.
+
+        None before the first view, and where no taught thing of known geometry explains the views.
+        """
+        with self._lock:
+            if not self.views:
+                return None
+            found = self._episodes.outlooks(self._episodes.steps[-1], np.ones(1, bool))[0]
+            return found if isinstance(found, Outlook) else None
 
     def _left(self) -> NDArray[np.bool_]:
         """Which candidates may still be chosen, (V,) bool."""

@@ -140,11 +140,32 @@ def divergences(
     forth = judged.ratio(first, second, gaps)
     back = judged.ratio(second, first, gaps)
     both_ways = np.maximum((forth + back) / 2, 0)
-    share = judged.different(first, second, gaps)
+    either = np.isfinite(images.depth[:, first]) | np.isfinite(images.depth[:, second])
+    share = judged.different(first, second, gaps).sum(2) / np.maximum(either.sum(2), 1)
     for rows, columns in ((first, second), (second, first)):
         divergence[:, rows, columns] = both_ways
         different[:, rows, columns] = share
     return divergence, different
+
+
+def different_pixels(
+    images: HypothesisImages, sensor: ExpectedSensor, pixels: PixelModel, prior: RegistrationPrior
+) -> NDArray[np.bool_]:
+    """Where the first two hypotheses differ by more than the noise, once they are aligned.
+
+    Args:
+        images: of two hypotheses.
+        sensor: the camera.
+        pixels: how a pixel is judged.
+        prior: by how much a hypothesis and a camera may still be moved.
+
+    Returns:
+        (V, P) bool.
+    """
+    first, second = _pairs(2)
+    gaps = gaps_after_alignment(images, sensor, prior)
+    judged = _Judged.of(images, sensor, pixels, prior)
+    return judged.different(first, second, gaps)[:, 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,14 +256,13 @@ class _Judged:
         union = (shows | rival).sum(2)
         return -mean.astype(np.float64) * np.minimum(1, union * self.area / self.enough)
 
-    def different(self, first: Index, second: Index, gaps: Float32) -> Float:
-        """Share of the pixels of either hypothesis in which they differ, (V, K)."""
+    def different(self, first: Index, second: Index, gaps: Float32) -> NDArray[np.bool_]:
+        """Pixels in which two hypotheses differ by more than the noise, (V, K, P)."""
         shows = self.shows[:, first]
         rival = self.shows[:, second]
         off = np.abs(gaps) > 3 * self.deviation[:, second]
         alone = np.where(shows, self.apart[:, second], self.apart[:, first]) > 0.5
-        differ = np.where(shows & rival, off, (shows ^ rival) & alone)
-        return differ.sum(2) / np.maximum((shows | rival).sum(2), 1)
+        return np.where(shows & rival, off, (shows ^ rival) & alone)
 
 
 @lru_cache(maxsize=4)

@@ -17,7 +17,11 @@ from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, elevation_of, look_at_origin
 from nextview.things.depth_view import depth_view
 from nextview.things.expected_images import ExpectedSensor, Surroundings, rendered_images
-from nextview.things.expected_likelihood import divergences, gaps_after_alignment
+from nextview.things.expected_likelihood import (
+    different_pixels,
+    divergences,
+    gaps_after_alignment,
+)
 from nextview.things.leading import Hypotheses
 from nextview.things.registration import RegistrationPrior
 from nextview.things.surface import SurfaceCaster
@@ -30,6 +34,7 @@ Goal = Literal["thing", "pose"]
 
 SENSOR_SIDE = 24  # rows and columns of a view by which the camera's noise is judged
 RENDERED_SIDE = 18  # rows and columns of the rendered images
+PICTURE_SIDE = 64  # rows and columns of pictures to look at
 BHATTACHARYYA = 0.25  # of two equally wide Gaussians, as a share of their divergence
 
 
@@ -168,6 +173,26 @@ def expected_views(
 
 
 @dataclass(frozen=True, eq=False)
+class RivalPictures:
+    """The two leading hypotheses as one camera would see them.
+
+    Attributes:
+        things: number of the surface of each, (2,) int64.
+        pictures: of each, as a headlight would show it, (2, S, S) uint8, 0 where it does not show.
+        different: pixels in which they differ by more than the noise, (S, S) bool.
+    """
+
+    things: NDArray[np.int64]
+    pictures: NDArray[np.uint8]
+    different: NDArray[np.bool_]
+
+    @property
+    def share(self) -> float:
+        """Share of the pixels that show either of them in which they differ."""
+        return float(self.different.sum() / max(1, self.pictures.any(0).sum()))
+
+
+@dataclass(frozen=True, eq=False)
 class Outlook:
     """All that is known when the next view of a thing is to be chosen.
 
@@ -245,6 +270,31 @@ class Outlook:
             Camera-to-world poses, (V, 4, 4) float64, object frame, metres.
         """
         return look_at_origin(elevation_of(directions), azimuth_of(directions), self.distance)
+
+    def rivals(self, camera: Float, side: int = PICTURE_SIDE) -> RivalPictures | None:
+        """Draw the two leading hypotheses, of two things if there are two, and their difference.
+
+        Args:
+            camera: camera-to-world pose, (4, 4), object frame, metres.
+            side: rows and columns of the pictures.
+
+        Returns:
+            The pictures; None if there is only one hypothesis.
+        """
+        things = self.hypotheses.things
+        order = np.argsort(-self.hypotheses.belief, kind="stable")
+        others = [*order[things[order] != things[order[0]]], *order[1:]]
+        if not others:
+            return None
+        rows = np.array([order[0], others[0]])
+        two = Hypotheses(things[rows], self.hypotheses.poses[rows], np.full(2, 0.5))
+        images = rendered_images(self.caster, two, camera[None], self.surroundings, side)
+        shows = np.isfinite(images.depth[0])
+        pictures = np.where(shows, 255 * images.cosine[0], 0).astype(np.uint8)
+        different = different_pixels(images, self.sensor, self.pixels, self.prior)[0]
+        return RivalPictures(
+            two.things, pictures.reshape(2, side, side), different.reshape(side, side)
+        )
 
     def expect(self, cameras: Float) -> ExpectedViews:
         """Expect what views from some cameras would tell.

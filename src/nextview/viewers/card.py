@@ -14,6 +14,7 @@ from nextview.geometry.viewsphere import ViewSphere, direction_of
 from nextview.recognition.poses import place_in_words
 from nextview.session.style import ACCENT, FAINT, GROUND, INK, WOOD, heat, rgb
 from nextview.session.view import View
+from nextview.things.expected_views import RivalPictures
 from nextview.viewers.exploration import Walk
 
 CELL = 11  # side of a cell of a map, pixels
@@ -55,7 +56,11 @@ def walk_card(walk: Walk) -> str:
         _figures(walk, view),
         _beliefs(walk),
     ]
-    parts.append(rivals_card(walk))
+    at = walk.next_view
+    why = ""
+    if at is not None:
+        why = geometry_card(walk, walk.sphere.directions[at], f"view {at}")
+    parts.append(why or rivals_card(walk))
     parts += [_maps(view), _steps(walk)]
     return f'{STYLE}<div class="nv">{"".join(parts)}</div>'
 
@@ -86,8 +91,10 @@ def preview_card(observation: Observation, walk: Walk) -> str:
     Returns:
         HTML: the picture, and the leading things as remembered from the nearest view.
     """
-    nearest, _ = walk.sphere.nearest(direction_of(observation.pose))
-    parts = f"<h3>From here</h3>{_image(observation.picture, 200)}{rivals_card(walk, nearest)}"
+    direction = direction_of(observation.pose)
+    nearest, _ = walk.sphere.nearest(direction)
+    rivals = geometry_card(walk, direction, "this camera") or rivals_card(walk, nearest)
+    parts = f"<h3>From here</h3>{_image(observation.picture, 200)}{rivals}"
     return f'{STYLE}<div class="nv">{parts}</div>'
 
 
@@ -140,6 +147,35 @@ def _captioned(images: Iterable[tuple[str, str]]) -> str:
 def _table(rows: Iterable[Iterable[str]]) -> str:
     cells = ("".join(f"<td>{cell}</td>" for cell in row) for row in rows)
     return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
+
+
+def geometry_card(walk: Walk, direction: NDArray[np.float64], what: str) -> str:
+    """The two leading hypotheses as rendered from a direction, (3,), and where they differ.
+
+    Nothing where no geometry is known, or only one hypothesis is left.
+    """
+    rivals = walk.rival_pictures(direction)
+    outlook = walk.session.outlook
+    if rivals is None or outlook is None:
+        return ""
+    names = [outlook.caster.surfaces[thing].name for thing in rivals.things]
+    if names[0] == names[1]:
+        names = [f"{names[0]}, likeliest pose", f"{names[1]}, second pose"]
+    both = [
+        (name, _image(picture, 128)) for name, picture in zip(names, rivals.pictures, strict=True)
+    ]
+    both.append(("where they differ", _image(differing(rivals), 128)))
+    return (
+        f"<p>The two likeliest, as {what} would show them: they differ in {rivals.share:.0%} of"
+        f" the pixels.</p>{_captioned(both)}"
+    )
+
+
+def differing(rivals: RivalPictures) -> NDArray[np.uint8]:
+    """What shows of either hypothesis, faint, and the pixels in which they differ, (S, S, 3)."""
+    either: NDArray[np.bool_] = np.asarray(rivals.pictures.any(0))
+    drawn = np.where(either[..., None], rgb(FAINT), rgb(GROUND))
+    return np.where(rivals.different[..., None], rgb(ACCENT), drawn).astype(np.uint8)
 
 
 def rivals_card(walk: Walk, view: int | None = None) -> str:

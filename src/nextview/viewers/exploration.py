@@ -24,6 +24,7 @@ from nextview.session.session import Session
 from nextview.session.system import System, load, simulated
 from nextview.session.view import View
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.things.expected_views import RivalPictures
 from nextview.things.memory import AZIMUTHS, RINGS, TaughtRecogniser
 
 Float = NDArray[np.float64]
@@ -182,6 +183,16 @@ class Walk:
             (recogniser.classes[c], remembered_picture(recogniser, int(h), ring, int(a)))
             for c, h, a in seen_from
         ]
+
+    def rival_pictures(self, direction: Float) -> RivalPictures | None:
+        """The two leading hypotheses as a camera in some direction, (3,), would see them.
+
+        Returns:
+            As they lie, with the pixels in which they differ; None where nothing can be foreseen by
+            geometry, or there is one hypothesis only.
+        """
+        outlook = self.session.outlook
+        return None if outlook is None else outlook.rivals(outlook.cameras(direction[None])[0])
 
     @property
     def visited(self) -> list[int]:
