@@ -28,7 +28,7 @@ from nextview.policies.base import EpisodeState
 from nextview.policies.gain import (
     INPUTS,
     VISIBILITY,
-    Frame,
+    CellFrame,
     features,
     maps_of,
     mirrored_features,
@@ -66,7 +66,7 @@ Split = Literal["train", "test"] | None
 Info = dict[str, Any]
 # bound of the observation space for what a map network says; the networks of this project stay far
 # below
-FAR = 100.0
+MAP_LIMIT = 100.0
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Rules:
     """
 
     inputs: tuple[str, ...] = ("belief", "view", "place")
-    frame: Frame = "camera"
+    frame: CellFrame = "camera"
     objective: str = "right"
     max_views: int = 5
     threshold: float | None = None
@@ -99,7 +99,7 @@ class Rules:
             raise UsageError(
                 f"inputs are some of {', '.join(INPUTS)} and maps, not {', '.join(self.inputs)}"
             )
-        for value, known in ((self.frame, get_args(Frame)), (self.objective, OBJECTIVES)):
+        for value, known in ((self.frame, get_args(CellFrame)), (self.objective, OBJECTIVES)):
             if value not in known:
                 raise UsageError(f"{value!r} is none of {', '.join(known)}")
         number(self.view_price, "the view_price", 0)
@@ -200,10 +200,13 @@ class Task:
             for name in ordered(rules.inputs)
         }
         high = np.concatenate(
-            [np.full(wide, FAR if name in rules.maps else 1.0) for name, wide in widths.items()]
+            [
+                np.full(wide, MAP_LIMIT if name in rules.maps else 1.0)
+                for name, wide in widths.items()
+            ]
         )
         return gymnasium.spaces.Box(
-            np.where(high > 1, -FAR, 0).astype(np.float32), high.astype(np.float32)
+            np.where(high > 1, -MAP_LIMIT, 0).astype(np.float32), high.astype(np.float32)
         )
 
     @property

@@ -17,12 +17,11 @@ from nextview.errors import ResultsError
 from nextview.recognition.belief import Calibration
 from nextview.recognition.map_names import CONFIDENCE, measure_of
 from nextview.recognition.model_card import ModelCard
+from nextview.types import Float, Index
 
 with extras():
     import pandas as pd
 
-Index = NDArray[np.int64]
-Float = NDArray[np.float64]
 # views after which confidence is compared with accuracy, beside all of them
 RELIABILITY_LOOKS = (1, 2, 5)
 

@@ -48,7 +48,7 @@ COLOURS = {
 }
 # all others, in turn
 OWN = ("#7b2d00", "#3a7d00", "#7209b7", "#00a3a3", "#e0679b", "#b3a000", "#ff7043", "#5c6bc0")
-MOST = 8  # curves of policies that a robot could follow, at most
+MOST_CURVES = 8  # curves of policies that a robot could follow, at most
 
 
 def ceiling(results: Results) -> list[str]:
@@ -73,7 +73,7 @@ def compared(results: Results) -> list[str]:
     accuracy = summary[at].set_index("policy")["value"]
     robots = sorted(
         (n for n in names if not is_oracle(n)), key=lambda n: (n != reference, -accuracy[n])
-    )[:MOST]
+    )[:MOST_CURVES]
     return [n for n in names if n in robots] + [
         n for n in ("oracle-valley", *ceiling(results)) if n in names
     ]

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
 from nextview.data import metrics
-
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 
 def resample(n: int, samples: int, rng: np.random.Generator) -> Float:

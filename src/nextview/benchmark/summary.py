@@ -16,11 +16,11 @@ from nextview.checks import extras
 from nextview.data import metrics
 from nextview.session.episode import Outcome
 from nextview.simulation.scene_layout import LEVELS, clutter_level
+from nextview.types import Float
 
 with extras():
     import pandas as pd
 
-Float = NDArray[np.float64]
 Drawn = dict[tuple, NDArray[np.float64]]  # what resampling gives, by policy, threshold and measure
 Cell = tuple[str, float | None, Outcome]
 TESTED = ("accuracy", "clean_accuracy", "n_views", "travel_all")

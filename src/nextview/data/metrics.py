@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 
 def ratio(top: Float, bottom: Float, weights: Float) -> Float:

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 from nextview.checks import extras, whole
 from nextview.errors import DatasetError
 
-MOST = 1024  # processes on one machine
+MOST_WORKERS = 1024  # processes on one machine
 PATIENCE = "10s"  # how long a scheduler may take to answer
 
 _starting = threading.Lock()
@@ -44,7 +44,9 @@ class WorkerDied:
 def count(workers: int | None) -> int:
     """The number of processes: one for each core by default."""
     return (
-        os.cpu_count() or 1 if workers is None else whole(workers, "the number of workers", 0, MOST)
+        os.cpu_count() or 1
+        if workers is None
+        else whole(workers, "the number of workers", 0, MOST_WORKERS)
     )
 
 

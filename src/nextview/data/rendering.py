@@ -15,7 +15,7 @@ from nextview.checks import number, whole
 from nextview.data.folders import Entry, Listing, scan_dataset, select
 from nextview.data.measures import depth_entropy
 from nextview.data.pool import WorkerDied, count, each
-from nextview.data.scene_views import SIDE, render_scene
+from nextview.data.scene_views import SCENE_SIDE, render_scene
 from nextview.data.store import (
     DEPTH_UNIT,
     DONE,
@@ -52,7 +52,7 @@ from nextview.simulation.simulated import OccludedCamera, SimulatedCamera
 AnySensor = Sensor | SensorMix | None
 LARGEST_CHUNK = 2**31 - 2**20  # bytes that may be compressed at once, the compressor's own included
 ODD_MESHES = 10  # that are named
-FARTHEST = np.iinfo(np.uint16).max * DEPTH_UNIT  # depth that can be stored, object radii
+FARTHEST_STORED = np.iinfo(np.uint16).max * DEPTH_UNIT  # depth that can be stored, object radii
 # sets the draws of a sensor apart from those of a deformation: no byte of a name is as large
 SENSING = 256
 
@@ -202,7 +202,7 @@ def render(
             name: getattr(options, name) for name in ("seed", "noise_seed", "unit", "largest_part")
         } | vars(options.deform)
         recipe |= {"sha256": hashes, "sensor": None if sensor is None else sensor.to_dict()}
-        recipe |= {"scene": None if options.meshes is None else SIDE, "dataset": dataset.name}
+        recipe |= {"scene": None if options.meshes is None else SCENE_SIDE, "dataset": dataset.name}
         store = _begin(path, describe(entries, sphere, size, recipe), overwrite)
         if (made_by := command()) not in store.commands:
             store.note(commands=[*store.commands, made_by])
@@ -269,9 +269,11 @@ def _check(path: Path, sphere: ViewSphere, size: int, options: RenderOptions) ->
             "scenes are rendered as they are: the largest part is of a folder of meshes"
         )
 
-    if sphere.distance + 1 > FARTHEST:
-        most = f"{FARTHEST:.2f} object radii, so the distance can be {FARTHEST - 1:.2f} at most"
-        raise DatasetError(f"{path}: depth is stored up to {most}, not {sphere.distance:g}")
+    if sphere.distance + 1 > FARTHEST_STORED:
+        raise DatasetError(
+            f"{path}: depth is stored up to {FARTHEST_STORED:.2f} object radii, so the distance can"
+            f" be {FARTHEST_STORED - 1:.2f} at most, not {sphere.distance:g}"
+        )
 
     if options.sensor is None:
         return None

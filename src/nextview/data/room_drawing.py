@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from nextview.checks import whole
 from nextview.data.folders import Entry, list_dataset, select
 from nextview.data.pool import WorkerDied, each
-from nextview.data.scene_drawing import LARGEST, MOST_SCENES
+from nextview.data.scene_drawing import MOST_FACES, MOST_SCENES
 from nextview.data.store import writing
 from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.files import check_new
@@ -438,7 +438,7 @@ def _furniture(
 def _other(path: Path, unit: str | None = None) -> Mesh | None:
     """A mesh that stands beside a target; None for one that is too large or damaged."""
     try:
-        return load_mesh(path, unit=unit, max_faces=LARGEST)
+        return load_mesh(path, unit=unit, max_faces=MOST_FACES)
     except MeshError:
         return None
 

@@ -37,16 +37,16 @@ from nextview.simulation.scene import (
 from nextview.simulation.scene_layout import LEVELS, SUFFIX, Block, Placement, SceneLayout
 from nextview.simulation.simulated import SimulatedCamera, visible_shares
 
-GRID = ViewSphere.named("40")
+SCENE_VIEWS = ViewSphere.named("40")
 # pixels of the pictures that tell how much of the target shows: in the end, and while drawing
-SIZE = 112
+SHARE_PIXELS = 112
 COARSE = 48
 # how far a scene's wanted share lies from its level's at most, and how well it is met
 SPREAD = 0.04
 TOLERANCE = 0.02
 # things around a target
-FEWEST = 3
-MOST = 20
+FEWEST_AROUND = 3
+MOST_AROUND = 20
 # things that are tried for one layout, and layouts for one scene
 TRIES = 200
 LAYOUTS_TRIED = 20
@@ -59,16 +59,18 @@ OBJECTS = {"light": 0.7, "medium": 0.6, "heavy": 0.4}  # share of objects among 
 # what is low hides nothing from above
 BOX_HEIGHT = {"light": HEIGHT, "medium": HEIGHT, "heavy": (1.4, 2.9)}
 # what a thing hides at least: the table is soon full
-LEAST = {"light": 0.0, "medium": 0.0, "heavy": 0.008}
+LEAST_HIDDEN = {"light": 0.0, "medium": 0.0, "heavy": 0.008}
 # chances of 0, 1 and 2
 WALLS = {"light": (0.8, 0.2, 0.0), "medium": (0.5, 0.4, 0.1), "heavy": (0.3, 0.4, 0.3)}
 WALL_AWAY = (1.2, 1.9)
 WALL_WIDTH = (2.0, 3.5)
 WALL_DEPTH = 0.1
 WALL_HEIGHT = (1.0, 2.6)
-POOL = 8  # meshes that are tried in one scene, at several places each: reading them takes longest
+MESHES_TRIED = (
+    8  # meshes that are tried in one scene, at several places each: reading them takes longest
+)
 # triangles of an object around the target: larger ones are passed over, for the sake of time
-LARGEST = 100_000
+MOST_FACES = 100_000
 MOST_SCENES = 100_000  # at each level, of each split
 
 
@@ -235,7 +237,7 @@ def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) ->
     rng = np.random.default_rng([seed, *name.encode()])
     mesh = cached_mesh(meshes.folder / target)
     others = [file for file in meshes.files if file != target]
-    others = [others[i] for i in rng.permutation(len(others))[:POOL]]
+    others = [others[i] for i in rng.permutation(len(others))[:MESHES_TRIED]]
     hiding = _Hiding(mesh)
 
     for _ in range(LAYOUTS_TRIED):
@@ -253,8 +255,14 @@ def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) ->
             scene = Scene(mesh, tuple(item for _, item in placed))
             objects = tuple(thing for thing, _ in placed if isinstance(thing, Placement))
             blocks = tuple(thing for thing, _ in placed if isinstance(thing, Block))
-            shares = tuple(_rounded(*visible_shares(scene, GRID.poses, SIZE, GRID.distance)))
-            unreachable = tuple(np.flatnonzero(~scene.reachable(GRID.poses[:, :3, 3])).tolist())
+            shares = tuple(
+                _rounded(
+                    *visible_shares(scene, SCENE_VIEWS.poses, SHARE_PIXELS, SCENE_VIEWS.distance)
+                )
+            )
+            unreachable = tuple(
+                np.flatnonzero(~scene.reachable(SCENE_VIEWS.poses[:, :3, 3])).tolist()
+            )
             middle = Placement(target, mesh_hash(meshes.folder / target))
             return SceneLayout(name, level, seed, middle, objects, blocks, shares, unreachable)
     raise DatasetError(
@@ -267,12 +275,12 @@ class _Hiding:
     """Rays from 40 cameras to the points of a target's surface that they see."""
 
     def __init__(self, mesh: Mesh) -> None:
-        camera = SimulatedCamera(mesh, COARSE, GRID.distance)
+        camera = SimulatedCamera(mesh, COARSE, SCENE_VIEWS.distance)
         eyes = []
         rays = []
         views = []
 
-        for view, pose in enumerate(GRID.poses):
+        for view, pose in enumerate(SCENE_VIEWS.poses):
             seen = camera.observe(pose)
             rows, columns = np.nonzero(seen.depth)
             (fx, _, cx), (_, fy, cy) = seen.intrinsics[:2]
@@ -285,7 +293,7 @@ class _Hiding:
 
         self.eyes, self.rays = (np.concatenate(rows).astype(np.float32) for rows in (eyes, rays))
         self.views = np.concatenate(views)
-        self.whole = np.maximum(np.bincount(self.views, minlength=len(GRID)), 1)
+        self.whole = np.maximum(np.bincount(self.views, minlength=len(SCENE_VIEWS)), 1)
 
     def by(self, item: Item, still: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return the rays that an item blocks.
@@ -306,7 +314,9 @@ class _Hiding:
 
     def share(self, still: NDArray[np.bool_]) -> float:
         """Share of the target that shows, on the average over the views."""
-        return float((np.bincount(self.views[still], minlength=len(GRID)) / self.whole).mean())
+        return float(
+            (np.bincount(self.views[still], minlength=len(SCENE_VIEWS)) / self.whole).mean()
+        )
 
 
 Thing = tuple[Placement | Block, Item]
@@ -330,9 +340,9 @@ def _layout(
 
     for _ in range(TRIES):
         share = hiding.share(free)
-        if len(placed) >= FEWEST + walls and share <= goal + TOLERANCE:
+        if len(placed) >= FEWEST_AROUND + walls and share <= goal + TOLERANCE:
             return placed
-        if len(placed) == MOST:
+        if len(placed) == MOST_AROUND:
             return None
 
         short = (
@@ -355,7 +365,7 @@ def _layout(
             continue
 
         left = free & ~hiding.by(item, free)
-        if goal - TOLERANCE <= hiding.share(left) <= share - LEAST[level] * (not short):
+        if goal - TOLERANCE <= hiding.share(left) <= share - LEAST_HIDDEN[level] * (not short):
             placed.append((thing, item))
             free = left
     return None
@@ -399,7 +409,7 @@ def _stood(thing: Placement | Block, folder: Path, floor: float) -> Item | None:
     try:
         if isinstance(thing, Block):
             return block_item(thing, floor)
-        return place(cached_mesh(folder / thing.mesh, LARGEST), thing, floor)
+        return place(cached_mesh(folder / thing.mesh, MOST_FACES), thing, floor)
     except MeshError:
         return None
 

@@ -26,14 +26,14 @@ from nextview.simulation.scene import Scene
 from nextview.simulation.scene_layout import clutter_level
 from nextview.simulation.simulated import TARGET, SceneCamera, visible_shares
 
-SIDE = 80  # of the pictures of the whole scene, pixels
+SCENE_SIDE = 80  # of the pictures of the whole scene, pixels
 HALF = 2.0  # they show so many object radii to each side of the target's centre
 SCENE_UNIT = 2e-4  # their depth is stored as uint16 in steps of this many object radii: up to 13.1
 # side of the picture in which the share that shows is measured, pixels; as when the scene was drawn
 SHARE_SIZE = 112
 
 
-def scene_intrinsics(distance: float, side: int = SIDE) -> NDArray[np.float64]:
+def scene_intrinsics(distance: float, side: int = SCENE_SIDE) -> NDArray[np.float64]:
     """Return the pinhole matrix of the images of a scene.
 
     Args:
@@ -59,7 +59,7 @@ def render_scene(scene: Scene, sphere: ViewSphere) -> dict[str, NDArray]:
     Returns:
         The arrays by their names in the store.
     """
-    camera = SceneCamera(scene, scene_intrinsics(sphere.distance), (SIDE, SIDE))
+    camera = SceneCamera(scene, scene_intrinsics(sphere.distance), (SCENE_SIDE, SCENE_SIDE))
     looks = [camera.look(pose) for pose in sphere.poses]
     positions = sphere.poses[:, :3, 3]
     depth = np.rint(np.stack([depth for depth, _ in looks]) / SCENE_UNIT)

@@ -6,18 +6,15 @@ Splits are stratified by class, and copies of a mesh stay together.
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.checks import whole
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.recognition.model_card import ModelCard, find_card
-
-Indices = NDArray[np.int64]
-Floats = NDArray[np.floating]
+from nextview.types import Floats, Index
 
 
-def duplicate_groups(measured: Floats) -> Indices:
+def duplicate_groups(measured: Floats) -> Index:
     """Return a number for each object, (N,), that its copies share.
 
     Copies have the same depth entropies, (N, V).
@@ -25,7 +22,7 @@ def duplicate_groups(measured: Floats) -> Indices:
     return np.unique(measured, axis=0, return_inverse=True)[1].ravel()
 
 
-def deduplicated(labels: Indices, measured: Floats) -> Indices:
+def deduplicated(labels: Index, measured: Floats) -> Index:
     """Return one object, the first, of each shape and label.
 
     Args:
@@ -33,7 +30,7 @@ def deduplicated(labels: Indices, measured: Floats) -> Indices:
         measured: depth entropy of the views, (N, V), by which copies are found.
 
     Returns:
-        Indices, ascending.
+        Index, ascending.
     """
     _, first = np.unique(
         np.stack([duplicate_groups(measured), labels], 1), axis=0, return_index=True
@@ -41,7 +38,7 @@ def deduplicated(labels: Indices, measured: Floats) -> Indices:
     return np.sort(first)
 
 
-def divide(labels: Indices, measured: Floats, share: float, seed: int) -> tuple[Indices, Indices]:
+def divide(labels: Index, measured: Floats, share: float, seed: int) -> tuple[Index, Index]:
     """Divide objects into a training and a validation part; copies stay together.
 
     Args:
@@ -51,7 +48,7 @@ def divide(labels: Indices, measured: Floats, share: float, seed: int) -> tuple[
         seed: of the draw.
 
     Returns:
-        Indices of the training and of the validation objects.
+        Index of the training and of the validation objects.
     """
     group = duplicate_groups(measured)
     rng = np.random.default_rng(seed)
@@ -63,7 +60,7 @@ def divide(labels: Indices, measured: Floats, share: float, seed: int) -> tuple[
     return np.flatnonzero(~validates), np.flatnonzero(validates)
 
 
-def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple[Indices, Indices]:
+def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple[Index, Index]:
     """Divide the rendered objects of the training split; see ``divide``.
 
     Args:
@@ -84,7 +81,7 @@ def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple
     return usable[training], usable[validation]
 
 
-def check_any(store: ViewStore, training: Indices, validation: Indices, lacking: str = "") -> None:
+def check_any(store: ViewStore, training: Index, validation: Index, lacking: str = "") -> None:
     """Check that there are objects for training and for validation.
 
     Args:
@@ -104,7 +101,7 @@ def check_any(store: ViewStore, training: Indices, validation: Indices, lacking:
             raise DatasetError(f"{store.path}: no object is left {what}{lacking}")
 
 
-def deduplicate(store: ViewStore, objects: Indices) -> Indices:
+def deduplicate(store: ViewStore, objects: Index) -> Index:
     """Return one of each shape and label among objects of a store; see ``deduplicated``.
 
     Args:
@@ -117,7 +114,7 @@ def deduplicate(store: ViewStore, objects: Indices) -> Indices:
     return objects[deduplicated(store.labels[objects], store.measure()[objects])]
 
 
-def sample(objects: Indices, count: int | None = None) -> Indices:
+def sample(objects: Index, count: int | None = None) -> Index:
     """Select objects in even steps from the first.
 
     Args:
@@ -138,7 +135,7 @@ def some_objects(
     split: str | None = None,
     held_out: ModelCard | str | Path | None = None,
     count: int | None = None,
-) -> Indices:
+) -> Index:
     """Return the rendered objects of a store that a user wants.
 
     Args:

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.floating]
+from nextview.types import Floats
+
 Triangles = tuple[Floats, NDArray[np.int32]]  # vertices, (N, 3), and faces, (F, 3)
 
 

@@ -15,14 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from nextview.checks import number, one_line, points, whole
 from nextview.errors import UsageError
+from nextview.types import Float, Index
 
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 DISTANCE = 3.0  # distance of the camera from the object's centre, in object radii
 # elevation and azimuth of a cell, in which travel off any grid is counted
 CELL = np.radians((18.0, 45.0))
 # viewpoints that there may be: distances between all of them are kept, 200 MB at this number
-MOST = 5_000
+MOST_VIEWPOINTS = 5_000
 # radians within which a camera stands at a candidate. What is more is a place of its own
 SNAP = 1e-6
 
@@ -239,7 +238,7 @@ class Directions(Viewpoints):
         length = np.linalg.norm(given, axis=1, keepdims=True)
         if not len(given) or not (length > 0).all():
             raise UsageError("there is no direction, or one of length zero")
-        whole(len(given), "the number of viewpoints", 1, MOST)
+        whole(len(given), "the number of viewpoints", 1, MOST_VIEWPOINTS)
         number(self.distance, "the distance", above=0)
         object.__setattr__(self, "directions", _fixed(given / length))
 
@@ -249,7 +248,7 @@ class Directions(Viewpoints):
 
         They lie on a Fibonacci lattice (Swinbank and Purser, QJRMS 132, 2006).
         """
-        whole(n, "the number of viewpoints", 1, MOST)
+        whole(n, "the number of viewpoints", 1, MOST_VIEWPOINTS)
         height = (np.arange(n) + 0.5) / n
         azimuth = np.arange(n) * np.pi * (3 - np.sqrt(5))
         flat = np.sqrt(1 - height**2)
@@ -278,8 +277,8 @@ class ViewSphere(Viewpoints):
     def __post_init__(self) -> None:
         if not self.elevations:
             raise UsageError("a view sphere needs at least one ring")
-        whole(self.azimuths, "the number of views on a ring", 3, MOST)
-        whole(len(self), "the number of viewpoints", 1, MOST)
+        whole(self.azimuths, "the number of views on a ring", 3, MOST_VIEWPOINTS)
+        whole(len(self), "the number of viewpoints", 1, MOST_VIEWPOINTS)
         for elevation in self.elevations:
             number(elevation, "an elevation", -90, 90)
         number(self.distance, "the distance", above=0)

@@ -11,11 +11,11 @@ from nextview.errors import PolicyError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import Viewpoints, ViewSphere
 from nextview.recognition.evidence import Evidence, items_at
+from nextview.types import Float
 
 if TYPE_CHECKING:
     from nextview.things.expected_views import Outlook  # SciPy, which few policies need
 
-Float = NDArray[np.float64]
 # where a policy may go: to all views, or to those of the local window
 Scope = Literal["global", "local"]
 

@@ -30,16 +30,15 @@ from nextview.policies.base import (
 from nextview.policies.learned_tables import cells_from, cells_to
 from nextview.recognition.inference import OnnxFile, check_end, open_onnx, run_onnx
 from nextview.recognition.map_names import SPHERE, in_order, maps_among
+from nextview.types import Float, Index
 
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 INPUTS = ("belief", "view", "place", "azimuth_bin")
 """What a network may take: the belief over all views; that by the last view alone; the ring and the
 views visited; and the azimuth bin that is seen, of the class believed most and over all classes.
 Any other name is that of a map."""
 # one more, for scenes: the share of the object that is expected to show from each view
 VISIBILITY = "visibility"
-Frame = Literal["camera", "object"]
+CellFrame = Literal["camera", "object"]
 """From where azimuths of cells are counted: the camera's, or that at which the object, if of the
 class believed most, most likely shows its azimuth bin 0."""
 FLOOR = np.log(1e-4)  # logarithm of the smallest belief that is told apart from none
@@ -68,7 +67,7 @@ def mirrored(sphere: ViewSphere) -> Index:
     return sphere.ring * n + (-sphere.azimuth_index) % n
 
 
-def origin(sphere: ViewSphere, state: EpisodeState, frame: Frame) -> Index:
+def origin(sphere: ViewSphere, state: EpisodeState, frame: CellFrame) -> Index:
     """Return the view from which the cells of each episode are counted.
 
     Args:
@@ -101,7 +100,7 @@ def _most_believed(belief: Float, azimuth_bins: Float) -> Float:
 
 
 def features(
-    sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], frame: Frame = "camera"
+    sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], frame: CellFrame = "camera"
 ) -> Float:
     """Compute the input of the gain network from the state of episodes.
 
@@ -159,7 +158,7 @@ def _facets(belief: Float) -> list[Float]:
 
 
 def mirrored_features(
-    sphere: ViewSphere, classes: int, inputs: Sequence[str], frame: Frame = "camera"
+    sphere: ViewSphere, classes: int, inputs: Sequence[str], frame: CellFrame = "camera"
 ) -> Index:
     """Return the place of each feature for the mirror image of an object.
 
@@ -221,7 +220,7 @@ class Gain:
     inputs: tuple[str, ...]
     travel_weight: float = 0.0
     scope: Scope = "global"
-    frame: Frame = "camera"
+    frame: CellFrame = "camera"
 
     def __post_init__(self) -> None:
         maps = maps_of(self.inputs)
@@ -234,9 +233,10 @@ class Gain:
                 f" {other}"
             )
         check_weight(self.travel_weight)
-        if self.frame not in get_args(Frame):
+        if self.frame not in get_args(CellFrame):
             raise PolicyError(
-                f"cells are counted from one of {', '.join(get_args(Frame))}, not {self.frame!r}"
+                f"cells are counted from one of {', '.join(get_args(CellFrame))}, not"
+                f" {self.frame!r}"
             )
 
     @property
@@ -338,7 +338,7 @@ class GainTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     classes: int
     inputs: tuple[str, ...]
     travel_weight: float
-    frame: Frame
+    frame: CellFrame
 
 
 def _cells(weights: Path, session: OnnxFile, features: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -18,8 +18,7 @@ from nextview.geometry.viewsphere import (
     elevation_of,
 )
 from nextview.policies.base import EpisodeState, Policy, ScoresViews, ValuesViews, travel_from
-
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 
 def anywhere(policy: Policy, sphere: Viewpoints) -> Policy:

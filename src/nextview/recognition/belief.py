@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 
 from nextview.checks import number, whole
 from nextview.errors import ModelError, RiskError, UsageError
-
-Float = NDArray[np.float64]
-Floating = NDArray[np.floating]
+from nextview.types import Float, Floats
 
 
-def fuse(logits: Floating, temperature: float = 1.0) -> Float:
+def fuse(logits: Floats, temperature: float = 1.0) -> Float:
     """Fuse the logits of several views by a plain sum (thesis, section 4.4).
 
     Args:
@@ -34,12 +32,12 @@ def fuse(logits: Floating, temperature: float = 1.0) -> Float:
     return _softmax(logits.sum(-2) / temperature)
 
 
-def _softmax(logs: Floating) -> Float:
+def _softmax(logs: Floats) -> Float:
     values = np.exp(logs - logs.max(-1, keepdims=True))
     return values / values.sum(-1, keepdims=True)
 
 
-def reorient(azimuth_bins: Floating, azimuth: Floating) -> Floating:
+def reorient(azimuth_bins: Floats, azimuth: Floats) -> Floats:
     """Convert log-evidence of seen azimuth bins to log-evidence of directions of bin 0, or back.
 
     From azimuth a, bin s is seen if bin 0 points to a - s, so the same sum converts either into the
@@ -58,7 +56,7 @@ def reorient(azimuth_bins: Floating, azimuth: Floating) -> Floating:
     low = np.floor(steps + 1e-9)
     share = np.maximum(steps - low, 0)
 
-    def turned(by: Float) -> Floating:
+    def turned(by: Float) -> Floats:
         source = (by.astype(np.int64) - np.arange(n)) % n
         return np.take_along_axis(azimuth_bins, np.broadcast_to(source, azimuth_bins.shape), -1)
 
@@ -71,7 +69,7 @@ def reorient(azimuth_bins: Floating, azimuth: Floating) -> Floating:
     return np.where(share > 1e-9, mixed, before)
 
 
-def log_evidence_of(logits: Floating, azimuth_bins: Floating | None, azimuth: Floating) -> Floating:
+def log_evidence_of(logits: Floats, azimuth_bins: Floats | None, azimuth: Floats) -> Floats:
     """Combine the outputs for views into log-evidence that can be summed over views.
 
     ``Calibration.belief`` takes the sum.
@@ -206,7 +204,7 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         """What the sum of the logits of so many views is divided by, same shape."""
         return self.temperature * (1 + self.correlation * (n_views - 1))
 
-    def log_belief(self, total: Floating, n_views: NDArray | int, classes: int) -> Float:
+    def log_belief(self, total: Floats, n_views: NDArray | int, classes: int) -> Float:
         """Return the log-belief in each class, up to a constant.
 
         Args:
@@ -241,16 +239,14 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
             )
         return logs + agreement
 
-    def _pointing(self, total: Floating, n_views: NDArray | int, classes: int) -> Float:
+    def _pointing(self, total: Floats, n_views: NDArray | int, classes: int) -> Float:
         """Log-evidence of the directions of azimuth bin 0, (..., azimuth bins, hypotheses)."""
         correlation = self.correlation if self.bin_correlation is None else self.bin_correlation
         sums = np.asarray(total, np.float64)[..., classes:]
         pointing = sums.reshape(*sums.shape[:-1], -1, len(self.hypotheses) or classes)
         return pointing / (1 + correlation * (np.asarray(n_views)[..., None, None] - 1))
 
-    def joint(
-        self, total: Floating, n_views: NDArray | int, classes: int, azimuth: Floating
-    ) -> Float:
+    def joint(self, total: Floats, n_views: NDArray | int, classes: int, azimuth: Floats) -> Float:
         """Return the joint belief in hypotheses and the azimuth bins from which they are seen.
 
         Args:
@@ -271,7 +267,7 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         )
         return _softmax(logs.reshape(*logs.shape[:-2], -1)).reshape(logs.shape)
 
-    def belief(self, total: Floating, n_views: NDArray | int, classes: int) -> Float:
+    def belief(self, total: Floats, n_views: NDArray | int, classes: int) -> Float:
         """Return the belief in each class.
 
         Args:
@@ -288,7 +284,7 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         return _softmax(self.log_belief(total, n_views, classes))
 
     def azimuth_bins(
-        self, total: Floating, n_views: NDArray | int, classes: int, azimuth: Floating
+        self, total: Floats, n_views: NDArray | int, classes: int, azimuth: Floats
     ) -> Float | None:
         """Return the belief in the azimuth bin seen from an azimuth, given each hypothesis.
 
@@ -393,7 +389,7 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
         low, high = self._usual
         return (np.log(radius) < low - np.log(much)) | (np.log(radius) > high + np.log(much))
 
-    def logits(self, radii: Floating) -> NDArray[np.float32]:
+    def logits(self, radii: Floats) -> NDArray[np.float32]:
         """Return what is added to the logits, (B, C) float32; zero for NaN radii.
 
         The radii are in metres, (B,).
@@ -465,7 +461,7 @@ class Stopping:
             return cls(calibration.threshold(risk, max_views), max_views)
         return cls(threshold, max_views, calibration.threshold_decay)
 
-    def reached(self, belief: Floating, n_views: NDArray | int) -> NDArray[np.bool_]:
+    def reached(self, belief: Floats, n_views: NDArray | int) -> NDArray[np.bool_]:
         """Return whether beliefs are high enough to stop.
 
         Args:

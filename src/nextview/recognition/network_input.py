@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from nextview.errors import ModelError, ObservationError
 from nextview.geometry.depth import object_depth, slope
 from nextview.geometry.observation import Observation
+from nextview.types import Float
 
-Float = NDArray[np.float64]
 InputKind = Literal["geometry", "image", "cloud"]
 CHANNELS = ("facing", "up", "height", "nearness")
 # channels of the kinds of input that are images

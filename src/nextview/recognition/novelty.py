@@ -20,8 +20,7 @@ from nextview.checks import check_array
 from nextview.errors import ModelError
 from nextview.files import arrays_in, checked_bytes, new_file
 from nextview.geometry.observation import Observation, SceneView
-
-Float = NDArray[np.floating]
+from nextview.types import Floats
 
 ARRAYS = ("quantiles", "objects", "neighbours", "standard")  # in the file of a novelty score
 NEIGHBOUR = 10  # the distance to this one of the nearest known views counts
@@ -49,10 +48,10 @@ class Quantiles:
             (views, classes): it is taken off a joint score; None where that is not known.
     """
 
-    quantiles: Float
+    quantiles: Floats
     objects: NDArray[np.int64]
     joint: bool = field(default=False, kw_only=True)
-    usual: Float | None = field(default=None, kw_only=True)
+    usual: Floats | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         check_array("its quantiles", self.quantiles, np.floating, (None, None))
@@ -69,7 +68,7 @@ class Quantiles:
             check_array("its usual", self.usual, np.floating, (None, None))
 
     def p_value(
-        self, score: Float | float, n_views: NDArray[np.int64] | int
+        self, score: Floats | float, n_views: NDArray[np.int64] | int
     ) -> NDArray[np.float64]:
         """Return the share of known objects that are at least as novel.
 
@@ -98,7 +97,7 @@ class Quantiles:
                 found[index] = min(float(found[index]), math.erfc(off / math.sqrt(2)) / 2)
         return found
 
-    def of_belief(self, log_belief: Float, n_views: int) -> float:
+    def of_belief(self, log_belief: Floats, n_views: int) -> float:
         """Return the joint novelty score of an object.
 
         Args:
@@ -135,8 +134,8 @@ class Novelty(Quantiles):
             sensor, and without one's errors, (2, 2) float32.
     """
 
-    neighbours: Float
-    standard: Float
+    neighbours: Floats
+    standard: Floats
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -153,7 +152,7 @@ class Novelty(Quantiles):
             raise ModelError("its standard deviations are not above zero")
 
     def scores(
-        self, embeddings: Float, exact: NDArray[np.bool_] | bool = False
+        self, embeddings: Floats, exact: NDArray[np.bool_] | bool = False
     ) -> NDArray[np.float64]:
         """Return the novelty score of each view.
 
@@ -206,7 +205,7 @@ class ViewScore:
     """
 
     observation: Observation
-    judge: Callable[[Sequence[Observation]], Float] | None
+    judge: Callable[[Sequence[Observation]], Floats] | None
     value: float = np.nan
 
 
@@ -246,12 +245,12 @@ def hidden_share(scene: SceneView | None) -> float:
     return float(hidden.sum() / max(outline.sum(), 1))
 
 
-def unit(rows: Float) -> Float:
+def unit(rows: Floats) -> Floats:
     """Rows as unit vectors, same shape; zero stays zero."""
     return rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12)
 
 
-def _in_eight_bits(rows: Float) -> NDArray[np.int8]:
+def _in_eight_bits(rows: Floats) -> NDArray[np.int8]:
     """Unit vectors as int8, same shape: the largest number of each row becomes 127.
 
     ``unit`` brings them back.
@@ -260,7 +259,7 @@ def _in_eight_bits(rows: Float) -> NDArray[np.int8]:
     return np.rint(rows / largest * np.iinfo(np.int8).max).astype(np.int8)
 
 
-def as_stored(rows: Float) -> NDArray[np.float32]:
+def as_stored(rows: Floats) -> NDArray[np.float32]:
     """Unit vectors, (R, F), as they are read after they were saved."""
     return unit(_in_eight_bits(rows).astype(np.float32))
 

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from nextview.checks import one_line, plugin, plugin_errors
 from nextview.errors import UsageError
-from nextview.recognition.belief import Floating, Stopping
+from nextview.recognition.belief import Stopping
+from nextview.types import Floats
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class Believed:
         n_views: so far, in which anything was seen, (...).
     """
 
-    belief: Floating
+    belief: Floats
     n_views: NDArray | int
 
     @property
@@ -55,7 +56,7 @@ class OwnStopping(Stopping):
     rule: Rule | None = None
     name: str = "a rule of your own"
 
-    def reached(self, belief: Floating, n_views: NDArray | int) -> NDArray[np.bool_]:
+    def reached(self, belief: Floats, n_views: NDArray | int) -> NDArray[np.bool_]:
         """Return what the rule decides.
 
         Args:

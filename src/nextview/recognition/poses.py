@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import ModelError
-
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 ALIKE_TURN = 5.0  # degrees between poses that are taken for one
 ALIKE_SHIFT = 0.005  # metres between the centres of poses that are taken for one

@@ -14,8 +14,7 @@ from nextview.recognition.belief import Calibration
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.novelty import Quantiles
 from nextview.recognition.poses import PoseCandidate
-
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 
 @runtime_checkable

@@ -65,9 +65,9 @@ from nextview.things.stored_surfaces import StoredSurfaces
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 
-NAME = "memory"  # of the card in a folder of taught things, and of the file beside it
-CARD = f"{NAME}.json"
-WEIGHTS = f"{NAME}{MEMORY_SUFFIX}"
+MEMORY_NAME = "memory"  # of the card in a folder of taught things, and of the file beside it
+CARD = f"{MEMORY_NAME}.json"
+WEIGHTS = f"{MEMORY_NAME}{MEMORY_SUFFIX}"
 PICTURE = "learned.png"
 # folder beside these things, of the memory that things are shown to before it is finished
 JUDGED = "judged"
@@ -651,7 +651,7 @@ def _card(
     )
 
     return ModelCard(
-        NAME,
+        MEMORY_NAME,
         "recogniser",
         features.input,
         "0" * 64,
@@ -688,8 +688,8 @@ def _remove_old(out: Path, kept: str) -> None:
     Ours are those whose name holds their hash, and that of earlier versions, which has none, if it
     is a memory. A link is removed, never what it points to.
     """
-    for file in out.glob(f"{glob.escape(NAME)}-*{MEMORY_SUFFIX}"):
-        digits = file.stem.removeprefix(f"{NAME}-")
+    for file in out.glob(f"{glob.escape(MEMORY_NAME)}-*{MEMORY_SUFFIX}"):
+        digits = file.stem.removeprefix(f"{MEMORY_NAME}-")
         if (
             file.name != kept
             and len(digits) == SHORT_HASH

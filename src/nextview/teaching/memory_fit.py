@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from nextview.recognition.belief import Calibration, SizeEvidence, log_evidence_of, of_true_class
 from nextview.things.memory import AZIMUTHS, by_ring, similarities
+from nextview.types import Floats, Index
 
-Index = NDArray[np.int64]
-Float = NDArray[np.floating]
 WEIGHTS = (20.0, 30.0, 40.0, 60.0, 90.0)  # of a cosine, as a log-likelihood
 CORRELATIONS = (0.1, 0.3, 0.6)  # of two views, see ``Calibration.bin_correlation``
 HEADS = (0.0, 5.0, 15.0)  # weights of the head beside the nearest views
@@ -21,7 +20,7 @@ VIEWS = (1, 2, 3, 5)
 FOLDS = 5
 LEVELS = 101
 SIZE_ERROR = 0.05  # deviation of the logarithm of a radius that a sensor measures
-FAR = -1e3
+NO_LIKENESS = -1e3
 
 
 @dataclass(frozen=True)
@@ -36,21 +35,21 @@ class Fit:
 
     weight: float
     correlation: float
-    head: Float
-    head_bias: Float
-    quantiles: Float
-    usual: Float
+    head: Floats
+    head_bias: Floats
+    quantiles: Floats
+    usual: Floats
     accuracy: tuple[float, ...]
     confused: tuple[tuple[int, int, float], ...]
 
 
 def fit_memory(
-    views: Float,
+    views: Floats,
     thing: Index,
     label: Index,
-    held_out: Float,
-    held_out_views: Float,
-    radii: Float,
+    held_out: Floats,
+    held_out_views: Floats,
+    radii: Floats,
 ) -> Fit:
     """Fit by the held-out views of the things, most likely after 1, 2, 3 and 5 of them.
 
@@ -75,7 +74,7 @@ def fit_memory(
     alike = _judged(views, thing, held_out[judged], held_out_views[judged])
     for row, t in enumerate(judged):
         if several[t]:
-            alike[row][:, (fold[thing] == fold[t]) & several[thing]] = FAR
+            alike[row][:, (fold[thing] == fold[t]) & several[thing]] = NO_LIKENESS
     heads, whole = _heads(views, thing, label, several, fold, held_out, judged)
     size = size_evidence(radii, label)
     measured = radii * np.exp(rng.normal(0, SIZE_ERROR, len(radii)))  # as a sensor would measure it
@@ -109,7 +108,7 @@ def fit_memory(
     )
 
 
-def _usual(logs: Float, truth: Index) -> Float:
+def _usual(logs: Floats, truth: Index) -> Floats:
     """Return the usual excess novelty of each class, (C,); 0 if it is not known.
 
     The input is the log-belief, (T, draws, C).
@@ -123,7 +122,7 @@ def _usual(logs: Float, truth: Index) -> Float:
     return found
 
 
-def _judged(views: Float, thing: Index, held_out: Float, where: Float) -> NDArray[np.float32]:
+def _judged(views: Floats, thing: Index, held_out: Floats, where: Floats) -> NDArray[np.float32]:
     """How alike each held-out view is to each resting pose and azimuth, (T, K, H, azimuths)."""
     flat = similarities(
         by_ring(views), held_out.reshape(-1, held_out.shape[-1]), where[..., 0].ravel()
@@ -132,14 +131,14 @@ def _judged(views: Float, thing: Index, held_out: Float, where: Float) -> NDArra
 
 
 def _heads(
-    views: Float,
+    views: Floats,
     thing: Index,
     label: Index,
     several: NDArray[np.bool_],
     fold: Index,
-    held_out: Float,
+    held_out: Floats,
     judged: Index,
-) -> tuple[NDArray[np.float32], tuple[Float, Float]]:
+) -> tuple[NDArray[np.float32], tuple[Floats, Floats]]:
     """Return the logits of held-out views by heads that have not seen the thing, (T, K, C).
 
     The head of all things is returned as well.
@@ -159,7 +158,7 @@ def _heads(
     return found, _ridge(x, y, classes)
 
 
-def _ridge(x: Float, y: Index, classes: int) -> tuple[Float, Float]:
+def _ridge(x: Floats, y: Index, classes: int) -> tuple[Floats, Floats]:
     """Fit ridge regression from views, (H, n, F), to one-hot classes, (H,).
 
     Classes have equal weight.
@@ -178,8 +177,8 @@ def _ridge(x: Float, y: Index, classes: int) -> tuple[Float, Float]:
 
 
 def _sums(
-    alike: Float, logits: Float, where: Float, drawn: Index, after: Sequence[int]
-) -> dict[int, Float]:
+    alike: Floats, logits: Floats, where: Floats, drawn: Index, after: Sequence[int]
+) -> dict[int, Floats]:
     """Sums of log-evidence ``after`` so many drawn views, (T, draws, ...) each."""
     total = [log_evidence_of(x, a, z) for x, a, z in zip(logits, alike, where[..., 1], strict=True)]
     return {
@@ -188,7 +187,7 @@ def _sums(
 
 
 def _belief(
-    sums: dict[int, Float], classes: int, hypotheses: Index, correlation: float
+    sums: dict[int, Floats], classes: int, hypotheses: Index, correlation: float
 ) -> list[NDArray[np.float64]]:
     """Return the log-belief from sums of log-evidence, (T, draws, classes), up to a constant."""
     calibration = Calibration(1.0, 1.0, None, correlation, tuple(hypotheses.tolist()))
@@ -196,7 +195,7 @@ def _belief(
 
 
 def _confused(
-    logs: Float, truth: Index, judged: Index, label: Index
+    logs: Floats, truth: Index, judged: Index, label: Index
 ) -> tuple[tuple[int, int, float], ...]:
     """Return pairs of things by how often one is named as the other, worst first."""
     answers = logs.argmax(-1)
@@ -212,7 +211,7 @@ def _confused(
     )
 
 
-def size_evidence(radii: Float, label: Index) -> SizeEvidence | None:
+def size_evidence(radii: Floats, label: Index) -> SizeEvidence | None:
     """Estimate how likely each size is for the things of each class.
 
     Each thing of a class adds a normal distribution of the log radius, and a tenth of a wide one,

@@ -37,10 +37,12 @@ Arrays = dict[str, NDArray]
 HELD_OUT = 8  # views of each thing that are not remembered
 SETUP = 8  # views that share the errors of one setup: a wrong centre, a wrong size
 BATCH = 20
-NEAR = np.radians(30)  # a captured view teaches what the thing looks like from no farther than this
-GRID = ViewSphere(RINGS, AZIMUTHS)
+NEAR_CAPTURED = np.radians(
+    30
+)  # a captured view teaches what the thing looks like from no farther than this
+MEMORY_GRID = ViewSphere(RINGS, AZIMUTHS)
 # poses of views through the sensor
-SENSED = GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape(-1, 4, 4)
+SENSED = MEMORY_GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape(-1, 4, 4)
 # of a thing's arrays: a phrase about the frames that were not used; it is not remembered
 LEFT_OUT = "left_out"
 # of a thing's arrays: its surface, if its size is known
@@ -189,7 +191,7 @@ def _around(clean: Parts, sensed: Parts) -> NDArray[np.float32]:
 def _clean(pool: ThreadPoolExecutor, mesh: Mesh) -> Parts:
     """Embeddings of the views of the grid without errors."""
     camera = SimulatedCamera(mesh)
-    return pool.map(partial(_seen, camera), np.split(GRID.poses, len(GRID) // BATCH))
+    return pool.map(partial(_seen, camera), np.split(MEMORY_GRID.poses, len(MEMORY_GRID) // BATCH))
 
 
 def _sensed(
@@ -213,7 +215,7 @@ def _of_capture(capture: Capture) -> Arrays:
     Its surface, and its resting pose, are in the frame of the world in which it was captured.
     """
     camera = CapturedCamera(capture)
-    camera.take_all(GRID.poses[0])
+    camera.take_all(MEMORY_GRID.poses[0])
     seen = [view for view in camera.object.observations if view.seen]
     if not seen:
         raise ObservationError(f"{capture.folder}: none of its frames shows an object")
@@ -221,8 +223,8 @@ def _of_capture(capture: Capture) -> Arrays:
     directions = np.stack([direction_of(view.pose) for view in seen])
     each = embeddings(seen)
     kept = np.arange(len(seen)) % 4 < 3 if len(seen) > 4 else np.ones(len(seen), bool)
-    arc = angle_between(GRID.directions[:, None], directions[kept][None])
-    views = np.where(arc.min(1)[:, None] < NEAR, each[kept][arc.argmin(1)], 0)
+    arc = angle_between(MEMORY_GRID.directions[:, None], directions[kept][None])
+    views = np.where(arc.min(1)[:, None] < NEAR_CAPTURED, each[kept][arc.argmin(1)], 0)
 
     # the views that are held out
     rest = np.flatnonzero(~kept) if not kept.all() else np.arange(len(seen))

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from nextview.errors import ObservationError
 from nextview.geometry.mesh import make_mesh
@@ -19,9 +18,7 @@ from nextview.things.memory import RINGS, TaughtRecogniser
 from nextview.things.taught import TaughtThings, residuals_of
 from nextview.things.unknown import KnownResiduals
 from nextview.things.weighing import LEAST_BELIEF, EvidenceWeights, JudgedEpisode, fit_weights
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
+from nextview.types import Float, Index
 
 VIEWS = (1, 2, 3)  # after so many views things are judged
 TRIES = 6  # views that are taken at most, until so many show the thing

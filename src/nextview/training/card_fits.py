@@ -29,9 +29,8 @@ from nextview.recognition.belief import (
 )
 from nextview.recognition.model_card import ModelCard
 from nextview.training.fitting_set import blind_walks, card_to_fit, for_fitting, load_sensed
+from nextview.types import Float, Floats
 
-Float = NDArray[np.float64]
-Floats = NDArray[np.floating]
 # of promised error rates
 THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())
 

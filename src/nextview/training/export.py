@@ -43,7 +43,7 @@ with extras():
     from torch import Tensor, nn
 
 OPSET = 18
-SMALL = 2**17
+SMALL_WEIGHT = 2**17
 
 
 class ShippedRecogniser(nn.Module):
@@ -147,7 +147,7 @@ def _shrink(graph: onnx.GraphProto, bits: int) -> None:
         values = numpy_helper.to_array(weight)
         small = f"{name}_small"
 
-        if bits == 16 or values.size < SMALL:
+        if bits == 16 or values.size < SMALL_WEIGHT:
             weight.CopyFrom(numpy_helper.from_array(values.astype(np.float16), small))
             nodes.append(helper.make_node("Cast", [small], [name], to=TensorProto.FLOAT))
             continue

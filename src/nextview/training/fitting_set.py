@@ -19,13 +19,10 @@ from nextview.policies.base import Evidence, Policy
 from nextview.recognition.belief import FixedLength
 from nextview.recognition.model_card import ModelCard, read_card, write_card
 from nextview.session.episode import run_episodes
+from nextview.types import Index
 
-Indices = NDArray[np.int64]
 
-
-def hold_out(
-    labels: Indices, measured: NDArray[np.floating], folds: int, seed: int
-) -> list[Indices]:
+def hold_out(labels: Index, measured: NDArray[np.floating], folds: int, seed: int) -> list[Index]:
     """Divide objects into parts of which each is held out from one network.
 
     Every class is spread evenly; copies of a shape stay together.
@@ -37,7 +34,7 @@ def hold_out(
         seed: of the draw.
 
     Returns:
-        Indices of the objects of each part.
+        Index of the objects of each part.
 
     Raises:
         DatasetError: there are fewer objects than parts, or fewer than two parts.
@@ -102,8 +99,8 @@ def load_sensed(paths: Sequence[Path], table: Predictions) -> list[Predictions]:
 
 
 def blind_walks(
-    sphere: ViewSphere, policy: Policy, starts: Indices, n_views: int, rng: np.random.Generator
-) -> Indices:
+    sphere: ViewSphere, policy: Policy, starts: Index, n_views: int, rng: np.random.Generator
+) -> Index:
     """Return the views of a policy that knows only where it has been.
 
     Args:
@@ -117,7 +114,7 @@ def blind_walks(
         Views in order, (E, n_views) int64.
     """
 
-    def nothing(episodes: Indices, views: Indices) -> Evidence:
+    def nothing(episodes: Index, views: Index) -> Evidence:
         return Evidence(np.zeros((len(episodes), 1)))
 
     return run_episodes(

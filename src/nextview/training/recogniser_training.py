@@ -19,15 +19,13 @@ from nextview.training.architectures import recogniser_network
 from nextview.training.inputs import PackedViews, ready_inputs
 from nextview.training.recipes import Hardware, RecogniserRecipe
 from nextview.training.runs import OwnBatches, fit, new_run, optimiser, start_from, train_once
+from nextview.types import Float, Index
 
 with extras():
     import lightning as L
     import torch
     from torch import Tensor, nn
     from torch.nn import functional as F
-
-Float = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -41,7 +39,7 @@ class StoredInputs:
     """
 
     inputs: NDArray[np.uint8] | PackedViews
-    row: Indices
+    row: Index
     azimuth_bins: NDArray[np.float32] | None = None
 
 
@@ -51,8 +49,8 @@ class Views(OwnBatches):
     def __init__(
         self,
         sources: list[StoredInputs],
-        objects: Indices,
-        labels: Indices,
+        objects: Index,
+        labels: Index,
         recipe: RecogniserRecipe,
     ) -> None:
         self.sources = sources
@@ -223,7 +221,7 @@ class ValidationViews(OwnBatches):
     """Every fifth view of the validation objects, shifted by one from object to object."""
 
     def __init__(
-        self, inputs: NDArray[np.uint8] | PackedViews, objects: Indices, labels: Indices
+        self, inputs: NDArray[np.uint8] | PackedViews, objects: Index, labels: Index
     ) -> None:
         self.inputs = inputs
         self.objects = objects
@@ -237,8 +235,8 @@ class ValidationViews(OwnBatches):
 
 def fit_recogniser(
     sources: list[StoredInputs],
-    labels: Indices,
-    parts: tuple[Indices, Indices],
+    labels: Index,
+    parts: tuple[Index, Index],
     recipe: RecogniserRecipe,
     out: Path,
     weights: Path | None = None,
@@ -281,7 +279,7 @@ def fit_recogniser(
     return best.net.eval()
 
 
-def mirror_planes(store: ViewStore, objects: Indices) -> Float:
+def mirror_planes(store: ViewStore, objects: Index) -> Float:
     """Find the plane of symmetry of each class.
 
     Args:
@@ -384,7 +382,7 @@ def train_recogniser(
 def _source(
     store: ViewStore,
     views: ViewStore,
-    needed: Indices,
+    needed: Index,
     recipe: RecogniserRecipe,
     planes: Float | None,
     track: Track,

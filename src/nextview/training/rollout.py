@@ -18,8 +18,8 @@ from nextview.recognition.belief import FixedLength, of_true_class
 from nextview.session.episode import run_episodes
 from nextview.training.card_fits import calibration_of
 from nextview.training.fitting_set import for_fitting
+from nextview.types import Float
 
-Float = NDArray[np.float64]
 # belief in the truth, its logarithm, or whether the answer is right
 OBJECTIVES = ("belief", "log-belief", "right")
 

@@ -25,8 +25,8 @@ from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.teaching.thing_views import embeddings
 from nextview.training.fitting_set import card_to_fit
+from nextview.types import Float32
 
-Float32 = NDArray[np.float32]
 REMEMBERED_VIEWS = 3
 """Remembered views of each known object as its mesh has it, and as many of a stretched copy."""
 CALIBRATION_VIEWS = 5

@@ -18,7 +18,7 @@ from nextview.things.expected_views import RivalPictures
 from nextview.viewers.exploration import Walk
 
 CELL = 11  # side of a cell of a map, pixels
-SHOWN = 5  # classes of which the belief is shown
+SHOWN_CLASSES = 5  # classes of which the belief is shown
 STYLE = f"""<style>
 .nv {{ font: 13px sans-serif; color: {INK}; padding: 0.4em 0.8em 0.8em }}
 .nv h3 {{ margin: 0 0 0.1em; font-size: 20px }}
@@ -224,7 +224,7 @@ def _beliefs(walk: Walk) -> str:
     counted = sum(view.observation.seen for view in walk.views)
     # none is drawn where it is infinite
     threshold = 100 * float(walk.stopping.threshold_at(max(counted, 1)))
-    for c in np.argsort(-highest, kind="stable")[:SHOWN]:
+    for c in np.argsort(-highest, kind="stable")[:SHOWN_CLASSES]:
         bars = (
             '<div class="bar"><i'
             f' style="top:0;height:8px;width:{100 * view.belief[c]:.1f}%;background:{ACCENT}"></i>'

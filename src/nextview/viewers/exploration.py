@@ -26,8 +26,7 @@ from nextview.session.view import View
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.expected_views import RivalPictures
 from nextview.things.memory import AZIMUTHS, RINGS, TaughtRecogniser
-
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 
 class StoredViews:

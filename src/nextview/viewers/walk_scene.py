@@ -11,15 +11,15 @@ from nextview.checks import extras
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.viewsphere import great_circle
 from nextview.session.style import ACCENT, FAINT, INK, WOOD, heat, rgb
+from nextview.types import Float
 from nextview.viewers.card import warm
 from nextview.viewers.exploration import Walk
 
 with extras():
     import viser
 
-Float = NDArray[np.float64]
 BALL = 0.09  # radius of a candidate view, object radii
-TABLE = 2.4  # radius of what the object stands on
+TABLE_RADIUS = 2.4  # radius of what the object stands on
 SMOOTH = 10_000  # faces of a mesh from which its vertices are shaded, not its faces: scans
 
 
@@ -62,7 +62,7 @@ class WalkScene:
         floor = (-1.0 if mesh is None else float(mesh.vertices[:, 2].min())) - 0.03
         server.scene.add_cylinder(
             f"{name}/table",
-            TABLE,
+            TABLE_RADIUS,
             0.04,
             (255, 246, 230),
             radial_segments=96,
