@@ -35,7 +35,7 @@ reproduce-small: .venv-test/installed  ## the same on three meshes a class, or o
 
 .venv-test/installed: pyproject.toml research/pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv-test
-	.venv-test/bin/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[train,benchmark,cluster,explore,large,record,dev,workflow,docs,envs]' -e 'research[arm,rl]'
+	.venv-test/bin/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[train,bags,benchmark,cluster,explore,large,record,dev,workflow,docs,envs]' -e 'research[arm,rl]'
 	touch $@
 
 clean:

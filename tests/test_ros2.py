@@ -16,8 +16,18 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 from pipeline import TABLE, box, cast, pose_at
+from ros_messages import (
+    SHAPE,
+    STORE,
+    header,
+    image_message,
+    info_message,
+    message,
+    roi,
+    transform_message,
+)
 from rosbags.rosbag2 import Reader, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
 import nextview
@@ -29,10 +39,6 @@ ROS = Path(__file__).parents[1] / "ros2"
 sys.path.insert(0, str(ROS / "nextview_ros"))
 from nextview_ros import conversion
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
-K = np.array([[260.0, 0, 79.5], [0, 265.0, 59.5], [0, 0, 1]])
-"""First pixel's centre at 0, as in ROS."""
-SHAPE = 120, 160
 ROS_MODULES = (
     "geometry_msgs",
     "geometry_msgs.msg",
@@ -54,72 +60,6 @@ ROS_MODULES = (
     "tf2_ros",
 )
 """What the node imports from ROS."""
-
-
-def message(kind, **fields):
-    return STORE.types[kind](**fields)
-
-
-def header(frame, time=12.5):
-    stamp = message("builtin_interfaces/msg/Time", sec=int(time), nanosec=round(1e9 * (time % 1)))
-    return message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
-
-
-def image_message(depth, encoding, big=False, padding=0, **more):
-    """A depth image; with rows that are longer than needed, and of either byte order."""
-    kind = np.dtype({"16UC1": "u2", "32FC1": "f4"}[encoding]).newbyteorder(">" if big else "<")
-    rows = np.ascontiguousarray(depth, kind).view(np.uint8)
-    rows = np.pad(rows.reshape(len(depth), -1), ((0, 0), (0, padding)), constant_values=7)
-    fields = {
-        "height": depth.shape[0],
-        "width": depth.shape[1],
-        "encoding": encoding,
-        "is_bigendian": int(big),
-    }
-    fields |= {"header": header("optical"), "step": rows.shape[1], "data": rows.ravel()}
-    return message("sensor_msgs/msg/Image", **(fields | more))
-
-
-def roi(offset):
-    return message(
-        "sensor_msgs/msg/RegionOfInterest",
-        x_offset=offset,
-        y_offset=0,
-        height=0,
-        width=0,
-        do_rectify=False,
-    )
-
-
-def info_message(k=K, shape=SHAPE, d=(), p=None, **more):
-    p = np.hstack([k, np.zeros((3, 1))]) if p is None else p
-    fields = {
-        "header": header("optical"),
-        "height": shape[0],
-        "width": shape[1],
-        "distortion_model": "plumb_bob",
-    }
-    fields |= {
-        "d": np.array(d, float),
-        "k": np.array(k, float).ravel(),
-        "r": np.eye(3).ravel(),
-        "p": p.ravel(),
-    }
-    return message(
-        "sensor_msgs/msg/CameraInfo",
-        **(fields | {"binning_x": 0, "binning_y": 0, "roi": roi(0)} | more),
-    )
-
-
-def transform_message(pose, child="optical", time=12.5):
-    x, y, z, w = map(float, Rotation.from_matrix(pose[:3, :3]).as_quat())
-    translation = message(
-        "geometry_msgs/msg/Vector3", **dict(zip("xyz", map(float, pose[:3, 3]), strict=True))
-    )
-    rotation = message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
-    transform = message("geometry_msgs/msg/Transform", translation=translation, rotation=rotation)
-    fields = {"header": header("world", time), "child_frame_id": child, "transform": transform}
-    return message("geometry_msgs/msg/TransformStamped", **fields)
 
 
 def recorded(folder, views):

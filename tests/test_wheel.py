@@ -31,6 +31,7 @@ EXAMPLES = {
         " report"
     ),
     "cluster": "from distributed import LocalCluster; import nextview.data.pool",
+    "bags": "import rosbags; from nextview.captured.bag import Bag",
     "train": "import lightning, torch; from nextview.training import export, runs",
     "workflow": "import snakemake",
     "explore": "import viser; from nextview.viewers.exploration import Exploration",
@@ -44,7 +45,7 @@ EXAMPLES = {
     "dev": "import hypothesis, mypy, pytest, ruff, skimage",
 }
 """One line for each extra, and for none."""
-QUICK = ("", "benchmark", "cluster", "envs", "record")
+QUICK = ("", "bags", "benchmark", "cluster", "envs", "record")
 """Those that are tried always: the others import for seconds."""
 EMPTY_ENVIRONMENT = {
     name: value

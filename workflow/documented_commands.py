@@ -75,6 +75,9 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"^(ros2|rosdep|colcon|cp -r ros2|cd |source )": (
         "needs ROS 2; tests/test_ros2.py tries the node with stand-ins"
     ),
+    r"my_(recordings?|folder)": (
+        "needs a recording of the reader's; tests/test_recordings.py writes such and reads them"
+    ),
     r"-m zipfile|efficientnet|resnet34-b627a593": "weights of others, which are fetched first",
     r"research\.(film|real_things|touching_things|growth)|verified_things": (
         "needs the YCB scans, and minutes"

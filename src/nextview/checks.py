@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from nextview.errors import MissingExtraError, ModelError, NextviewError, UsageError
 
 EXTRAS = {  # packages by the optional part of the installation that brings them
+    "bags": ("rosbags",),
     "benchmark": ("jinja2", "pandas", "pyarrow"),
     "cluster": ("dask", "distributed"),
     "explore": ("viser", "websockets"),

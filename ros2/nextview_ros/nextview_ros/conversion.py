@@ -13,95 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from nextview.captured.messages import depth_of, intrinsics_of, pose_of, seconds
 from nextview.errors import ObservationError
 from nextview.sensing.frame import AXES, Frame
 
 Float = NDArray[np.float64]
 
-ENCODINGS = {
-    "16UC1": np.dtype(np.uint16),
-    "mono16": np.dtype(np.uint16),
-    "32FC1": np.dtype(np.float32),
-}
-"""How a pixel is stored, by the encoding of a depth image."""
 SIMULTANEOUS = 0.02
 """Seconds that image, camera_info and transform may be apart: a camera at 30 Hz never mixes
 neighbours.
 """
-
-
-def depth_of(image: Any) -> NDArray[Any]:
-    """The pixels of a ``sensor_msgs/Image``: (height, width), uint16 millimetres or float32 metres,
-    native byte order.
-
-    Raises:
-        ObservationError: it is no depth image, or shorter than it says.
-    """
-    if image.encoding not in ENCODINGS:
-        raise ObservationError(
-            f"a depth image is {', '.join(ENCODINGS)}, not {image.encoding!r}: a colour topic?"
-        )
-    kind = ENCODINGS[image.encoding].newbyteorder(">" if image.is_bigendian else "<")
-    height, width, step = int(image.height), int(image.width), int(image.step)
-    data = np.frombuffer(bytes(image.data), np.uint8)
-    if step < width * kind.itemsize or len(data) < step * height:
-        raise ObservationError(
-            f"an image of {width} x {height} in {image.encoding} has rows of"
-            f" {width * kind.itemsize} bytes or more; this one has {len(data)} bytes in rows of"
-            f" {step}"
-        )
-    rows = data[: step * height].reshape(height, step)[:, : width * kind.itemsize]
-    return np.ascontiguousarray(rows).view(kind).astype(kind.newbyteorder("="))
-
-
-def intrinsics_of(info: Any, rectified: bool = False) -> Float:
-    """The pinhole matrix of a ``sensor_msgs/CameraInfo``, (3, 3), pixels; the first pixel's centre
-    is at 0.
-
-    Args:
-        info: the message.
-        rectified: whether the images are: then ``p`` counts, and the distortion ``d`` is undone
-            already.
-
-    Raises:
-        ObservationError: the camera is not calibrated, distorts, or gives binned or cropped images.
-    """
-    binned = max(int(info.binning_x), 1), max(int(info.binning_y), 1)
-    if binned != (1, 1) or info.roi.x_offset or info.roi.y_offset:
-        raise ObservationError(
-            "camera_info is of binned or cropped images: use the topic of the whole image"
-        )
-    if rectified:
-        k = np.asarray(info.p, float).reshape(3, 4)[:, :3].copy()
-    else:
-        k = np.asarray(info.k, float).reshape(3, 3).copy()
-        if np.any(np.asarray(info.d, float)):
-            raise ObservationError(
-                f"the camera distorts ({info.distortion_model}): use rectified images (image_rect"
-                " of image_proc), and say that they are"
-            )
-    if not k.any():
-        raise ObservationError(
-            f"the camera is not calibrated: {'p' if rectified else 'k'} of camera_info is zero"
-        )
-    return k
-
-
-def pose_of(transform: Any) -> Float:
-    """A ``geometry_msgs/TransformStamped`` as a matrix, (4, 4): from its child's frame into that of
-    its header.
-
-    Raises:
-        ObservationError: the quaternion is none of a rotation.
-    """
-    t, q = transform.transform.translation, transform.transform.rotation
-    quaternion = np.array([q.x, q.y, q.z, q.w])
-    if not abs(np.linalg.norm(quaternion) - 1) < 1e-3:
-        raise ObservationError(f"a rotation is a quaternion of length 1, not {quaternion.tolist()}")
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
-    pose[:3, 3] = t.x, t.y, t.z
-    return pose
 
 
 def frame_of(
@@ -143,11 +64,6 @@ def frame_of(
             f"image, camera_info and transform are {max(times) - min(times):.3f} s apart"
         )
     return Frame(depth_of(image), intrinsics_of(info, rectified), pose_of(transform), axes=axes)
-
-
-def seconds(stamp: Any) -> float:
-    """A ``builtin_interfaces/Time`` in seconds."""
-    return stamp.sec + 1e-9 * stamp.nanosec
 
 
 def fill_pose(message: Any, pose: Float, axes: str = "opencv") -> Any:

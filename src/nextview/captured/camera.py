@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nextview.captured.check import check_capture, refuse_many
-from nextview.captured.folders import Capture, CapturedFrame, Float
+from nextview.captured.frames import Capture, CapturedFrame, Float
 from nextview.errors import DatasetError, NoViewLeftError, ObservationError
 from nextview.geometry.viewsphere import angle_between
 from nextview.sensing.frame import Frame

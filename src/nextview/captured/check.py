@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nextview.captured.camera_mistakes import find_camera_mistake, find_offset
-from nextview.captured.folders import Capture, CapturedFrame
+from nextview.captured.frames import Capture, CapturedFrame
 from nextview.captured.pose_mistakes import (
     FEWEST_JUDGED,
     UNIT_NAMES,
@@ -36,6 +36,7 @@ DEPTH_SOURCES = {
     "BOP": "depth_scale in scene_camera.json",
     "TUM RGB-D": "this layout, 5000 per metre",
     "7-Scenes": "this layout, 1000 per metre",
+    "ROS 2 bag": "as REP 118 has it: 16UC1 millimetres, 32FC1 metres",
 }
 
 
@@ -346,10 +347,10 @@ def _scale_in_words(capture: Capture, scale: float, depth: float, unit: float) -
     depths = (
         f"the depth is {times:g} times too {'large' if scale > 1 else 'small'}: its steps are of "
     )
-    depths += (
-        f"{step / scale:.3g} mm, not of {step:.3g} mm"
-        f" ({DEPTH_SOURCES.get(capture.layout, 'in its files')})"
-    )
+    source = DEPTH_SOURCES.get(capture.layout, "in its files")
+    if capture.scale_given:
+        source = "--depth-scale"
+    depths += f"{step / scale:.3g} mm, not of {step:.3g} mm ({source})"
 
     plausible = PLAUSIBLE_DEPTH[0] <= depth <= PLAUSIBLE_DEPTH[1]
     if translations and plausible and times >= NEVER_A_DEPTH:

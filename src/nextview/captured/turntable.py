@@ -10,11 +10,14 @@ from scipy.spatial import cKDTree
 
 from nextview.captured.folders import (
     INTRINSICS,
+    is_capture,
+)
+from nextview.captured.frames import (
     MILLIMETRES,
     Capture,
     CapturedFrame,
+    DepthFile,
     Float,
-    is_capture,
     read_table,
 )
 from nextview.errors import DatasetError, ObservationError
@@ -50,7 +53,7 @@ def read_turntable(folder: Path, turn: str) -> Capture:
     k = read_table(folder / INTRINSICS, "the pinhole matrix", 3)
     way = 1 if turn == "ccw" else -1
     frames = [
-        CapturedFrame(path.stem, path, MILLIMETRES, k, np.eye(4))
+        CapturedFrame(path.stem, DepthFile(path), MILLIMETRES, k, np.eye(4))
         for path in sorted(folder.glob("*.png"))
     ]
     shown = []

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from nextview.captured.folders import NOTHING, pinhole_of
+from nextview.captured.frames import NOTHING, pinhole_of
 from nextview.checks import number
 from nextview.errors import ResultsError, UsageError
 from nextview.files import new_folder

@@ -12,7 +12,7 @@ from nextview.files import check_new
 from nextview.geometry.mesh import MAX_FACES, load_mesh, mesh_warnings
 from nextview.geometry.observation import Camera
 from nextview.session.session import FrameCamera
-from nextview.session.system import simulated
+from nextview.session.system import is_frames, simulated
 
 Unit = Literal["mm", "cm", "inch", "foot", "m"]
 Three = tuple[float, float, float]
@@ -73,7 +73,13 @@ class ObjectOptions:
         box: of a folder: the upright box into which the object just fits, its low and its high
             corner, metres (heights along --up), or a JSON file with low, high and axes.
         object_id: of a BOP folder with several objects: the one that is meant.
-        intrinsics: of a folder: FX FY CX CY, pixels, or a file with the pinhole matrix.
+        intrinsics: of a folder: FX FY CX CY, pixels, or a file with them: the pinhole matrix, or
+            what ROS, librealsense or Open3D wrote (JSON or YAML).
+        depth_scale: of a folder: metres that one step of the depth images stands for, if not as its
+            files say; 0.001 for millimetres.
+        depth_topic: of a ROS 2 bag with several topics of depth images.
+        world_frame: of a ROS 2 bag: the frame of tf that is the world, z up; the root of the tree
+            if not given.
         raw: of a folder: take the depth as it is, without denoising.
         by_shape: of a folder: the object's size says nothing of its class, as with toys.
     """
@@ -87,14 +93,17 @@ class ObjectOptions:
     box: tuple[float, float, float, float, float, float] | Path | None = None
     object_id: int | None = None
     intrinsics: tuple[float, float, float, float] | Path | None = None
+    depth_scale: float | None = None
+    depth_topic: str | None = None
+    world_frame: str | None = None
     raw: bool = False
     by_shape: bool = False
 
     def camera(self, path: Path, seed: int) -> Camera | FrameCamera:
-        """Create a camera in front of the object of a mesh file or a folder of captured frames.
+        """Create a camera in front of the object of a mesh file or of captured frames.
 
         Args:
-            path: of the file or folder.
+            path: of the mesh file, or of the folder, the bag or the image.
             seed: of the sensor's errors.
 
         Returns:
@@ -103,12 +112,12 @@ class ObjectOptions:
         Raises:
             UsageError: an option does not apply to this kind of input.
         """
-        folder = path.is_dir()
+        folder = is_frames(path)
         of_meshes = ("unit", "sensor", "max_faces", "largest_part")
         for field in fields(self)[1:]:
             if (field.name in of_meshes) == folder and getattr(self, field.name) != field.default:
                 option = field.name.replace("_", "-")
-                kind = "mesh files" if folder else "folders of captured views"
+                kind = "mesh files" if folder else "captured views"
                 raise UsageError(f"{path}: --{option} is for {kind}, and this is none")
 
         if folder:
@@ -126,7 +135,14 @@ class ObjectOptions:
         from nextview.captured.folders import read_box, read_capture
         from nextview.sensing.object_frame import Box, upright_axes
 
-        capture = read_capture(folder, self.intrinsics, self.object_id)
+        capture = read_capture(
+            folder,
+            self.intrinsics,
+            self.object_id,
+            self.depth_scale,
+            self.depth_topic,
+            self.world_frame,
+        )
         console.print(f"{capture!r}")
         up = UP[self.up] if isinstance(self.up, str) else self.up
         box = read_box(self.box) if isinstance(self.box, Path) else None

@@ -44,14 +44,15 @@ def recognise(
 ) -> None:
     """Recognise an object by next best views, and show where it looked and why.
 
-    The object is in a mesh file, or in a folder of captured depth images with poses in the layout
-    of BOP, TUM RGB-D or 7-Scenes. Of these the view nearest to the one asked for answers. The
-    object is what the masks show; else what lies in the box; else the thing on the support plane
-    that is nearest to the point, or at which the first camera is aimed.
+    The object is in a mesh file, or in captured depth images with poses: a ROS 2 bag, or a folder
+    in the layout of BOP, TUM RGB-D, 7-Scenes or a RealSense recorder. Of these the
+    view nearest to the one asked for answers. The object is what the masks show; else what lies in
+    the box; else the thing on the support plane that is nearest to the point, or at which the first
+    camera is aimed.
 
     Args:
-        path: OFF, OBJ, PLY, STL or GLB file of one object that stands upright; or a folder of
-            captured views.
+        path: OFF, OBJ, PLY, STL or GLB file of one object that stands upright; or a folder or
+            a bag of captured views, or one depth image (.png).
         more: further ones; with --json each is a line.
         start: first view; of the 40, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not
             given.

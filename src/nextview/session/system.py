@@ -44,6 +44,7 @@ MOST_THREADS = 1024
 # the models that ship with the package, and their share of false alarms
 DEFAULT = "modelnet10"
 UNKNOWN = 0.02
+FRAME_FILES = (".mcap", ".db3", ".bag", ".png")  # files of captured frames, not of meshes
 
 
 @dataclass(frozen=True, repr=False)
@@ -134,8 +135,8 @@ class System:
         """Look at an object until it is clear what it is, or the views run out.
 
         Args:
-            what: a mesh file (OFF, OBJ, PLY, STL or GLB), a mesh, a folder of captured views, or a
-                camera: anything with ``observe(pose)``.
+            what: a mesh file (OFF, OBJ, PLY, STL or GLB), a mesh, captured views (a
+                folder, a ROS 2 bag), or a camera: anything with ``observe(pose)``.
             start: the first view, an index of ``sphere``; drawn by the seed if not given.
             seed: decides the first view and whatever the policy draws.
             up: the up axis of a mesh file, "y" or "z"; z if not given, but y for GLB. Of a folder,
@@ -153,14 +154,14 @@ class System:
             UsageError: there is no such sensor, or ``what`` is nothing to look at.
             ObservationError: the object is found in none of the captured views.
         """
-        if largest_part and not (isinstance(what, str | Path) and not os.path.isdir(what)):
+        if largest_part and not (isinstance(what, str | Path) and not is_frames(what)):
             raise UsageError("the largest part is taken of a mesh file while it is read")
         if isinstance(what, str) and not what.strip():
             raise UsageError(
                 "what is looked at has an empty name; give a mesh file or a folder of views"
             )
         if isinstance(what, str | Path):
-            if os.path.isdir(what):  # not Path.is_dir, which raises where a name is too long
+            if is_frames(what):
                 what = _camera_of(Path(what), up)
             elif up is None or isinstance(up, str):
                 what = load_mesh(what, up, unit, largest_part=largest_part)
@@ -352,6 +353,12 @@ def _grid_of(network: MapNetwork, sphere: ViewSphere) -> ViewSphere:
             return grid
     there = f"the {len(sphere)} viewpoints {sphere.rings}"
     raise PolicyError(f"the map {network.card.name} has {network.rings} rings, and {there}")
+
+
+def is_frames(path: str | Path) -> bool:
+    """Whether a path is a folder, a bag or an image of captured frames, not a mesh file."""
+    # not Path.is_dir, which raises where a name is too long
+    return os.path.isdir(path) or os.path.splitext(path)[1].lower() in FRAME_FILES
 
 
 def _camera_of(folder: Path, up: str | tuple[float, float, float] | None) -> "CapturedCamera":

@@ -234,10 +234,10 @@ def learn_things(
 ) -> Learned:
     """Teach the things in a folder, and write a folder of models that recognises them.
 
-    Each mesh in the folder is a thing of its own name, as is each folder of captured depth frames
-    with poses (BOP, TUM RGB-D or 7-Scenes) or from a turntable; any other folder is a class, and
-    the meshes in it are its things. A run that was stopped goes on where it was. Use what it writes
-    with --models OUT, or ``nextview.load(models=OUT)``.
+    Each mesh in the folder is a thing of its own name, as is each ROS 2 bag, and each folder of
+    depth frames with poses (BOP, TUM RGB-D, 7-Scenes or RealSense) or from a turntable; any other
+    folder is a class, and the meshes in it are its things. A run that was stopped goes on where it
+    was. Use what it writes with --models OUT, or ``nextview.load(models=OUT)``.
 
     Args:
         folder: what is to be taught.

@@ -4,6 +4,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from nextview.captured.bag import is_bag
 from nextview.captured.folders import is_capture
 from nextview.captured.turntable import is_turntable
 from nextview.checks import one_line
@@ -21,7 +22,7 @@ class ThingSource:
     Attributes:
         name: of the thing.
         label: its class.
-        path: its mesh file, or the folder of captured frames.
+        path: its mesh file, or the folder or bag of captured frames.
     """
 
     name: str
@@ -47,9 +48,9 @@ class Found:
 def find_things(folder: Path, out: Path | None = None, one_class: bool = False) -> Found:
     """Find the things that a folder teaches.
 
-    A mesh in the folder itself, and a folder of captured frames, is a thing and a class of its own
-    name. All else is as in a dataset (``data.folders``): each mesh in a class folder is a thing of
-    that class; where there are splits, those of "train".
+    A mesh in the folder itself, and a folder or a ROS 2 bag of captured frames, is a thing and a
+    class of its own name. All else is as in a dataset (``data.folders``): each mesh in a class
+    folder is a thing of that class; where there are splits, those of "train".
 
     Args:
         folder: to be looked through.
@@ -76,16 +77,17 @@ def find_things(folder: Path, out: Path | None = None, one_class: bool = False) 
     listing = read_folder(folder, loose=True, skip=skip)
 
     entries, other_splits = _to_be_taught(listing.entries)
+    in_bags = {path.relative_to(folder) for path in captures}
     left_out = left_out_phrases(
-        listing.left_out
+        [(path, reason) for path, reason in listing.left_out if path not in in_bags]
         + [(e.path.relative_to(folder), f"of the split {e.split}") for e in other_splits]
     )
-    things = [ThingSource(path.name, path.name, path) for path in captures]
+    things = [_of_frames(path) for path in captures]
     things += [ThingSource(entry.name, entry.label, entry.path) for entry in entries]
     if not things:
         text = (
-            f"{folder}: holds no mesh ({', '.join(FORMATS)}) and no folder of depth frames with"
-            " poses"
+            f"{folder}: holds no mesh ({', '.join(FORMATS)}) and no folder or bag of depth"
+            " frames with poses"
         )
         raise DatasetError("; left out: ".join([text, *filter(None, ["; ".join(left_out)])]))
     things.sort(key=lambda thing: (thing.label, thing.name))
@@ -94,26 +96,33 @@ def find_things(folder: Path, out: Path | None = None, one_class: bool = False) 
         _check_classes(folder, things)
 
     layout = [listing.layout()] if entries else []
-    if captures:
-        layout.append(
-            "1 folder of depth frames"
-            if len(captures) == 1
-            else f"{len(captures)} folders of depth frames"
-        )
+    bags = sum(is_bag(path) for path in captures)
+    layout += _counted(bags, "ROS 2 bag", "ROS 2 bags")
+    layout += _counted(len(captures) - bags, "folder of depth frames", "folders of depth frames")
     notes = (f"in {folder}: {', '.join(layout)}", *listing.notes)
     return Found(things, left_out, notes)
 
 
 def _captures(folder: Path) -> list[Path]:
-    """The folders of captured frames in a folder, sorted by name."""
-    inside = sorted(
-        path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")
-    )
+    """The folders and bags of captured frames in a folder, sorted by name."""
+    inside = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     return [
         path
         for path in inside
-        if path.name.isprintable() and (is_capture(path) or is_turntable(path))
+        if path.name.isprintable()
+        and (is_bag(path) or (path.is_dir() and (is_capture(path) or is_turntable(path))))
     ]
+
+
+def _counted(count: int, one: str, several: str) -> list[str]:
+    """How many there are, a phrase; nothing for none."""
+    return [f"{count} {one if count == 1 else several}"] if count else []
+
+
+def _of_frames(path: Path) -> ThingSource:
+    """The thing that a folder of captured frames, or the file of a bag, shows."""
+    name = path.name if path.is_dir() else path.stem
+    return ThingSource(name, name, path)
 
 
 def _to_be_taught(entries: list[Entry]) -> tuple[list[Entry], list[Entry]]:

@@ -12,9 +12,11 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from nextview.captured.bag import is_bag
 from nextview.captured.camera import CapturedCamera
 from nextview.captured.check import summary
-from nextview.captured.folders import Capture, is_capture, read_capture
+from nextview.captured.folders import is_capture, read_capture
+from nextview.captured.frames import Capture
 from nextview.captured.turntable import read_turntable
 from nextview.checks import one_of, whole
 from nextview.errors import DatasetError, ObservationError
@@ -70,6 +72,11 @@ class TeachingOptions:
         turntable: depth frames without poses, beside camera-intrinsics.txt: the camera stood still,
             and the thing turned once around by equal steps, counter-clockwise (ccw) or clockwise
             (cw) as seen from above.
+        depth_scale: of captured frames: metres that one step of the depth images stands for, if
+            not as their files say; 0.001 for millimetres.
+        depth_topic: of ROS 2 bags with several topics of depth images.
+        world_frame: of ROS 2 bags: the frame of tf that is the world, z up; the root of the tree if
+            not given.
         seed: of all random draws.
     """
 
@@ -81,6 +88,9 @@ class TeachingOptions:
     any_size: bool = False
     one_class: bool = False
     turntable: Literal["ccw", "cw"] | None = None
+    depth_scale: float | None = None
+    depth_topic: str | None = None
+    world_frame: str | None = None
     seed: int = 0
 
     def check(self) -> None:
@@ -100,7 +110,7 @@ def teach(path: Path, name: str, how: TeachingOptions, threads: int = 1) -> Arra
     """Look at one thing, and note what is to be remembered of it.
 
     Args:
-        path: a mesh file, or a folder of captured frames.
+        path: a mesh file, or a folder or a bag of captured frames.
         name: of the thing; with the seed it decides all random draws.
         how: how it is looked at.
         threads: that work side by side.
@@ -114,14 +124,8 @@ def teach(path: Path, name: str, how: TeachingOptions, threads: int = 1) -> Arra
         MeshError, DatasetError, ObservationError: why it cannot be looked at, in one sentence.
     """
     rng = np.random.default_rng([how.seed, zlib.crc32(name.encode())])
-    if path.is_dir():
-        if not is_capture(path) and how.turntable is None:
-            raise DatasetError(
-                f"{path}: its frames have no poses; --turntable ccw or cw says how the thing turned"
-            )
-        return _of_capture(
-            read_capture(path) if is_capture(path) else read_turntable(path, str(how.turntable))
-        )
+    if path.is_dir() or is_bag(path):
+        return _of_capture(_captured(path, how), name)
     mesh = load_mesh(path, how.up, how.unit, largest_part=how.largest_part)
     rotations = np.eye(3)[None] if how.upright else resting_poses(mesh)
     lying = [mesh, *(rotated(mesh, rotation) for rotation in rotations[1:])]
@@ -151,6 +155,24 @@ def teach(path: Path, name: str, how: TeachingOptions, threads: int = 1) -> Arra
         ),
         **_surface(mesh, to_mesh),
     }
+
+
+def _captured(path: Path, how: TeachingOptions) -> Capture:
+    """The frames of a folder or a bag."""
+    if is_bag(path):
+        return read_capture(
+            path,
+            depth_scale=how.depth_scale,
+            depth_topic=how.depth_topic,
+            world_frame=how.world_frame,
+        )
+    if is_capture(path):
+        return read_capture(path, depth_scale=how.depth_scale)
+    if how.turntable is None:
+        raise DatasetError(
+            f"{path}: its frames have no poses; --turntable ccw or cw says how the thing turned"
+        )
+    return read_turntable(path, how.turntable)
 
 
 def _surface(mesh: Mesh, to_mesh: NDArray[np.float64]) -> Arrays:
@@ -207,7 +229,7 @@ def _seen(camera: Camera, poses: NDArray[np.float64]) -> NDArray[np.float32]:
     return embeddings([camera.observe(pose) for pose in poses])
 
 
-def _of_capture(capture: Capture) -> Arrays:
+def _of_capture(capture: Capture, name: str) -> Arrays:
     """Return what captured frames show, for each cell of the grid by its nearest frame.
 
     Every fourth frame is held out.
@@ -234,7 +256,7 @@ def _of_capture(capture: Capture) -> Arrays:
     )
 
     found = camera.object.object_frame
-    surface = fuse(camera.object.sightings, found.radius, capture.folder.name)
+    surface = fuse(camera.object.sightings, found.radius, name)
 
     return {
         "views": views.reshape(1, len(RINGS), AZIMUTHS, -1).astype(np.float16),

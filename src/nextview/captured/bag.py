@@ -1,0 +1,437 @@
+"""Depth images of a ROS 2 bag, with the poses that its tf gives them.
+
+A bag is a folder with ``metadata.yaml``, or one file of it (.mcap, .db3). It is read image by
+image; of a long one only a sample is used.
+"""
+
+import weakref
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.captured.frames import CapturedFrame, Float, Views
+from nextview.captured.messages import (
+    ENCODINGS,
+    STEPS,
+    compressed_encoding,
+    depth_of,
+    depth_of_compressed,
+    intrinsics_of,
+    seconds,
+)
+from nextview.captured.transforms import NoTransformError, TransformError, TransformTree
+from nextview.checks import extras, one_line
+from nextview.errors import DAMAGED, DatasetError, NextviewError, ObservationError
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+    from rosbags.rosbag2 import Reader
+
+ENDINGS = (".mcap", ".db3")
+OLD_ENDING = ".bag"  # of ROS 1
+METADATA = "metadata.yaml"
+MOST_FRAMES = 120  # of a recording that are used, evenly spread in time
+RAW = "sensor_msgs/msg/Image"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+TF = "tf2_msgs/msg/TFMessage"
+FIXED = "tf_static"  # the end of the name of the topic of transforms that never change
+NANOSECONDS = 1e-9
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is a bag, or a file of one; also one of ROS 1, which ``read_bag`` refuses."""
+    if path.is_dir():
+        return (path / METADATA).exists() or bool(_storage_files(path))
+    return path.suffix.lower() in (*ENDINGS, OLD_ENDING) and path.is_file()
+
+
+def read_bag(
+    path: Path,
+    intrinsics: Float | None = None,
+    depth_topic: str | None = None,
+    world_frame: str | None = None,
+) -> Views:
+    """Find the depth images of a bag, the intrinsics of their camera and its poses.
+
+    Args:
+        path: which ``is_bag``.
+        intrinsics: pinhole matrix, (3, 3), pixels, if not that of camera_info.
+        depth_topic: where the depth images are, if there are several such topics.
+        world_frame: the frame that is the world, z up; by default the root of the tree that the
+            camera hangs in.
+
+    Raises:
+        DatasetError: the bag is damaged, or lacks depth images, camera_info or transforms.
+        MissingExtraError: rosbags is not installed.
+    """
+    bag = Bag(path)
+    topic = _depth_topic(bag, depth_topic)
+    images = _sample(bag, topic)
+    first = images[0]
+    tree = _transforms(bag)
+    camera = first.frame
+    if camera not in tree.frames:
+        what = "there is no tf in it" if not tree.frames else f"tf knows {_listed(tree.frames)}"
+        raise DatasetError(
+            f"{path}: nothing says where the camera was: tf has no frame {camera!r}, which the"
+            f" images are in ({what}); record /tf and /tf_static too"
+        )
+    world = tree.root(camera) if world_frame is None else world_frame.lstrip("/")
+    if world not in tree.frames:
+        raise DatasetError(f"{path}: tf has no frame {world!r}; there are {_listed(tree.frames)}")
+
+    notes = [f"depth of {topic.topic}", f"poses of {camera} in {world} by tf"]
+    if topic.msgcount > len(images):
+        notes.append(f"{len(images)} of {topic.msgcount} images, evenly spread")
+    if not tree.moves(camera, world):
+        notes.append("tf does not move the camera: one image is used")
+        images = images[:1]
+    if intrinsics is None:
+        intrinsics, source = _intrinsics(bag, topic.topic, first)
+        notes.append(f"intrinsics of {source}")
+
+    # a frame that only carries the camera tells nothing of the vertical
+    views = Views([], notes, z_is_up=world_frame is not None or tree.moves(camera, world))
+    lost = _add_frames(views, images, tree, world, intrinsics)
+    if lost:
+        notes.append(f"{lost} images have no pose in tf and are left out")
+    if not views.frames and not views.unreadable:
+        raise DatasetError(
+            f"{path}: tf gives none of the images a pose of {camera!r} in {world!r} at its stamp"
+            f" ({first.stamp:.3f} s the first): are the stamps of one clock?"
+        )
+    return views
+
+
+class Bag:
+    """An open bag; it is closed when nothing uses it any more.
+
+    Args:
+        path: of a bag, or a file of one.
+
+    Attributes:
+        path: the same.
+        connections: what was recorded, a topic and its type each; without those of no message.
+        start: nanoseconds, of the first message.
+        end: nanoseconds, after the last message.
+
+    Raises:
+        DatasetError: it cannot be read.
+        MissingExtraError: rosbags is not installed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        with extras():
+            from rosbags.rosbag2 import Reader
+            from rosbags.typesys import Stores, get_typestore
+        self.path = path
+        self._types = get_typestore(Stores.ROS2_JAZZY)
+        with _damage_named(path):
+            self._reader = Reader(_opened(path))
+            self._reader.open()
+        # rows that are still being read: the file cannot be closed before they are
+        self._unread: set[Generator[Any, None, None]] = set()
+        weakref.finalize(self, _close, self._reader, self._unread)
+        self.connections = [each for each in self._reader.connections if each.msgcount > 0]
+        self.start = self._reader.start_time
+        self.end = self._reader.end_time
+
+    def of_type(self, *kinds: str) -> list["Connection"]:
+        """What was recorded of some types of messages, sorted by topic."""
+        found = [each for each in self.connections if each.msgtype in kinds]
+        return sorted(found, key=lambda each: each.topic)
+
+    def messages(
+        self, connections: Sequence["Connection"], start: int | None = None, stop: int | None = None
+    ) -> Iterator[tuple["Connection", int, Any]]:
+        """Read messages one by one.
+
+        Args:
+            connections: of which topics.
+            start: nanoseconds, of the first one.
+            stop: nanoseconds, before which the last one was recorded.
+
+        Yields:
+            Topic, nanoseconds at which it was recorded, and the message.
+        """
+        found = self._reader.messages(connections, start, stop)
+        self._unread.add(found)
+        try:
+            while True:
+                with _damage_named(self.path):
+                    given = next(found, None)
+                    if given is None:
+                        return
+                    connection, time, data = given
+                    message = self._types.deserialize_cdr(data, connection.msgtype)
+                yield connection, time, message
+        finally:
+            found.close()
+            self._unread.discard(found)
+
+
+@dataclass(frozen=True)
+class RecordedImage:
+    """A depth image in a bag.
+
+    Attributes:
+        bag: an open one.
+        connection: of the topic.
+        time: nanoseconds, when it was recorded.
+        stamp: seconds, of its header.
+        frame: the tf frame that it is in.
+        encoding: one of ``messages.ENCODINGS``, if it holds depth.
+        size: width and height, pixels.
+    """
+
+    bag: Bag
+    connection: "Connection"
+    time: int
+    stamp: float
+    frame: str
+    encoding: str
+    size: tuple[int, int]
+
+    def read(self) -> NDArray[np.uint16] | NDArray[np.float32]:
+        """Read the image, (H, W), uint16 or float32.
+
+        Raises:
+            DatasetError: the bag is damaged.
+            ObservationError: it is no depth image.
+        """
+        here = self.bag.messages([self.connection], self.time, self.time + 1)
+        for _, _, message in here:
+            if seconds(message.header.stamp) == self.stamp:
+                return _pixels(message, self.connection.msgtype)
+        raise DatasetError(f"{self}: the image is not there any more")
+
+    @property
+    def name(self) -> str:
+        """Seconds since the bag's first message."""
+        return f"{(self.time - self.bag.start) * NANOSECONDS:.3f}"
+
+    def __str__(self) -> str:
+        return f"{self.bag.path}, {self.connection.topic} at {self.name} s"
+
+
+def _close(reader: "Reader", unread: set[Generator[Any, None, None]]) -> None:
+    """Close a bag, also if reading it was broken off."""
+    for rows in list(unread):
+        rows.close()
+    reader.close()
+
+
+def _opened(path: Path) -> Path:
+    """What rosbags shall open for a bag; of one without metadata its only file."""
+    if path.suffix.lower() == OLD_ENDING:
+        raise DatasetError(
+            f"{path}: is a bag of ROS 1; rosbags-convert --src {path.name} --dst {path.stem} makes"
+            " one of ROS 2 of it"
+        )
+    if not path.is_dir() or (path / METADATA).exists():
+        return path
+    files = _storage_files(path)
+    if len(files) > 1:
+        raise DatasetError(
+            f"{path}: has no {METADATA}, as after a recording that was killed; ros2 bag reindex"
+            f" {path.name} writes it"
+        )
+    return files[0]
+
+
+def _storage_files(folder: Path) -> list[Path]:
+    """The files of a bag in a folder."""
+    return sorted(path for ending in ENDINGS for path in folder.glob(f"*{ending}"))
+
+
+@cache
+def _damage() -> tuple[type[Exception], ...]:
+    """What rosbags raises for a damaged file, and the libraries that it reads with."""
+    with extras():
+        from rosbags.rosbag2 import ReaderError
+        from rosbags.rosbag2.storage_mcap import zstd
+        from rosbags.rosbag2.storage_sqlite3 import apsw
+        from rosbags.serde import SerdeError
+    return (*DAMAGED, AssertionError, ReaderError, SerdeError, zstd.ZstdError, apsw.Error)
+
+
+@contextmanager
+def _damage_named(path: Path) -> Iterator[None]:
+    """Stands around calls of rosbags: what it raises for a damaged file becomes one sentence."""
+    try:
+        yield
+    except NextviewError:
+        raise
+    except _damage() as error:
+        phrase = one_line(str(error) or type(error).__name__, 120).rstrip(".")
+        raise DatasetError(
+            f"{path}: the bag is damaged, or its recording was cut off ({phrase})"
+        ) from None
+
+
+def _depth_topic(bag: Bag, asked: str | None) -> "Connection":
+    """The topic of the depth images: the one that is asked for, or the only one there is."""
+    topics = bag.of_type(RAW, COMPRESSED)
+    encodings = {each.topic: _encoding(bag, each) for each in topics}
+    if asked is not None:
+        found = [each for each in topics if each.topic.strip("/") == asked.strip("/")]
+        if not found:
+            there = _listed([f"{each.topic} ({encodings[each.topic]})" for each in topics])
+            raise DatasetError(f"{bag.path}: has no images on {asked}; there are {there}")
+        if encodings[found[0].topic] not in ENCODINGS:
+            raise DatasetError(
+                f"{bag.path}: {asked} holds no depth but {encodings[found[0].topic]!r}; depth is"
+                f" {', '.join(ENCODINGS)}"
+            )
+        return found[0]
+
+    deep = [each for each in topics if encodings[each.topic] in ENCODINGS]
+    raw = {each.topic for each in deep if each.msgtype == RAW}
+    # the same images as those of another topic
+    deep = [each for each in deep if each.msgtype == RAW or _base(each.topic) not in raw]
+    if not deep:
+        images = [f"{topic} ({encoding})" for topic, encoding in encodings.items()]
+        others = f"; its images are {_listed(images)}" if images else " and no others"
+        raise DatasetError(f"{bag.path}: holds no depth images ({', '.join(ENCODINGS)}){others}")
+    if len(deep) > 1:
+        names = _listed([each.topic for each in deep])
+        raise DatasetError(
+            f"{bag.path}: holds depth images on {len(deep)} topics; name one with --depth-topic:"
+            f" {names}"
+        )
+    return deep[0]
+
+
+def _encoding(bag: Bag, connection: "Connection") -> str:
+    """That of the first image of a topic."""
+    message = next(bag.messages([connection]))[2]
+    return compressed_encoding(message) if connection.msgtype == COMPRESSED else message.encoding
+
+
+def _base(topic: str) -> str:
+    """The topic of the raw images that those of a topic were compressed from."""
+    return topic.rpartition("/")[0]
+
+
+def _sample(bag: Bag, topic: "Connection") -> list[RecordedImage]:
+    """Images of a topic, evenly spread in time, at most ``MOST_FRAMES``, in the order of stamps."""
+    if topic.msgcount <= MOST_FRAMES:
+        found = [_recorded(bag, topic, time, image) for _, time, image in bag.messages([topic])]
+    else:
+        # the first image of each of so many parts of the recording
+        found = []
+        length = bag.end - bag.start
+        edges = [bag.start + length * part // MOST_FRAMES for part in range(MOST_FRAMES + 1)]
+        for start, stop in pairwise(edges):
+            first = next(bag.messages([topic], start, stop), None)
+            if first is not None:
+                found.append(_recorded(bag, topic, first[1], first[2]))
+    return sorted(found, key=lambda image: image.stamp)
+
+
+def _recorded(bag: Bag, topic: "Connection", time: int, message: Any) -> RecordedImage:
+    """What is kept of an image until it is read."""
+    compressed = topic.msgtype == COMPRESSED
+    if compressed:
+        height, width = _pixels(message, topic.msgtype).shape
+    else:
+        height, width = int(message.height), int(message.width)
+    return RecordedImage(
+        bag,
+        topic,
+        time,
+        seconds(message.header.stamp),
+        message.header.frame_id.lstrip("/"),
+        compressed_encoding(message) if compressed else message.encoding,
+        (width, height),
+    )
+
+
+def _pixels(message: Any, kind: str) -> NDArray[Any]:
+    return depth_of_compressed(message) if kind == COMPRESSED else depth_of(message)
+
+
+def _transforms(bag: Bag) -> TransformTree:
+    """All that tf says in a bag."""
+    tree = TransformTree()
+    topics = bag.of_type(TF)
+    said = (
+        (connection.topic.endswith(FIXED), each)
+        for connection, _, message in (bag.messages(topics) if topics else ())
+        for each in message.transforms
+    )
+    try:
+        for fixed, each in said:
+            child = each.child_frame_id.lstrip("/")
+            parent = each.header.frame_id.lstrip("/")
+            tree.add(child, parent, seconds(each.header.stamp), each.transform, fixed)
+        tree.sort()
+    except TransformError as error:
+        raise DatasetError(f"{bag.path}: {error}") from None
+    return tree
+
+
+def _intrinsics(bag: Bag, topic: str, image: RecordedImage) -> tuple[Float, str]:
+    """The pinhole matrix of a bag's depth camera, and the topic that says it."""
+    infos = bag.of_type(CAMERA_INFO)
+    places = {f"{_base(topic)}/camera_info", f"{_base(_base(topic))}/camera_info"}
+    found = [each for each in infos if each.topic in places]
+    if not found:
+        found = [each for each in infos if _fits(next(bag.messages([each]))[2], image)]
+    if len(found) != 1:
+        there = _listed([each.topic for each in infos]) if infos else "none"
+        raise DatasetError(
+            f"{bag.path}: the camera_info of {topic} is missing (there is {there}): give"
+            " --intrinsics FX FY CX CY, or a file with them"
+        )
+    info = next(bag.messages(found))[2]
+    if (info.width, info.height) != image.size:
+        raise DatasetError(
+            f"{bag.path}: {found[0].topic} is of images of {info.width} x {info.height} pixels, and"
+            f" {topic} has {image.size[0]} x {image.size[1]}"
+        )
+    distorts = bool(np.any(np.asarray(info.d)))
+    try:
+        return intrinsics_of(info, rectified=distorts and "rect" in topic), found[0].topic
+    except ObservationError as error:
+        raise DatasetError(f"{bag.path}: {found[0].topic}: {error}") from None
+
+
+def _fits(info: Any, image: RecordedImage) -> bool:
+    """Whether a camera_info is of the frame and the size of an image."""
+    same = info.header.frame_id.lstrip("/") == image.frame
+    return same and (info.width, info.height) == image.size
+
+
+def _add_frames(
+    views: Views, images: list[RecordedImage], tree: TransformTree, world: str, k: Float
+) -> int:
+    """Add frames with the poses of some images; returns how many have none."""
+    lost = 0
+    for image in images:
+        try:
+            if image.encoding not in STEPS:
+                raise ObservationError(f"{image}: its encoding is {image.encoding!r}")
+            pose = tree.pose(image.frame, world, image.stamp)
+        except NoTransformError:
+            lost += 1
+        except (DatasetError, ObservationError) as error:
+            views.unreadable[image.name] = str(error)
+        else:
+            scale = STEPS[image.encoding]
+            views.frames.append(CapturedFrame(image.name, image, scale, k, pose))
+    return lost
+
+
+def _listed(names: Sequence[str], most: int = 8) -> str:
+    """Names in a sentence."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return (", ".join(names[:most]) or "none") + more

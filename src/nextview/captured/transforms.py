@@ -1,0 +1,171 @@
+"""A tree of frames that move against each other, as tf records it: where one is in another, when.
+
+Foote, "tf: The transform library", TePRA 2013.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from nextview.captured.frames import Float
+from nextview.captured.messages import matrix_of
+from nextview.errors import DatasetError
+
+LONGEST_GAP = 0.5  # seconds between two transforms from which a pose between them is interpolated
+BEYOND = 0.02  # seconds before the first or after the last transform that it still counts for
+
+
+class TransformError(DatasetError):
+    """Frames that make no tree."""
+
+
+class NoTransformError(DatasetError):
+    """A frame has no place in another at some time."""
+
+
+@dataclass
+class _Link:
+    """How one frame lies in its parent's.
+
+    Attributes:
+        parent: name of that frame.
+        stamps: seconds, N.
+        positions: (3,) each, metres.
+        quaternions: x, y, z, w each.
+        fixed: it never changes: then there is one, whose stamp does not count.
+    """
+
+    parent: str
+    fixed: bool
+    stamps: list[float] = field(default_factory=list)
+    positions: list[tuple[float, ...]] = field(default_factory=list)
+    quaternions: list[tuple[float, ...]] = field(default_factory=list)
+
+    def sorted(self) -> "_Link":
+        """The same in the order of time; of several at one time the last."""
+        stamps, last = np.unique(np.array(self.stamps)[::-1], return_index=True)
+        order = len(self.stamps) - 1 - last
+        return _Link(
+            self.parent,
+            self.fixed,
+            stamps.tolist(),
+            [self.positions[i] for i in order],
+            [self.quaternions[i] for i in order],
+        )
+
+    def at(self, time: float) -> Float | None:
+        """From the frame into its parent's, (4, 4); None if nothing is known of that time."""
+        if self.fixed:
+            return matrix_of(self.positions[-1], self.quaternions[-1])
+        after = int(np.searchsorted(self.stamps, time))
+        if after in (0, len(self.stamps)):
+            nearest = min(after, len(self.stamps) - 1)
+            if abs(self.stamps[nearest] - time) > BEYOND:
+                return None
+            return matrix_of(self.positions[nearest], self.quaternions[nearest])
+
+        before = after - 1
+        gap = self.stamps[after] - self.stamps[before]
+        if gap > LONGEST_GAP:
+            return None
+        share = (time - self.stamps[before]) / gap
+        ends = [matrix_of(self.positions[i], self.quaternions[i]) for i in (before, after)]
+        pose = np.eye(4)
+        turn = Rotation.from_matrix(ends[1][:3, :3] @ ends[0][:3, :3].T).as_rotvec()
+        pose[:3, :3] = Rotation.from_rotvec(share * turn).as_matrix() @ ends[0][:3, :3]
+        pose[:3, 3] = (1 - share) * ends[0][:3, 3] + share * ends[1][:3, 3]
+        return pose
+
+
+class TransformTree:
+    """Which frame hangs on which, and how they move."""
+
+    def __init__(self) -> None:
+        self._links: dict[str, _Link] = {}
+
+    def add(self, child: str, parent: str, stamp: float, transform: object, fixed: bool) -> None:
+        """Take in where a frame was in another.
+
+        Args:
+            child: the frame.
+            parent: the frame that it hangs on.
+            stamp: seconds.
+            transform: ``geometry_msgs/Transform``: from the child's frame into the parent's.
+            fixed: it never changes.
+
+        Raises:
+            TransformError: the frame hung on another one before.
+        """
+        link = self._links.setdefault(child, _Link(parent, fixed))
+        if link.parent != parent:
+            raise TransformError(
+                f"tf frame {child!r} has two parents, {link.parent!r} and {parent!r}"
+            )
+        t, q = transform.translation, transform.rotation  # type: ignore[attr-defined]
+        link.stamps.append(stamp)
+        link.positions.append((t.x, t.y, t.z))
+        link.quaternions.append((q.x, q.y, q.z, q.w))
+
+    def sort(self) -> None:
+        """Put what was taken in into the order of time, once all of it was.
+
+        Raises:
+            TransformError: frames hang on each other in a circle.
+        """
+        self._links = {child: link.sorted() for child, link in self._links.items()}
+        for child in self._links:
+            self._above(child)
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of all frames."""
+        parents = {link.parent for link in self._links.values()}
+        return tuple(sorted(parents | set(self._links)))
+
+    def root(self, frame: str) -> str:
+        """The frame that hangs on no other, above a frame."""
+        return self._above(frame)[-1]
+
+    def moves(self, frame: str, world: str) -> bool:
+        """Whether a frame moves in another, as far as transforms say."""
+        links = self._between(frame, world)
+        return any(not self._links[child].fixed for child in links)
+
+    def pose(self, frame: str, world: str, time: float) -> Float:
+        """From a frame into another, (4, 4), at some time, seconds.
+
+        Raises:
+            NoTransformError: nothing joins them, or not at that time.
+            ObservationError: a quaternion is none of a rotation.
+        """
+        root = self.root(frame)
+        if self.root(world) != root:
+            raise NoTransformError(f"tf does not join {frame!r} with {world!r}")
+        ways = []
+        for each in (frame, world):
+            pose = np.eye(4)
+            for child in self._above(each)[:-1]:
+                step = self._links[child].at(time)
+                if step is None:
+                    parent = self._links[child].parent
+                    raise NoTransformError(
+                        f"tf has nothing of {child!r} in {parent!r} at {time:.3f} s"
+                    )
+                pose = step @ pose
+            ways.append(pose)
+        return np.asarray(np.linalg.inv(ways[1]) @ ways[0])
+
+    def _above(self, frame: str) -> list[str]:
+        """A frame and those that it hangs on, up to the root."""
+        chain = [frame]
+        while chain[-1] in self._links:
+            parent = self._links[chain[-1]].parent
+            if parent in chain:
+                raise TransformError(f"tf goes round in a circle: {' in '.join([*chain, parent])}")
+            chain.append(parent)
+        return chain
+
+    def _between(self, frame: str, world: str) -> set[str]:
+        """The frames whose links are on the way from a frame to another."""
+        return set(self._above(frame)[:-1]) ^ set(self._above(world)[:-1])
