@@ -6,6 +6,7 @@ import pytest
 
 from nextview.data.folders import left_out_phrases, list_dataset, read_folder, scan_dataset
 from nextview.errors import DatasetError
+from nextview.teaching.thing_sources import find_things
 
 
 def meshes(root: Path, *places: str) -> Path:
@@ -247,6 +248,12 @@ def test_a_folder_around_the_classes_is_told(tmp_path):
     assert not scan_dataset(
         meshes(tmp_path / "one", "bed/77/models/m.ply", "bed/78/models/m.ply")
     ).notes
+
+
+def test_a_file_is_no_folder_of_things(tmp_path):
+    mesh = meshes(tmp_path, "cup.ply") / "cup.ply"
+    with pytest.raises(DatasetError, match=r"cup\.ply: is a file, .* the folder .*: \S+$"):
+        find_things(mesh)
 
 
 def test_a_dataset_without_meshes_is_refused_and_says_what_it_holds(tmp_path, caplog):

@@ -155,8 +155,7 @@ def array_mutations():
             )
     for name in FLOATS:
         for how, change in OF_FLOATS.items():
-            if (name, how) != ("radii", "NaN"):  # a size that is not known
-                yield name, how, change
+            yield name, how, change
     for (name, how), change in OF_ONE.items():
         yield name, how, change
 
@@ -282,6 +281,8 @@ REFUSED = {
     "absurd correlation": set_at("calibration/bin_correlation", 1e30),
     "a temperature of next to nothing": set_at("calibration/temperature", 1e-30),
     "an absurd temperature": set_at("calibration/temperature", 1e30),
+    "endless densities of sizes": set_at("size/log_density/0/0", 1e300),
+    "an endless score": set_at("scores", {"accuracy": -1e300}),
     "sizes of one class less": set_at("size/log_density", lambda rows: rows[:-1]),
     "ragged sizes": set_at("size/log_density/0", lambda row: row[:-1]),
     "descending sizes": set_at("size/radii_m", lambda radii: radii[::-1]),

@@ -353,7 +353,10 @@ def test_frames_that_only_together_show_a_too_large_object_blame_the_poses(tiny,
     np.testing.assert_equal(snapshot(session), before)
 
 
-@pytest.mark.parametrize(("distance", "words"), [(0.15, "outside of it"), (700, "in millimetres")])
+@pytest.mark.parametrize(
+    ("distance", "words"),
+    [(0.15, "outside of it: ask for a larger one.* a mask$"), (700, "in millimetres")],
+)
 def test_a_distance_that_cannot_be_is_refused_once_the_radius_is_known(tiny, distance, words):
     session = begin(tiny, distance=distance)
     before = snapshot(session)
@@ -362,6 +365,15 @@ def test_a_distance_that_cannot_be_is_refused_once_the_radius_is_known(tiny, dis
     ):
         session.update(frame(pose_at(20, 30, 0.7, (0, 0, 0.08))))
     assert snapshot(session) == before
+
+
+def test_only_sixteen_bits_are_blamed_for_a_distance_inside_the_object(tiny):
+    seen = frame(pose_at(20, 30, 0.7, (0, 0, 0.08)))
+    counted = Frame(
+        np.rint(1000 * seen.depth).astype(np.uint16), INTRINSICS, seen.pose, pixel_centre=0.5
+    )
+    with pytest.raises(UsageError, match="the steps of the uint16 depth are no millimetres"):
+        begin(tiny, distance=0.15).update(counted)
 
 
 def test_a_small_thing_may_be_looked_at_from_some_way_off(tiny):

@@ -385,12 +385,30 @@ def test_poses_in_millimetres_are_refused_where_the_target_or_another_frame_tell
     ):
         with pytest.raises(ObservationError, match=r"the target is 700 m away.* in millimetres"):
             ObservedObject(**target).add(in_millimetres(first))
+    # The camera's height over the table tells, if the world has its origin there.
+    with pytest.raises(ObservationError, match=r"0.45 m in millimetres: the pose is in milli"):
+        ObservedObject().add(in_millimetres(first))
+
     thing = ObservedObject()
-    thing.add(in_millimetres(first))
+    elsewhere = in_millimetres(first).shifted(np.array([0, 0, 4000.0]))
+    thing.add(elsewhere)
     assert [warning.name for warning in thing.warnings] == ["far origin"]
     with pytest.raises(ObservationError, match=r"from where it was.* in millimetres"):
         thing.add(in_millimetres(second))
     assert len(thing.observations) == 1
+
+
+@pytest.mark.parametrize(("turns", "said"), [(1, "to the left"), (-1, "to the right"), (2, "head")])
+@pytest.mark.parametrize("azimuth", [20, 110, 200])
+def test_a_picture_that_is_turned_against_its_pose_is_named(turns, said, azimuth):
+    pose = pose_at(60, azimuth, 0.7)
+    seen = frame([TABLE, WEDGE], pose)
+    intrinsics = seen.intrinsics.copy()
+    if turns != 2:
+        intrinsics[[0, 1], 2] = intrinsics[[1, 0], 2]
+    turned_depth = np.rot90(seen.depth, turns).copy()
+    with pytest.raises(ObservationError, match=rf"the picture .*{said}"):
+        ObservedObject().add(Frame(turned_depth, intrinsics, pose, pixel_centre=0.5))
 
 
 @pytest.mark.parametrize("steps", [0.1, 0.2, 0.25])  # millimetres
@@ -414,6 +432,10 @@ def test_sixteen_bits_in_other_steps_are_refused_with_the_depth_scale(steps):
             ObservedObject(**target).add(counted(25, steps))
     with pytest.raises(ObservationError, match=said):
         refuse_far(counted(60, steps), counted(25, steps), None, 0.0)
+    alone = ObservedObject()
+    alone.add(counted(25, steps))
+    assert [warning.name for warning in alone.warnings] == ["unit"]
+    assert f"are the steps of the uint16 depth {steps:g} mm?" in alone.warnings[0].message
     for target in ({}, {"point": (0, 0, 0.1)}):
         thing = ObservedObject(**target)
         thing.add(counted(25, 1))

@@ -30,6 +30,7 @@ from nextview.things.registration import (
     align,
     centred,
     different_poses,
+    inverses,
     render,
     start,
 )
@@ -266,6 +267,20 @@ def test_hypotheses_that_come_to_one_pose_are_one():
     placed = start(np.array([0, 0, 1, 0, 0]), turns, 1)
     placed.centres[4, 0] += 0.01
     assert different_poses(caster, placed).tolist() == [0, 2, 3, 4]
+
+
+def test_a_pose_that_is_hardly_determined_has_no_negative_variance():
+    """Matrices of full rank are inverted as usual; next to singular ones are merely uncertain."""
+    rng = np.random.default_rng(0)
+    factors = rng.normal(size=(20, 6, 6))
+    full = factors @ factors.swapaxes(1, 2) + np.eye(6)
+    np.testing.assert_allclose(inverses(full), np.linalg.inv(full), rtol=1e-9, atol=1e-12)
+
+    turns, _ = np.linalg.qr(factors)
+    strengths = np.array([1e12, 1e11, 1e9, 1e4, 1e-7, -1e-5])  # the last ones by rounding
+    singular = (turns * strengths) @ turns.swapaxes(1, 2)
+    assert (np.linalg.eigvalsh(inverses(singular)) > 0).all()
+    assert (np.trace(inverses(singular), axis1=1, axis2=2) > 1e-6).all()
 
 
 def test_more_pixels_show_what_is_thin():

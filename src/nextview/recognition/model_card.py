@@ -27,6 +27,7 @@ COLLECTIONS = {"modelnet10": RECOGNISER, "ycb": "ycb"}
 MAPS = {LEM: "lem-modelnet10", LCM: "lcm-modelnet10"}
 NOWHERE = Path()
 SCHEMA = 2  # of the cards of models; those of policies have 1
+LARGEST_NUMBER = 1e9  # of a card; densities, gains and sizes are far smaller
 LARGEST_WEIGHT = 1e6  # of a cosine; what is fitted is below a hundred
 LARGEST_ORDER = 1000  # of a symmetry; what is found is below ten
 UNIT_LENGTH = 1e-3  # by which the axis of a symmetry may be too long: cards hold rounded numbers
@@ -282,10 +283,24 @@ def read_card(path: Path) -> ModelCard:
     """
     path = Path(path)
     card = read_record(path, ModelCard, "a model card")
+    _check_numbers(path, card)
     weights = path.with_suffix(".onnx") if card.memory is None else _memory_there(path, card.sha256)
     if not weights.exists():
         raise ModelError(f"{weights}: the weights of model {card.name} are missing")
     return replace(card, path=weights)
+
+
+def _check_numbers(path: Path, card: ModelCard) -> None:
+    """See that no number of a card is beyond what any fit gives: sums of such ones overflow."""
+    left: list[tuple[str, Any]] = [("", msgspec.to_builtins(card))]
+    while left:
+        name, value = left.pop()
+        if isinstance(value, dict):
+            left += [(f"{name}.{key}".lstrip("."), item) for key, item in value.items()]
+        elif isinstance(value, list | tuple):
+            left += [(name, item) for item in value]
+        elif isinstance(value, int | float) and abs(value) > LARGEST_NUMBER:
+            raise ModelError(f"{path}: its {name} holds {value:g}, and {LARGEST_NUMBER:g} is most")
 
 
 def memory_path(card: Path, sha256: str) -> Path:

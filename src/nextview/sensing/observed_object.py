@@ -293,6 +293,10 @@ class ObservedObject:
         for view in made[-4:-1]:
             warnings = warnings or check_views(view, made[-1])
         warnings += plausibility.check_place(displaced)
+        if plane is not None and frame.pose is not None and not before.sightings:
+            height = float(plane.height(frame.camera_to_world[:3, 3]))
+            plausibility.refuse_millimetres(frame.camera_to_world, height, up)
+            warnings += plausibility.check_steps(frame, height, up)
         if frame.pose is not None and self.up is not None:
             warnings += self._check_lean(sightings)
 

@@ -50,6 +50,9 @@ FEWEST_SHARED = 50  # points on which two frames have to agree or not before a d
 # metres from the origin of the world, within which robots work; where positions in millimetres
 # begin
 FAR_ORIGIN = 30.0
+FARTHEST_MILLIMETRES = 20_000.0  # from the world's origin within which a robot's camera is
+SAME_HEIGHT = 0.1  # part of a height up to which another one is the same
+SAME_STEPS = 0.03  # the same, of heights that tell the steps of the depth
 ORDER_OF_SIZE = np.sqrt(10)  # factor from which a radius is nearer to ten times than to once
 
 
@@ -98,6 +101,52 @@ def refuse_far(frame: Frame, last: Frame | None, target: Float | None, radius: f
             f"{what}: is the pose in millimetres, or are target and pose of different worlds?"
         )
     refuse_depth_scale(frame, last, target, radius)
+
+
+def refuse_millimetres(pose: Float, height: float, up: Float) -> None:
+    """Refuse a first pose in millimetres: a thousandth of its height is that over the support.
+
+    Args:
+        pose: camera-to-world, (4, 4).
+        height: of the camera above the support plane as the depth shows it, metres.
+        up: against gravity, world, (3,).
+    """
+    place = pose[:3, 3]
+    origin = float(np.linalg.norm(place))
+    in_metres = float(place @ up) / 1000
+    near = abs(in_metres - height) < SAME_HEIGHT * height
+    if FAR_ORIGIN < origin < FARTHEST_MILLIMETRES and near:
+        raise ObservationError(
+            f"the camera is {origin:.0f} m from the world's origin and {height:.2g} m above the"
+            f" support, which is {in_metres:.2g} m in millimetres: the pose is in millimetres"
+        )
+
+
+def check_steps(frame: Frame, height: float, up: Float) -> list[ViewWarning]:
+    """Whether 16-bit depth of other steps than millimetres would fit the pose; usually not.
+
+    Depth that is several times too large puts the support so far below the camera. With the right
+    steps it is level with the world's origin, as a robot's base or table often is.
+
+    Args:
+        frame: the first one, with a pose.
+        height: of the camera above the support plane as the depth shows it, metres.
+        up: against gravity, world, (3,).
+    """
+    stands = float(frame.camera_to_world[:3, 3] @ up)
+    if not frame.counted or stands <= 0:
+        return []
+    for times in TIMES_TOO_LARGE:
+        if abs(height / times - stands) < SAME_STEPS * stands:
+            return [
+                ViewWarning(
+                    "unit",
+                    f"the support lies {height - stands:.2g} m below the world's origin, and level"
+                    f" with it if the depth is {times:g} times too large: are the steps of the"
+                    f" uint16 depth {1 / times:.3g} mm?",
+                )
+            ]
+    return []
 
 
 def refuse_depth_scale(

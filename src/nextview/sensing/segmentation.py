@@ -20,6 +20,8 @@ TRIALS = 200
 TILT = np.cos(np.radians(12.0))
 # the same, at which a plane counts nothing when planes are compared
 STEEPEST_SUPPORT = np.cos(np.radians(15.0))
+# a quarter turn of a camera about its optical axis
+QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 # share of what is seen that lies on a support plane, at least; more if gravity is not known
 LEAST = 0.04
 LEAST_ALONE = 0.15
@@ -312,9 +314,14 @@ def mistake_in_pose(plane: Plane, pose: Float, up: Float) -> str | None:
         "the camera's axes are OpenGL's?": rotation @ AXES["opengl"],
         "the camera's axes are those of a ROS body?": rotation @ AXES["ros"],
         "the pose is inverse, world-to-camera?": rotation.T,
+        "the picture is turned to the left?": rotation @ QUARTER,
+        "the picture is turned to the right?": rotation @ QUARTER.T,
+        "the picture stands on its head?": rotation @ QUARTER @ QUARTER,
     }
     seen = rotation.T @ plane.normal
-    return next((mistake for mistake, right in mistakes.items() if right @ seen @ up > TILT), None)
+    rises = {mistake: float(right @ seen @ up) for mistake, right in mistakes.items()}
+    likeliest = max(rises, key=lambda mistake: rises[mistake])
+    return likeliest if rises[likeliest] > TILT else None
 
 
 def inside_box(frame: Frame, box: Box) -> Mask:

@@ -317,7 +317,7 @@ class Session:
             self._distance = checked
             if self.object is not None and self.object.sightings:
                 try:
-                    self._check_distance(self.object.object_frame.radius)
+                    self._check_distance(self.object)
                 except UsageError:
                     self._distance = before
                     raise
@@ -545,7 +545,7 @@ class Session:
                 object.add(frame)
                 self._reconsider(object)
             self._refuse_disagreement(object)
-            self._check_distance(object.object_frame.radius)
+            self._check_distance(object)
             return self._take(
                 object.observations[self._before :], object.warnings, frame.camera_to_world, object
             )
@@ -591,13 +591,20 @@ class Session:
             " in another unit), or has the object moved?"
         )
 
-    def _check_distance(self, radius: float) -> None:
+    def _check_distance(self, object: ObservedObject) -> None:
         """Refuse targets inside the object or far from it, as soon as its radius is known."""
+        radius = object.object_frame.radius
         if self.distance is None or radius < self.distance <= FARTHEST_TARGET * radius:
             return
-        why = "outside of it: is the depth too large (uint16 is taken for millimetres)?"
         if self.distance > radius:
             why = f"within {FARTHEST_TARGET:g} radii: is it in millimetres?"
+        else:
+            why = (
+                "outside of it: ask for a larger one, unless what was found is not the object, and"
+                " is to be named by a point, a box or a mask"
+            )
+            if object.sightings[-1].frame.counted:
+                why += "; or the steps of the uint16 depth are no millimetres"
         raise UsageError(
             f"the distance of {self.distance:g} m from the centre of an object of {radius:.2g} m"
             f" radius has to be {why}"

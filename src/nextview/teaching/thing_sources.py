@@ -65,6 +65,11 @@ def find_things(folder: Path, out: Path | None = None, one_class: bool = False) 
             name, or all are of one class: a folder around the things, as an archive has one, looks
             the same.
     """
+    if folder.is_file():
+        raise DatasetError(
+            f"{folder}: is a file, and things are taught from the folder that holds them:"
+            f" {folder.absolute().parent}"
+        )
     if not folder.is_dir():
         raise DatasetError(f"{folder}: there is no such folder")
     if not str(folder).isprintable():

@@ -95,6 +95,10 @@ class Memory:
         if not ((known > 0) & (known <= LARGEST_RADIUS)).all():
             raise ModelError(f"its radii are not above zero and at most {LARGEST_RADIUS:g} m")
 
+        nameless = np.isnan(self.radii) & (self.surfaces.counts[:, 0] > 0)
+        if nameless.any():
+            raise ModelError("its radii lack that of a thing whose surface is known in metres")
+
         head = self.head.astype(np.float64)
         # Views are unit vectors.
         largest = np.linalg.norm(head, axis=0) + np.abs(self.head_bias.astype(np.float64))

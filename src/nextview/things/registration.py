@@ -545,7 +545,21 @@ def pose_covariances(
         rendered = render(caster, alignment, view, number)
         centres = alignment.centres + alignment.cameras[:, number]
         information = information + _normal_equations(_outline(view, rendered, centres), prior)[0]
-    return np.asarray(np.linalg.inv(information), np.float64)
+    return inverses(information)
+
+
+def inverses(information: Float) -> Float:
+    """Inverses of symmetric matrices, (H, N, N), none of which has a negative variance.
+
+    In single precision a direction that is hardly determined may get a zero or negative
+    eigenvalue: it counts as determined as little as that precision tells.
+    """
+    scale = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), FREE))
+    scaled = information / (scale[:, :, None] * scale[:, None])  # turns and places have other units
+    values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
+    values = np.maximum(values, np.finfo(np.float32).eps)
+    inverse = (vectors / values[:, None]) @ vectors.swapaxes(1, 2)
+    return np.asarray(inverse / (scale[:, :, None] * scale[:, None]), np.float64)
 
 
 def _outline(view: DepthView, rendered: Rendered, centres: Float) -> _Pulls:
