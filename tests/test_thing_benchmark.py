@@ -18,7 +18,7 @@ from nextview.benchmark.thing_episodes import (
     hiding_boxes,
     read_arrays,
 )
-from nextview.benchmark.thing_policies import FixedSequence, Foresight
+from nextview.benchmark.thing_policies import Foresight, RingSteps
 from nextview.benchmark.thing_replay import EpisodeRuns, ThingRun
 from nextview.benchmark.thing_results import latex, markdown
 from nextview.benchmark.thing_tables import Compared, summarise_things
@@ -200,10 +200,10 @@ def test_the_fixed_sequence_comes_to_all_views_of_its_ring():
     taken = [8]
     for _ in range(7):
         state = state_at(taken[-1], taken)
-        taken.append(int(FixedSequence(SPHERE).next_views(state, np.random.default_rng(0))[0]))
+        taken.append(int(RingSteps(SPHERE).next_views(state, np.random.default_rng(0))[0]))
     assert sorted(taken) == list(range(8, 16))
     assert taken[1] == 11  # three steps of 45 degrees ahead
-    after = FixedSequence(SPHERE).next_views(state_at(taken[-1], taken), np.random.default_rng(0))
+    after = RingSteps(SPHERE).next_views(state_at(taken[-1], taken), np.random.default_rng(0))
     assert int(after[0]) not in taken
 
 

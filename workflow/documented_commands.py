@@ -92,6 +92,9 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"SceneLayout\.load": (
         "names one of the drawn scenes; tests/test_scenes.py looks into one of its own"
     ),
+    r"agent_on_things": (
+        "needs things that were taught; tests/test_thing_environment.py lets it learn"
+    ),
     r"nextview_ros": "takes messages of ROS 2; tests/test_ros2.py has recorded ones",
     r"--ensemble runs/second": "needs the run of the line before",
     r"agents/(ppo|mvselect)\.json .*agents/": "needs two agents of a million steps each",

@@ -5,6 +5,7 @@ Importing this module registers them.
 - ``nextview/Recognise-v0``: over a file of predictions, thousands of episodes in one batch, nothing
 is rendered.
 - ``nextview/RecogniseMesh-v0``: over meshes, rendered and shown to the networks as the agent goes.
+- ``nextview/RecogniseThings-v0``: over taught things of known geometry, see ``thing_environment``.
 """
 
 import logging
@@ -61,6 +62,10 @@ gymnasium.register(
     vector_entry_point=f"{_HERE}:RecogniseVectorEnv",
 )
 gymnasium.register("nextview/RecogniseMesh-v0", f"{_HERE}:RecogniseMeshEnv")
+gymnasium.register(
+    "nextview/RecogniseThings-v0",
+    "nextview.benchmark.thing_environment:RecogniseThingsEnv",
+)
 # objects to learn from, or objects to judge by; None for all
 Split = Literal["train", "test"] | None
 Info = dict[str, Any]

@@ -35,7 +35,7 @@ SETTLED_BELIEF = 0.97  # in the truth, after which foresight looks for nothing b
 
 
 @dataclass(frozen=True)
-class FixedSequence:
+class RingSteps:
     """Goes round the ring of the first view by equal steps, whatever is believed."""
 
     sphere: ViewSphere
@@ -127,7 +127,7 @@ def policies_of(
         "random": lambda _: RandomAll(SPHERE),
         "spread": lambda _: Spread(SPHERE),
         "furthest": lambda _: Furthest(SPHERE),
-        "fixed": lambda _: FixedSequence(SPHERE),
+        "fixed": lambda _: RingSteps(SPHERE),
         "geometry": lambda _: geometry,
         "pose": lambda _: replace(geometry, goal="pose"),
         "foresight": Foresight,

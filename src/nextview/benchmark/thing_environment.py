@@ -1,0 +1,209 @@
+"""The Gymnasium environment ``nextview/RecogniseThings-v0``: taught things of known geometry.
+
+An agent sees the joint belief over thing and pose: the leading hypotheses, and how much is believed
+of each. Importing ``nextview.benchmark.environments`` registers it.
+"""
+
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.benchmark.environments import Rules, rows
+from nextview.benchmark.thing_benchmark import opened
+from nextview.benchmark.thing_episodes import SPHERE, Occlusion, Setting, ThingEpisode
+from nextview.checks import extras, whole
+from nextview.errors import DatasetError, SessionError
+from nextview.geometry.mesh import load_mesh
+from nextview.policies.learned_tables import cells_from
+from nextview.teaching.thing_sources import find_things
+from nextview.things.leading import MOST_LEADING
+from nextview.things.taught import TaughtThings
+from nextview.training.rollout import value_of
+
+with extras():
+    import gymnasium
+
+Float = NDArray[np.float64]
+
+KEPT_EPISODES = 64  # whose views are kept in memory
+FAR_METRES = 10.0  # bound of the places of hypotheses
+MOST_NATS = 20.0  # bound of the information of a view
+LEAST_BELIEF = 1e-12  # whose logarithm is paid for
+
+
+class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
+    """Recognise a taught thing, alone or half hidden, by few views through a sensor.
+
+    The observation is the joint belief over thing and pose. "belief" is that in each thing, (T,).
+    "hypotheses" is that in each of the leading hypotheses, (H,), 0 where there are fewer, the
+    likeliest first. "things" says whose they are, (H,), T for none, and "poses" where they are in
+    the frame of the last camera, (H, 3, 4), metres. "information" is what each action is expected
+    to tell of the thing, (V,), nats: what the policy discriminate goes by. "visited" are the
+    actions that lead to a view that was taken, (V,).
+
+    An action is a ring, and how many azimuth steps ahead of the last view:
+    ``ring * azimuths + steps``. One that leads to a view that was taken goes to the nearest free
+    one.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
+
+    def __init__(
+        self,
+        scans: str | Path,
+        models: str,
+        sensor: str = "wrist",
+        occlusion: Occlusion = "none",
+        draws: int = 4,
+        seed: int = 0,
+        **rules: Any,
+    ) -> None:
+        """Open a memory, and find the scans of what it knows.
+
+        Args:
+            scans: folder of the scans, in metres.
+            models: name or folder of the memory.
+            sensor: what the views are taken with.
+            occlusion: "none", or boxes that leave "half" or, if "heavy", a third visible.
+            draws: how many episodes of each thing there are to be drawn from.
+            seed: of these, see ``thing_episodes.Setting``.
+            rules: objective, max_views, threshold and prices, see ``environments.Rules``.
+
+        Raises:
+            DatasetError: there is no scan of a thing.
+            UsageError: rules that make no sense.
+        """
+        self.rules = Rules(**rules)
+        whole(self.rules.max_views, "the number of views", 2, len(SPHERE))
+        self.draws = whole(draws, "the number of draws", 1)
+        self.things: TaughtThings = opened(models)
+        files = {thing.name: thing.path for thing in find_things(Path(scans)).things}
+        missing = [name for name in self.things.names if name not in files]
+        if missing:
+            raise DatasetError(f"{scans}: holds no scan of {missing[0]}, which {models} knows")
+
+        setting = Setting(sensor, occlusion, seed)
+        self._begin = lru_cache(KEPT_EPISODES)(
+            lambda thing, draw: ThingEpisode(
+                self.things,
+                partial(load_mesh, files[self.things.names[thing]], unit="m"),
+                thing,
+                draw,
+                setting,
+            )
+        )
+        self.action_space = gymnasium.spaces.Discrete(len(SPHERE))
+        self.observation_space = self._space()
+        self._episode: ThingEpisode | None = None
+        self._views: list[int] = []
+
+    def _space(self) -> gymnasium.spaces.Dict:
+        box = partial(gymnasium.spaces.Box, dtype=np.float32)
+        count = len(self.things.names)
+        views = len(SPHERE)
+        return gymnasium.spaces.Dict(
+            {
+                "belief": box(0, 1, (count,)),
+                "hypotheses": box(0, 1, (MOST_LEADING,)),
+                "things": gymnasium.spaces.MultiDiscrete([count + 1] * MOST_LEADING),
+                "poses": box(-FAR_METRES, FAR_METRES, (MOST_LEADING, 3, 4)),
+                "information": box(0, MOST_NATS, (views,)),
+                "visited": gymnasium.spaces.MultiBinary(views),
+            }
+        )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode; its first view is not the agent's.
+
+        Args:
+            seed: of what is drawn; None goes on.
+            options: "object", the number of a thing, and "draw"; drawn by default.
+        """
+        super().reset(seed=seed)
+        given = options or {}
+        drawn = {
+            "object": self.np_random.integers(len(self.things.names)),
+            "draw": self.np_random.integers(self.draws),
+        }
+        below = {"object": len(self.things.names), "draw": self.draws}
+        thing, draw = (
+            int(rows(given.get(name, drawn[name]), 1, most, name)[0])
+            for name, most in below.items()
+        )
+        self._episode = self._begin(thing, draw)
+        self._views = [self._episode.start]
+        self._travel = 0.0
+        self._over = False
+        self._value = self._judged()
+        return self._observed(), self._info()
+
+    def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Take a view; what is paid is the change of the objective, less the prices."""
+        if self._episode is None or self._over:
+            raise SessionError("no episode is under way; call reset")
+        here = self._views[-1]
+        wanted = cells_from(SPHERE)[here, int(rows(action, 1, len(SPHERE), "action")[0])]
+        free = np.ones(len(SPHERE), bool)
+        free[self._views] = False
+        view = int(np.where(free, SPHERE.travel[wanted], np.inf).argmin())
+        way = float(SPHERE.travel[here, view])
+        self._views.append(view)
+        self._travel += way
+
+        before = self._value
+        self._value = self._judged()
+        rules = self.rules
+        price = rules.view_price + rules.travel_price * way
+        sure = rules.threshold is not None and self._belief.max() >= rules.threshold
+        self._over = bool(sure or len(self._views) >= rules.max_views)
+        return self._observed(), self._value - before - price, self._over, False, self._info()
+
+    def _judged(self) -> float:
+        """The objective now."""
+        assert self._episode is not None
+        self._belief = self._episode.verified(self._views)[0].belief
+        logs = np.log(np.maximum(self._belief, LEAST_BELIEF))[None]
+        truth = np.array([self._episode.thing])
+        return float(value_of(logs, truth, self.rules.objective)[0])
+
+    def _observed(self) -> dict[str, Any]:
+        assert self._episode is not None
+        outlook = self._episode.outlook(self._views)
+        leading = outlook.hypotheses
+        count = len(leading.things)
+        order = np.argsort(-leading.belief, kind="stable")
+        reached = cells_from(SPHERE)[self._views[-1]]
+        cameras = outlook.cameras(SPHERE.directions[[*reached, self._views[-1]]])
+
+        belief = np.zeros(MOST_LEADING, np.float32)
+        belief[:count] = leading.belief[order]
+        things = np.full(MOST_LEADING, len(self.things.names))
+        things[:count] = leading.things[order]
+        poses = np.zeros((MOST_LEADING, 3, 4), np.float32)
+        poses[:count] = (np.linalg.inv(cameras[-1]) @ leading.poses[order])[:, :3]
+        information = outlook.expect(cameras[:-1]).information()
+        return {
+            "belief": self._belief.astype(np.float32),
+            "hypotheses": belief,
+            "things": things,
+            "poses": poses.clip(-FAR_METRES, FAR_METRES),
+            "information": information.astype(np.float32).clip(0, MOST_NATS),
+            "visited": np.isin(reached, self._views).astype(np.int8),
+        }
+
+    def _info(self) -> dict[str, Any]:
+        assert self._episode is not None
+        return {
+            "object": self._episode.thing,
+            "view": self._views[-1],
+            "n_views": len(self._views),
+            "travel": self._travel,
+            "answer": int(self._belief.argmax()),
+            "confidence": float(self._belief.max()),
+            "travel_to": SPHERE.travel[self._views[-1]][cells_from(SPHERE)[self._views[-1]]],
+        }
