@@ -1,7 +1,7 @@
 """Taught things recognised by features alone and verified by their geometry, at true size.
 
     python benchmarks/verified_things.py SCANS [--models ycb] [--draws 0 1] [--every 3] [--resting]
-    [--clutter 5] [--known even] [--fit]
+    [--clutter 5] [--known even] [--save FOLDER]
 
 SCANS holds the scans of the things that the memory knows, in metres, by their names: they are what
 is looked at. Surfaces, weights and views are those of the memory. Each draw shows every thing once,
@@ -16,18 +16,20 @@ belief of 0.97 and more; of the things that are named right the error of the azi
 a symmetry about the vertical; a box counts modulo half a turn), of the place of the centre in the
 camera's frame, ADD-S below a tenth of the diameter in the same frame (Hinterstoisser et al. 2012;
 the definitions of the BOP toolkit), and the share in the right resting pose, or one that looks the
-same; and the milliseconds that the verification takes, without the features.
+same; and the milliseconds of one core from a further frame to the decision: its features, and the
+verification of all frames. The last line says how much memory all of this took.
 
-With ``--fit`` the weights that the draws call for are printed, with the loss that they are chosen
-by. With ``--known even`` or ``odd`` every other thing is taught and all are shown: the first half
-of the draws says which residuals are usual, the others are judged by a p-value of 0.02.
+With ``--save`` each draw that is done is kept in a folder, and not run again. With ``--known even``
+or ``odd`` every other thing is known, as if the others had been removed from the memory, and all
+are shown: printed is how many are called unknown, by a p-value below 0.02.
 """
 
 from __future__ import annotations
 
+import resource
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -38,7 +40,8 @@ from rich.progress import track
 from scipy.spatial import cKDTree
 
 from nextview.cli.exit_status import orderly_end
-from nextview.errors import UsageError
+from nextview.errors import ResultsError, UsageError
+from nextview.files import command, read_record, write_record
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated
@@ -50,7 +53,7 @@ from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 from nextview.things.unknown import KnownResiduals
 from nextview.things.verifier import Verified
-from nextview.things.weighing import EvidenceWeights, JudgedEpisode, fit_weights
+from nextview.things.weighing import EvidenceWeights
 
 Float = NDArray[np.float64]
 
@@ -104,6 +107,7 @@ class Episode:
         log_evidence: what the features say of each, see ``log_evidence_of``, (V, D).
         true_pose: of the scan file's frame in the object frame, (4, 4), metres.
         in_cameras: of the scan file's frame in the frame of each camera, (V, 4, 4), metres.
+        seconds: of CPU that the features of a view took, in the mean.
     """
 
     thing: int
@@ -111,6 +115,7 @@ class Episode:
     log_evidence: NDArray[np.floating]
     true_pose: Float
     in_cameras: Float
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -123,16 +128,16 @@ class Outcome:
         by_features: whether the features alone name it right.
         answer: the thing believed most.
         confidence: belief in it.
-        seconds: of CPU that the verification took.
+        seconds: of CPU from the last frame to the decision.
         residual: how badly the likeliest hypothesis explains the views.
-        named: the thing that it is of.
+        explained: share of the thing's pixels that it explains.
+        p_value: share of known things that are explained as badly; None if the memory does not say.
         azimuth: error, degrees; None for a thing with every symmetry, and in another resting pose
             that looks the same, too.
         place: error of the centre in the last camera's frame, metres.
         place_in_world: the same in the robot's world, in which the cameras' places have errors.
         add_s: mean distance of the surface's points, diameters.
         resting: whether the resting pose is right.
-        judged: what weights are fitted to.
     """
 
     thing: int
@@ -142,18 +147,41 @@ class Outcome:
     confidence: float
     seconds: float
     residual: float
-    named: int
+    explained: float
+    p_value: float | None
     azimuth: float | None
     place: float | None
     place_in_world: float | None
     add_s: float | None
     resting: bool | None
-    judged: JudgedEpisode
 
     @property
     def right(self) -> bool:
         """Whether the thing is named right."""
         return self.answer == self.thing
+
+
+@dataclass(frozen=True)
+class Draw:
+    """What was found in one draw.
+
+    Attributes:
+        setting: how the things were shown.
+        models: memory of the things.
+        known: which of them were taught.
+        every: of how many things one was shown.
+        views: after how many views they were judged.
+        outcomes: of all things, after each number of views.
+        command: that made it.
+    """
+
+    setting: Setting
+    models: str
+    known: Literal["all", "even", "odd"]
+    every: int
+    views: tuple[int, ...]
+    outcomes: tuple[Outcome, ...]
+    command: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +191,7 @@ class Taught:
     Attributes:
         orders: of the symmetry about the vertical; 0 for any azimuth.
         weights: that the memory was fitted to.
+        residuals: how badly its things are usually explained; None if that was not fitted.
     """
 
     recogniser: TaughtRecogniser
@@ -172,6 +201,7 @@ class Taught:
     points: list[Float]
     orders: list[int]
     weights: EvidenceWeights
+    residuals: KnownResiduals | None
 
     @classmethod
     def load(cls, models: str, scans: Path) -> Taught:
@@ -195,7 +225,16 @@ class Taught:
         points = [surface.sample(POINTS, np.random.default_rng(0)) for surface in whole]
         orders = [symmetry_order(*both) for both in zip(whole, points, strict=True)]
         surfaces = list(known.verifier.caster.surfaces)
-        return cls(recogniser, names, meshes, surfaces, points, orders, known.verifier.weights)
+        return cls(
+            recogniser,
+            names,
+            meshes,
+            surfaces,
+            points,
+            orders,
+            known.verifier.weights,
+            known.residuals,
+        )
 
     def resting_poses(self, thing: int) -> Float:
         """How the thing of this number can rest, rotations from the scan's axes, (N, 3, 3)."""
@@ -203,8 +242,12 @@ class Taught:
         return memory.rotations[memory.thing == thing].astype(np.float64)
 
     def things(self, some: NDArray[np.int64]) -> TaughtThings:
-        """A recogniser of some of the things."""
-        return TaughtThings(self.recogniser, [self.surfaces[k] for k in some], self.weights)
+        """A recogniser of some of the things, as if the others had been removed."""
+        residuals = self.residuals
+        if residuals is not None:
+            residuals = replace(residuals, usual=residuals.usual[some])
+        surfaces = [self.surfaces[k] for k in some]
+        return TaughtThings(self.recogniser, surfaces, self.weights, residuals)
 
 
 def symmetry_order(surface: Surface, points: Float) -> int:
@@ -256,17 +299,19 @@ def shown(taught: Taught, things: TaughtThings, thing: int, draw: int, setting: 
     to_object[:3, :3] = frame.axes
     to_object[:3, 3] = -frame.axes @ frame.centre
     in_cameras = np.linalg.inv(np.stack(cameras)) @ in_truth
+    begun = time.process_time()  # one thread; others on the machine do not count
     evidence = things.log_evidence(observations)
-    return Episode(thing, observations, evidence, to_object @ in_truth, in_cameras)
+    seconds = (time.process_time() - begun) / len(observations)
+    return Episode(thing, observations, evidence, to_object @ in_truth, in_cameras, seconds)
 
 
 def judged(
     things: TaughtThings, taught: Taught, some: NDArray[np.int64], episode: Episode, views: int
 ) -> Outcome:
     """Recognise the thing of an episode after some views, among some things."""
-    begun = time.process_time()  # one thread; others on the machine do not count
+    begun = time.process_time()
     found = things.verify(episode.observations[:views], episode.log_evidence[:views])
-    seconds = time.process_time() - begun
+    seconds = episode.seconds + time.process_time() - begun
 
     answer = int(some[found.belief.argmax()])
     truth = int(np.searchsorted(some, episode.thing)) if episode.thing in some else -1
@@ -281,8 +326,8 @@ def judged(
         confidence=float(found.belief.max()),
         seconds=seconds,
         residual=found.residual,
-        named=int(found.things[0]),
-        judged=found.judged(truth),
+        explained=float(found.explained[0].mean()),
+        p_value=things.p_value(episode.observations[:views], found),
         **errors,
     )
 
@@ -382,29 +427,32 @@ def mistakes(taught: Taught, outcomes: Sequence[Outcome], views: Sequence[int]) 
 
 
 def unknown_table(
-    outcomes: Sequence[list[Outcome]], known: NDArray[np.int64], views: Sequence[int]
+    outcomes: Sequence[Outcome], known: NDArray[np.int64], views: Sequence[int]
 ) -> Iterator[str]:
     """How many of the things that were not taught, and of those that were, are called unknown."""
-    fitted = [o for draw in outcomes[: len(outcomes) // 2] for o in draw if o.right]
-    things = np.array([int(np.searchsorted(known, o.thing)) for o in fitted])
-    residuals = np.array([o.residual for o in fitted])
-    usual = KnownResiduals.fit(things, residuals, np.array([o.views for o in fitted]), len(known))
-
     yield "| views | strangers unknown | known unknown | strangers named with confidence |"
     yield "|---|---|---|---|"
-    rest = [o for draw in outcomes[len(outcomes) // 2 :] for o in draw]
     for k in views:
-        refused = []
-        sure = []
-        taught = []
-        for o in (o for o in rest if o.views == k):
-            p = usual.p_value(o.residual, int(np.searchsorted(known, o.answer)), k)
-            if o.thing in known:
-                taught.append(p < REJECTED)
-            else:
-                refused.append(p < REJECTED)
-                sure.append(p >= REJECTED and o.confidence >= CONFIDENT)
-        yield f"| {k} | {np.mean(refused):.3f} | {np.mean(taught):.3f} | {np.mean(sure):.3f} |"
+        some = [o for o in outcomes if o.views == k and o.p_value is not None]
+        strangers = [o for o in some if o.thing not in known]
+        taught = [o for o in some if o.thing in known]
+        refused = np.mean([unknown(o) for o in strangers])
+        wrongly = np.mean([unknown(o) for o in taught])
+        sure = np.mean([not unknown(o) and o.confidence >= CONFIDENT for o in strangers])
+        yield f"| {k} | {refused:.3f} | {wrongly:.3f} | {sure:.3f} |"
+
+
+def unknown(outcome: Outcome) -> bool:
+    """Whether a thing is called unknown."""
+    return outcome.p_value is not None and outcome.p_value < REJECTED
+
+
+def kept(file: Path, asked: Draw) -> list[Outcome]:
+    """The outcomes of a draw that an earlier run kept; ResultsError if it asked for others."""
+    found = read_record(file, Draw, "what was found in a draw", ResultsError)
+    if replace(found, outcomes=(), command=asked.command) != asked:
+        raise ResultsError(f"{file}: is of {found.command!r}; give another folder to --save")
+    return list(found.outcomes)
 
 
 def main(
@@ -417,7 +465,7 @@ def main(
     known: Literal["all", "even", "odd"] = "all",
     resting: bool = False,
     clutter: int = 0,
-    fit: bool = False,
+    save: Path | None = None,
 ) -> None:
     """Show the things, recognise them, and print the tables.
 
@@ -431,7 +479,7 @@ def main(
         known: which of the things are taught; all are shown.
         resting: show things in any pose that they can rest in.
         clutter: number of boxes around each thing.
-        fit: print the weights that the draws call for.
+        save: folder in which the draws that are done are kept, and looked for.
     """
     taught = Taught.load(models, scans)
     setting = Setting(sensor, max(views), resting, clutter)
@@ -441,20 +489,27 @@ def main(
 
     outcomes: list[list[Outcome]] = []
     for draw in draws:
+        file = None if save is None else save / f"draw-{draw}.json"
+        asked = Draw(setting, models, known, every, views, (), command())
+        if file is not None and file.exists():
+            outcomes.append(kept(file, asked))
+            continue
+
         here: list[Outcome] = []
         for thing in track(everything[draw % every :: every], f"draw {draw}"):
             episode = shown(taught, things, int(thing), draw, setting)
             counts = [k for k in views if k <= len(episode.observations)]
             here += [judged(things, taught, some, episode, k) for k in counts]
         outcomes.append(here)
+        if file is not None:
+            write_record(file, replace(asked, outcomes=tuple(here)))
 
-    if known != "all":
-        print(*unknown_table(outcomes, some, views), sep="\n")
-        return
     together = [outcome for draw in outcomes for outcome in draw]
-    print(*table(together, views), "", *mistakes(taught, together, views), sep="\n")
-    if fit:
-        print(fit_weights([outcome.judged for outcome in together]))
+    if known == "all":
+        print(*table(together, views), "", *mistakes(taught, together, views), sep="\n")
+    else:
+        print(*unknown_table(together, some, views), sep="\n")
+    print(f"memory: at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GB")
 
 
 if __name__ == "__main__":

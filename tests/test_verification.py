@@ -525,14 +525,17 @@ def test_what_is_always_explained_badly_is_not_unknown_for_that():
 
 def test_what_the_noise_of_a_real_camera_explains_is_no_stranger():
     known = KnownResiduals(np.full(1, 0.05), (np.linspace(-0.3, 0.3, 99),))
-    # Pixels that are off by the noise, 30 % more of it than was measured, have this mean.
-    off = np.random.default_rng(0).normal(0, 1.29, 100_000)
+    # Pixels that are off by the noise, 50 % more of it than was measured, have this mean.
+    off = np.random.default_rng(0).normal(0, 1.49, 100_000)
     explained = float((off**2 / 2).mean())
     assert known.p_value(explained, 0, 1) == pytest.approx(0.01)
     assert known.of_real_camera(explained, 0, 1) >= 0.5
     assert known.of_real_camera(explained + 0.1, 0, 1) == pytest.approx(0.01)
     # a banana does not explain a ring, though it lies on a part of it
     assert known.of_real_camera(explained, 0, 1, explained=0.5) == pytest.approx(0.01)
+    # a camera that is more exact than the scan errs little by its noise
+    assert known.of_real_camera(explained, 0, 1, noise_share=0.9) == pytest.approx(0.01)
+    assert known.of_real_camera(0.9 * explained, 0, 1, noise_share=0.9) >= 0.5
     # better explained things have larger p-values still
     assert known.of_real_camera(0.04, 0, 1) > known.of_real_camera(0.06, 0, 1)
 

@@ -10,7 +10,8 @@ from nextview.cli.episode_table import episode_as_json, print_episode
 from nextview.cli.progress import console
 from nextview.errors import NextviewError, ObservationError, UsageError
 from nextview.files import new_file
-from nextview.session.system import System, load, simulated
+from nextview.session.session import Session
+from nextview.session.system import load, simulated
 
 DEMO_PICTURE = Path("nextview_demo.png")
 
@@ -41,6 +42,7 @@ def recognise(
     output: Output = Output(),
     start: int | None = None,
     seed: int = 0,
+    any_orientation: bool = False,
 ) -> None:
     """Recognise an object by next best views, and show where it looked and why.
 
@@ -57,6 +59,8 @@ def recognise(
         start: first view; of the 40, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not
             given.
         seed: decides the first view, whatever the policy draws and the errors of a sensor.
+        any_orientation: the object is a taught thing that may be held, lean or fly: it need not
+            rest as it was taught.
     """
     if more and (output.figure or output.record):
         raise UsageError(
@@ -71,7 +75,9 @@ def recognise(
     for one in (path, *more):
         name = one.name if source.sensor is None else f"{one.name} through {source.sensor}"
         try:
-            show(source.camera(one, seed), name, system, output, start, seed, None if more else 1)
+            camera = source.camera(one, seed)
+            session = system.session_with(camera, start, seed, any_orientation)
+            show(session, camera, name, system.policy_name, output, None if more else 1)
         except NextviewError as error:
             if not more:
                 raise
@@ -102,34 +108,34 @@ def demo(
     if figure is None:  # the name is the demo's own: a second demo draws over the first
         output = Output(DEMO_PICTURE, overwrite=True)
     check_file(output.figure, output.overwrite)
-    show(simulated(sample_mesh(shape)), f"the sample {shape}", load(), output, start)
+    system = load()
+    camera = simulated(sample_mesh(shape))
+    session = system.session_with(camera, start)
+    show(session, camera, f"the sample {shape}", system.policy_name, output)
     console.print(f"the episode is drawn in {output.figure}")
 
 
 def show(
+    session: Session,
     camera: Any,
     name: str,
-    system: System,
+    policy: str,
     output: Output,
-    start: int | None,
-    seed: int = 0,
     indent: int | None = 1,
 ) -> None:
     """Recognise what a camera sees, print the episode and write the requested files.
 
     Args:
+        session: recognises the object.
         camera: in front of the object.
         name: of the object.
-        system: recognises it.
+        policy: name of what chooses the views.
         output: what is to be written.
-        start: index of the first view; None for a random one.
-        seed: of the draws.
         indent: of the JSON text, in spaces; None for one line.
 
     Raises:
         ObservationError: nothing of the object is seen from any view.
     """
-    session = system.session_with(camera, start, seed)
     with ExitStack() as recorded:
         if output.record is not None:
             from nextview.viewers.recording import Recorder
@@ -148,7 +154,7 @@ def show(
     if output.json:
         print(episode_as_json(result, name, frames, indent))
     else:
-        print_episode(result, name, system.policy_name, frames)
+        print_episode(result, name, policy, frames)
     for frame, reason in getattr(camera, "left_out", {}).items():
         console.print(f"left out: {frame}: {reason}", style="yellow")
     if output.figure is not None:

@@ -112,6 +112,15 @@ class LooksAhead(Protocol):
         """
 
 
+@runtime_checkable
+class KnowsAnyOrientation(Protocol):
+    """A recogniser of things that rest, which has one of things that need not rest beside it."""
+
+    @property
+    def in_any_orientation(self) -> Recogniser:
+        """The same for things that are held, lean or fly."""
+
+
 def tells_unknown(recogniser: Recogniser) -> bool:
     """Whether a recogniser may say that an object is of none of its classes."""
     return recogniser.novelty is not None or isinstance(recogniser, JudgesTogether)

@@ -28,7 +28,7 @@ from nextview.recognition.map_names import SPHERE
 from nextview.recognition.model_card import DISCRIMINATE, Collection, find_models
 from nextview.recognition.own_recogniser import own_recogniser
 from nextview.recognition.own_stopping import Rule, own_stopping
-from nextview.recognition.protocol import Recogniser, tells_unknown
+from nextview.recognition.protocol import KnowsAnyOrientation, Recogniser, tells_unknown
 from nextview.session.limits import Limits
 from nextview.session.result import Recognition
 from nextview.session.session import FrameCamera, Session
@@ -81,6 +81,7 @@ class System:
         min_height: float | None = None,
         max_height: float | None = None,
         clearance: float | None = None,
+        any_orientation: bool = False,
     ) -> Session:
         """One object under way, for whoever moves the camera. Those for a robot need no more than a
         distance.
@@ -102,22 +103,33 @@ class System:
                 high as it stood.
             clearance: metres between the camera and what the frames show; 0.1 by default, 0 for
                 any.
+            any_orientation: it is a taught thing that may be held, lean or fly: it need not rest
+                as it was taught. A frame takes about twice as long.
+
+        Raises:
+            ModelError: things in any orientation are recognised by their geometry, and the models
+                know none.
         """
         rng = np.random.default_rng(whole(seed, "the seed", 0, 2**63 - 1))
         drawn = int(rng.integers(len(self.sphere)))
         start = drawn if start is None else start
         options = (self.stopping, rng, object, distance, self.unknown)
-        session = Session(self.models, self.policy, self.sphere, start, *options)
+        models = _in_any_orientation(self.models) if any_orientation else self.models
+        session = Session(models, self.policy, self.sphere, start, *options)
         session.limits = Limits(min_height, max_height, clearance)
         return session
 
     def session_with(
-        self, camera: Camera | FrameCamera, start: int | None = None, seed: int = 0
+        self,
+        camera: Camera | FrameCamera,
+        start: int | None = None,
+        seed: int = 0,
+        any_orientation: bool = False,
     ) -> Session:
         """A session for a camera: where it gives frames, for its object."""
         if not isinstance(camera, FrameCamera):
-            return self.session(start, seed)
-        session = self.session(start, seed, camera.object)
+            return self.session(start, seed, any_orientation=any_orientation)
+        session = self.session(start, seed, camera.object, any_orientation=any_orientation)
         if getattr(camera, "knows_reach", False):
             session.limits = Limits.none()
         return session
@@ -131,6 +143,7 @@ class System:
         unit: str | None = None,
         sensor: "str | Sensor | None" = None,
         largest_part: bool = False,
+        any_orientation: bool = False,
     ) -> Recognition:
         """Look at an object until it is clear what it is, or the views run out.
 
@@ -148,6 +161,7 @@ class System:
             largest_part: of a mesh file, leave out all that is not connected to its largest part,
                 see ``load_mesh``. What is likely to be wrong with a file's mesh is a Python
                 warning.
+            any_orientation: see ``session``.
 
         Raises:
             MeshError, DatasetError: the file or the folder cannot be used.
@@ -176,7 +190,7 @@ class System:
         if not hasattr(what, "observe"):
             wanted = "a mesh file, a Mesh, a folder of views, or a camera with observe(pose)"
             raise UsageError(f"what is looked at is {wanted}, not {one_line(repr(what))}")
-        return self.session_with(what, start, seed).run(what)
+        return self.session_with(what, start, seed, any_orientation).run(what)
 
     def __repr__(self) -> str:
         name = self.models.recogniser.name
@@ -185,6 +199,15 @@ class System:
 
     def __reduce__(self) -> "tuple[Callable[[], System], tuple[()]]":
         return partial(load, **self.loaded), ()
+
+
+def _in_any_orientation(models: Models) -> Models:
+    """The same for things that need not rest; ModelError where no geometry is known."""
+    recogniser = models.recogniser
+    if not isinstance(recogniser, KnowsAnyOrientation):
+        what = "things in any orientation are recognised by their geometry, and it knows none"
+        raise ModelError(f"{recogniser.name}: {what}")
+    return replace(models, recogniser=recogniser.in_any_orientation)
 
 
 def simulated(mesh: Mesh, sensor: "str | Sensor | None" = None, seed: int = 0) -> Camera:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -24,9 +25,6 @@ from nextview.things.verifier import Verified
 Float = NDArray[np.float64]
 
 NO_SCALE = "the scale of what is seen is not known in metres"
-# The radius of what is seen, of that of the whole thing: much may be hidden, or little taken in.
-SMALLEST_SHARE = 0.25
-LARGEST_SHARE = 2.0
 
 
 class VerifiedRecogniser(TaughtRecogniser):
@@ -50,7 +48,8 @@ class VerifiedRecogniser(TaughtRecogniser):
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what is made of the memory, and leads back to it."""
-        return {name: value for name, value in vars(self).items() if name != "things"}
+        made = ("things", "in_any_orientation")
+        return {name: value for name, value in vars(self).items() if name not in made}
 
     @cached_property
     def things(self) -> TaughtThings:
@@ -59,6 +58,16 @@ class VerifiedRecogniser(TaughtRecogniser):
         if found is None:
             raise ModelError(f"{self.card.card_path}: knows no geometry of its things")
         return found
+
+    @cached_property
+    def in_any_orientation(self) -> VerifiedRecogniser:
+        """The same for things that may be held, lean or fly: they need not rest.
+
+        Features remember things that rest, so outlines propose what is aligned.
+        """
+        tilted = copy(self)
+        tilted.things = self.things.in_any_orientation()
+        return tilted
 
     @cached_property
     def labels(self) -> NDArray[np.int64]:
@@ -125,7 +134,7 @@ class VerifiedRecogniser(TaughtRecogniser):
             belief,
             poses=poses,
             camera_error=camera_error,
-            p_value=self._p_value(observations, found),
+            p_value=self.things.p_value(observations, found),
             found=found,
         )
 
@@ -146,26 +155,6 @@ class VerifiedRecogniser(TaughtRecogniser):
     def _no_geometry(self, belief: Float) -> str:
         """Why there is no pose of the class believed most, in words."""
         return f"the geometry of {self.classes[int(belief.argmax())]} is not known in metres"
-
-    def _p_value(self, observations: Sequence[Observation], found: Verified) -> float | None:
-        """Share of known things that are explained as badly by the likeliest hypothesis.
-
-        What is of another order of size than the likeliest thing is none of them, whatever its
-        few pixels say: it gets the least p-value that there is.
-        """
-        residuals = self.things.residuals
-        if residuals is None:
-            return None
-
-        likeliest = int(found.things[0])
-        views = found.mean.shape[1]
-        seen = max(observation.radius or 0.0 for observation in observations)
-        share = seen / float(self.things.verifier.caster.radii[likeliest])
-        if not SMALLEST_SHARE <= share <= LARGEST_SHARE:
-            return residuals.p_value(np.inf, likeliest, views)
-
-        explained = float(found.explained[0].mean())
-        return residuals.of_real_camera(found.residual, likeliest, views, explained)
 
 
 def open_recogniser(model: str | Path, threads: int = 0) -> NetworkRecogniser:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -76,7 +77,8 @@ class SeveralRecognisers:
                 raise ModelError(f"{name}: {what}; teach them again")
         self.memories = tuple(memories.values())
         self.network = next(iter(networks.values()), None)
-        self.members: tuple[NetworkRecogniser, ...] = tuple((memories | networks).values())
+        self._collections: dict[str, NetworkRecogniser] = {**memories, **networks}
+        self.members = tuple(self._collections.values())
         self.name = ", ".join(memories | networks)
         self.novelty: Quantiles | None = None
         self.classes = _told_apart(
@@ -86,12 +88,23 @@ class SeveralRecognisers:
         self._novelties: WeakKeyDictionary[Observation, float] = WeakKeyDictionary()
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but what was said of observations so far."""
-        left_out = ("_said", "_novelties")
+        """All but what was said of observations so far, and what is made of the memories."""
+        left_out = ("_said", "_novelties", "in_any_orientation")
         return {name: value for name, value in vars(self).items() if name not in left_out}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, _said=WeakKeyDictionary(), _novelties=WeakKeyDictionary())
+
+    @cached_property
+    def in_any_orientation(self) -> SeveralRecognisers:
+        """The same for things that may be held, lean or fly: they need not rest."""
+        tilted: dict[str, NetworkRecogniser] = {}
+        for name, member in self._collections.items():
+            if isinstance(member, VerifiedRecogniser):
+                tilted[name] = member.in_any_orientation
+            else:
+                tilted[name] = member
+        return SeveralRecognisers(tilted)
 
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
         """What each view speaks for, each collection being as likely: for policies alone."""

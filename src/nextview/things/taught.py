@@ -1,6 +1,7 @@
 """A memory of taught things together with their surfaces: from observations to names and poses."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import fields
 
 import numpy as np
@@ -15,9 +16,14 @@ from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
 from nextview.things.unknown import KnownResiduals
 from nextview.things.verifier import Verified, Verifier
+from nextview.things.view_templates import ViewTemplates
 from nextview.things.weighing import EvidenceWeights
 
 Float = NDArray[np.float64]
+
+# The radius of what is seen, of that of the whole thing: much may be hidden, or little taken in.
+SMALLEST_SHARE = 0.25
+LARGEST_SHARE = 2.0
 
 
 class TaughtThings:
@@ -30,6 +36,8 @@ class TaughtThings:
         residuals: how badly known things are explained, in the same order; None if that was not
             fitted.
         symmetries: of each thing, in the same order.
+        templates: of the things from all around, where they may have any orientation; None where
+            they rest as they were taught.
         rows: hypotheses of the memory that are of these things, (R,) int64.
     """
 
@@ -69,6 +77,7 @@ class TaughtThings:
         self.residuals = residuals
         self.symmetries = tuple(about.things[known.index(name)].symmetries for name in self.names)
         self.verifier = Verifier(surfaces, owners, memory.rotations[self.rows], weights)
+        self.templates: ViewTemplates | None = None
 
     @classmethod
     def of(cls, recogniser: TaughtRecogniser) -> "TaughtThings | None":
@@ -97,6 +106,15 @@ class TaughtThings:
         where = str(recogniser.card.card_path)
         weights = weights_of(about.verification, where)
         return cls(recogniser, some, weights, residuals_of(about.verification, known))
+
+    def in_any_orientation(self) -> "TaughtThings":
+        """The same things, which may be held, lean or fly: they need not rest.
+
+        Each is rendered from all around, which takes some 50 ms a thing.
+        """
+        tilted = copy(self)
+        tilted.templates = ViewTemplates(self.verifier.caster)
+        return tilted
 
     def __call__(self, observations: Sequence[Observation]) -> Verified:
         """Recognise the thing that some views show.
@@ -152,8 +170,40 @@ class TaughtThings:
         Returns:
             The belief in each thing, and the poses.
         """
+        if self.templates is not None:
+            return self.verifier.in_any_orientation(observations, self.templates)
         known = joint[self.rows]
         return self.verifier(observations, known / known.sum())
+
+    def p_value(self, observations: Sequence[Observation], found: Verified) -> float | None:
+        """Share of known things that are explained as badly by the likeliest hypothesis.
+
+        What is of another order of size than the likeliest thing is none of them, whatever its
+        few pixels say: it gets the least p-value that there is.
+
+        Args:
+            observations: the views.
+            found: what was found of them.
+
+        Returns:
+            Between 0 and 1, small for a thing that was not taught; None if it was not fitted how
+            badly known things are explained.
+        """
+        if self.residuals is None:
+            return None
+
+        likeliest = int(found.things[0])
+        views = found.mean.shape[1]
+        seen = max(observation.radius or 0.0 for observation in observations)
+        share = seen / float(self.verifier.caster.radii[likeliest])
+        if not SMALLEST_SHARE <= share <= LARGEST_SHARE:
+            return self.residuals.p_value(np.inf, likeliest, views)
+
+        explained = float(found.explained[0].mean())
+        noise_share = float(found.noise_share[0].mean())
+        return self.residuals.of_real_camera(
+            found.residual, likeliest, views, explained, noise_share
+        )
 
 
 def weights_of(verification: Verification, where: str) -> EvidenceWeights:

@@ -12,7 +12,7 @@ SHRINKAGE = 2.0
 LEAST_RESIDUAL = 0.02  # below which residuals do not differ
 NOISE_RESIDUAL = 0.5  # of pixels that are off by just the noise: half a squared standard normal
 NOISE_SHARE = 0.8  # of a thing's pixels that the surface explains, if only the noise is in the way
-NOISE_KNOWN = 1.3  # by what factor the noise of a real camera may be larger than it is measured
+NOISE_KNOWN = 1.5  # by what factor the noise of a real camera may be larger than it is measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,26 +110,34 @@ class KnownResiduals:
         return float((1 + as_bad) / (1 + len(excess)))
 
     def of_real_camera(
-        self, residual: float, thing: int, views: int, explained: float = 1.0
+        self,
+        residual: float,
+        thing: int,
+        views: int,
+        explained: float = 1.0,
+        noise_share: float = 1.0,
     ) -> float:
         """The p-value of what a real camera sees, whose noise is not known exactly.
 
         Cameras have errors that no model of their noise holds. Known things are then explained
         worse than in the simulation that this was fitted to. So a residual that the noise alone
         explains, if it is larger than it was measured by ``NOISE_KNOWN``, is no reason to call a
-        thing unknown; provided that the surface explains most of the pixels at all.
+        thing unknown; provided that the surface explains most of the pixels at all. A camera that
+        is more exact than the scans explains little by its noise.
 
         Args:
             residual: of the likeliest hypothesis.
             thing: which thing it is of.
             views: how many views there are.
             explained: share of the thing's pixels that the hypothesis explains, in the mean.
+            noise_share: part that the noise of the camera has in the variance of a depth; the
+                errors of the scan have the rest.
 
         Returns:
             See ``p_value``; at least 0.5 where the noise explains the residual.
         """
         p_value = self.p_value(residual, thing, views)
-        noise_explains = residual <= NOISE_RESIDUAL * NOISE_KNOWN**2
+        noise_explains = residual <= NOISE_RESIDUAL * NOISE_KNOWN**2 * noise_share
         if noise_explains and explained >= NOISE_SHARE:
             return 0.5 + p_value / 2
         return p_value

@@ -46,12 +46,15 @@ class ViewLikelihood:
         explained: share of the thing's pixels that the hypothesis explains, (H,) float64.
         misfit: how badly the hypothesis explains the view if nothing is known of others, (H,)
             float64, 0 for exactly: see ``likelihood``.
+        noise_share: part of the noise of the camera in the variance of a depth that is measured on
+            the hypothesis, beside the errors of its scan, (H,) float64.
     """
 
     total: Float
     pixels: Float
     explained: Float
     misfit: Float
+    noise_share: Float
 
     @property
     def mean(self) -> Float:
@@ -107,4 +110,16 @@ def likelihood(
     mismatch = -(both * match).sum(1) / np.maximum(both.sum(1), 1e-9)
     mismatch = np.where(both.any(1), mismatch, -model.outlier)
     misfit = mismatch - model.outlier * (model.missing * missing + model.through * seen_through)
-    return ViewLikelihood(judged.sum(1), counted.sum(1).astype(np.float64), explained, misfit)
+    return ViewLikelihood(
+        total=judged.sum(1),
+        pixels=counted.sum(1).astype(np.float64),
+        explained=explained,
+        misfit=misfit,
+        noise_share=_noise_share(view, rendered),
+    )
+
+
+def _noise_share(view: DepthView, rendered: Rendered) -> Float:
+    """Part of the noise in the variance of a typical depth of the thing, (H,)."""
+    noise = float(np.median(view.noise[view.kind == THING])) ** 2
+    return np.asarray(noise / (noise + rendered.errors.astype(np.float64) ** 2))

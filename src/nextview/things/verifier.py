@@ -1,7 +1,7 @@
 """Recognise taught things by their geometry: propose, align, judge every pixel, believe."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import rotation_z
 from nextview.things.depth_view import DepthView, MetricImage
 from nextview.things.ground import levelling
-from nextview.things.proposals import Proposals, propose
+from nextview.things.proposals import propose
 from nextview.things.registration import (
     COARSE,
     FINE,
@@ -28,10 +28,13 @@ from nextview.things.registration import (
 )
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.verification import PixelModel, ViewLikelihood, likelihood
+from nextview.things.view_templates import ViewTemplates
 from nextview.things.weighing import EvidenceWeights, JudgedEpisode
 
 Float = NDArray[np.float64]
 
+ANY_TILT = 0.3  # radians by which a thing in any orientation is off its proposal: hardly held
+TILTED_PROPOSALS = 120  # of things in any orientation, of all views together
 AGAINST_FEATURES = 0.1  # misfit for each unit of log-belief that features hold against a thing
 LEAST_BY_FEATURES = 0.01  # belief by features below which it does not matter
 
@@ -60,6 +63,11 @@ STAGES = (
     Stage(24, COARSE, 12, 25.0),
     Stage(FINE_SIDE, FINE, 12, np.inf),
 )
+TILTED_STAGES = tuple(
+    replace(stage, levels=tuple(replace(level, turned=True) for level in stage.levels), most=most)
+    for stage, most in zip(STAGES, (32, 12, 12), strict=True)
+)
+"""The same for things in any orientation, which are turned about all axes from the beginning."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +89,7 @@ class Verified:
         explained: share of the thing's pixels in each view that each hypothesis explains, (M, V)
             float64.
         misfit: how badly each hypothesis explains each view, (M, V) float64; 0 for exactly.
+        noise_share: see ``ViewLikelihood``, of each hypothesis in each view, (M, V) float64.
     """
 
     belief: Float
@@ -95,6 +104,7 @@ class Verified:
     by_features: Float
     explained: Float
     misfit: Float
+    noise_share: Float
 
     def judged(self, truth: int) -> JudgedEpisode:
         """The same as an example of the thing of this number, to fit weights to."""
@@ -110,6 +120,32 @@ class Verified:
         """
         against = -np.log(max(self.by_features[self.things[0]], LEAST_BY_FEATURES))
         return float(self.misfit[0].mean() + AGAINST_FEATURES * against)
+
+
+@dataclass(frozen=True, eq=False)
+class _Proposed:
+    """What is aligned, M hypotheses.
+
+    Attributes:
+        resting: index of the verifier's hypotheses, (M,) int64.
+        rotations: from the axes of the scan files to the object frame, (M, 3, 3) float64.
+        log_belief: before the geometry is looked at, (M,) float64.
+        by_features: belief in each thing before that, (T,) float64, sums to 1.
+    """
+
+    resting: NDArray[np.int64]
+    rotations: Float
+    log_belief: Float
+    by_features: Float
+
+    def select(self, rows: NDArray) -> "_Proposed":
+        """Some of the hypotheses, by index."""
+        return replace(
+            self,
+            resting=self.resting[rows],
+            rotations=self.rotations[rows],
+            log_belief=self.log_belief[rows],
+        )
 
 
 class Verifier:
@@ -178,27 +214,82 @@ class Verifier:
 
         proposals = propose(joint)
         turns = rotation_z(proposals.azimuths) @ self.rotations[proposals.hypotheses]
+        by_features = np.zeros(len(self.caster.surfaces))
+        np.add.at(by_features, self.owners, joint.sum(1))
+        by_features /= by_features.sum()
+        proposed = _Proposed(proposals.hypotheses, turns, proposals.log_belief, by_features)
+
         images = _images(observations)
         level = levelling([image.ground for image in images if image.ground is not None])
         images = [image.turned(level) for image in images]
-        views = [image.view(STAGES[0].side) for image in images]
-        alignment = start(self.owners[proposals.hypotheses], turns, len(views))
+        return self._settled(proposed, images, STAGES, self.prior, level)
+
+    def in_any_orientation(
+        self, observations: Sequence[Observation], templates: ViewTemplates
+    ) -> Verified:
+        """The same for a thing that need not rest on anything: held, leaning or thrown.
+
+        Args:
+            observations: views of one thing, all in one object frame.
+            templates: of the same surfaces.
+
+        Returns:
+            The belief by size, outline and geometry, and the poses. ``resting`` is any resting
+            pose of the thing.
+
+        Raises:
+            ObservationError: no view shows the thing, or its scale is not known.
+        """
+        images = [replace(image, ground=None) for image in _images(observations)]
+        each = max(1, TILTED_PROPOSALS // len(images))
+        found = [templates.propose(image, each) for image in images]
+        things = np.concatenate([one.things for one in found])
+        if not len(things):
+            raise ObservationError("no view shows enough of the thing to be compared with others")
+
+        by_outline = np.mean([one.log_belief for one in found], axis=0)
+        belief = np.exp(by_outline - by_outline.max())
+        first = np.searchsorted(self.owners, np.arange(len(self.caster.surfaces)))
+        proposed = _Proposed(
+            resting=first[things],
+            rotations=np.concatenate([one.rotations for one in found]),
+            log_belief=by_outline[things],
+            by_features=belief / belief.sum(),
+        )
+        prior = replace(self.prior, tilt=ANY_TILT)
+        return self._settled(proposed, images, TILTED_STAGES, prior, np.eye(3))
+
+    def _settled(
+        self,
+        proposed: _Proposed,
+        images: Sequence[MetricImage],
+        stages: Sequence[Stage],
+        prior: RegistrationPrior,
+        level: Float,
+    ) -> Verified:
+        """The proposals aligned and judged, coarse to fine, in a frame that was turned to be
+        level.
+        """
+        views = [image.view(stages[0].side) for image in images]
+        alignment = start(self.owners[proposed.resting], proposed.rotations, len(views))
         alignment = centred(self.caster, alignment, views)
 
-        for stage in STAGES:
+        for stage in stages:
             views = [image.view(stage.side) for image in images]
-            alignment = align(self.caster, alignment, views, stage.levels, self.prior)
+            alignment = align(self.caster, alignment, views, stage.levels, prior)
             judged = self._judge(alignment, views)
-            scores = self._scores(proposals.log_belief, alignment, views, judged)
+            mean = np.stack([view.mean for view in judged], 1)
+            costs = camera_cost(alignment, views, prior)
+            scores = self.weights.scores(mean, costs, proposed.log_belief)
 
             order = np.argsort(-scores, kind="stable")
             order = order[scores[order] >= scores[order[0]] - stage.hopeless]
             rows = order[different_poses(self.caster, alignment.select(order))][: stage.most]
             alignment = alignment.select(rows)
-            proposals = proposals.select(rows)
+            proposed = proposed.select(rows)
 
         aligned = alignment.turned(level.T)
-        return self._verified(proposals, aligned, scores[rows], views, judged, rows, joint)
+        return self._verified(proposed, aligned, scores[rows], costs[rows], judged, rows)
 
     def _judge(self, alignment: Alignment, views: Sequence[DepthView]) -> list[ViewLikelihood]:
         return [
@@ -206,48 +297,34 @@ class Verifier:
             for number, view in enumerate(views)
         ]
 
-    def _scores(
-        self,
-        log_belief: Float,
-        alignment: Alignment,
-        views: Sequence[DepthView],
-        judged: Sequence[ViewLikelihood],
-    ) -> Float:
-        """Log-likelihood of each hypothesis by all evidence, up to a constant, (M,)."""
-        mean = np.stack([view.mean for view in judged], 1)
-        return self.weights.scores(mean, camera_cost(alignment, views, self.prior), log_belief)
-
     def _verified(
         self,
-        proposals: Proposals,
+        proposed: _Proposed,
         alignment: Alignment,
         scores: Float,
-        views: Sequence[DepthView],
+        costs: Float,
         judged: Sequence[ViewLikelihood],
         rows: NDArray[np.int64],
-        joint: Float,
     ) -> Verified:
         """The answer of the proposals that survived, sorted by their scores.
 
         ``rows`` are theirs in what was judged.
         """
-        by_features = np.zeros(len(self.caster.surfaces))
-        np.add.at(by_features, self.owners, joint.sum(1))
-        by_features /= by_features.sum()
         shares = np.exp(scores - scores.max())
         return Verified(
-            belief=self.weights.belief(scores, alignment.things, by_features),
+            belief=self.weights.belief(scores, alignment.things, proposed.by_features),
             things=alignment.things,
-            resting=proposals.hypotheses,
+            resting=proposed.resting,
             probabilities=shares / shares.sum(),
             poses=alignment.poses(self.caster),
             cameras=alignment.cameras,
             mean=np.stack([view.mean[rows] for view in judged], 1),
-            camera_costs=camera_cost(alignment, views, self.prior),
-            log_belief=proposals.log_belief,
-            by_features=by_features,
+            camera_costs=costs,
+            log_belief=proposed.log_belief,
+            by_features=proposed.by_features,
             explained=np.stack([view.explained[rows] for view in judged], 1),
             misfit=np.stack([view.misfit[rows] for view in judged], 1),
+            noise_share=np.stack([view.noise_share[rows] for view in judged], 1),
         )
 
 

@@ -1,0 +1,256 @@
+"""Proposals for things in any orientation: what is seen, compared with pictures from all around.
+
+Each thing is rendered from directions all around it, as template matching does (Hinterstoisser et
+al., "Model based training, detection and pose estimation of texture-less 3D objects in heavily
+cluttered scenes", 2012). A picture is a small grid over the outline, centred and scaled by the
+moments of the outline, so that where the thing is and how far away does not matter. What is seen is
+turned in the image plane instead of the templates. Outlines are compared by their intersection over
+union, depths by the mean squared difference where both show, and sizes by the ratio of the
+outlines. All of it is a few matrix products.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.geometry.viewsphere import rotation_z
+from nextview.things.depth_view import THING, MetricImage
+from nextview.things.surface import SurfaceCaster
+
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Index = NDArray[np.int64]
+
+DIRECTIONS = 162  # from which each thing is rendered: some 15 degrees apart
+TURNS = 24  # in the image plane, in which what is seen is compared: 15 degrees apart
+GRID = 16  # rows and columns of a picture
+REACH = 2.2  # from its centre to its borders, root mean squares of the outline
+RENDERED = 48  # rows and columns of pixels of a rendering
+DISTANCE = 5.0  # of the camera from the centre, radii
+MOST_ORIENTATIONS = 16  # of one thing that are proposed
+FEWEST_PIXELS = 12  # of an outline that can be compared
+
+OUTLINE_WEIGHT = 8.0
+DEPTH_WEIGHT = 4.0
+SIZE_WEIGHT = 3.0
+"""How much a unit of the mismatch of outlines, depths and sizes costs."""
+SIZE_DEVIATION = 0.1  # of the logarithm of the ratio of sizes, as large as is usual
+LARGEST_SIZE_COST = 3.0  # half squared deviations: something may be hidden
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """Small pictures of outlines and depths, N of them, C cells each.
+
+    Attributes:
+        outline: which cells show the thing, 0 or 1, (N, C) float32.
+        depth: behind the mean of the outline, root mean squares of the outline; 0 where nothing
+            shows, (N, C) float32.
+        size: root mean square of the outline, metres, (N,) float64.
+    """
+
+    outline: Float32
+    depth: Float32
+    size: Float
+
+
+@dataclass(frozen=True, eq=False)
+class OrientedProposals:
+    """Hypotheses of things in any orientation, the likeliest first.
+
+    Attributes:
+        things: thing of each, (M,) int64.
+        rotations: from the axes of the scan files to the object frame, (M, 3, 3) float64.
+        log_belief: in each thing by outline, size and the shape of the depth, up to a constant,
+            (T,) float64.
+    """
+
+    things: Index
+    rotations: Float
+    log_belief: Float
+
+
+class ViewTemplates:
+    """Pictures of things from all around.
+
+    Attributes:
+        things: thing of each template, (N,) int64.
+        rotations: from the axes of the scan file to those of the camera, (N, 3, 3) float64.
+        pictures: what the camera sees.
+    """
+
+    def __init__(self, caster: SurfaceCaster) -> None:
+        """Render all surfaces of a caster from all around.
+
+        Args:
+            caster: of the things.
+        """
+        looks = looking_from(spread_directions(DIRECTIONS))
+        things = []
+        rotations = []
+        found = []
+        for thing in range(len(caster.surfaces)):
+            for look, picture in _rendered(caster, thing, looks):
+                things.append(thing)
+                rotations.append(look)
+                found.append(picture)
+        self.things = np.array(things)
+        self.rotations = np.array(rotations)
+        self.pictures = Pictures(
+            np.stack([one[0] for one in found]),
+            np.stack([one[1] for one in found]),
+            np.array([one[2] for one in found]),
+        )
+
+    def propose(self, image: MetricImage, count: int) -> OrientedProposals:
+        """The likeliest things and orientations, given what one view shows.
+
+        Args:
+            image: the view.
+            count: number of proposals. One thing has at most MOST_ORIENTATIONS of them.
+
+        Returns:
+            The proposals; none where too little is seen.
+        """
+        known = int(self.things.max()) + 1
+        turned, look = seen(image)
+        if turned is None:
+            return OrientedProposals(np.zeros(0, np.int64), np.zeros((0, 3, 3)), np.zeros(known))
+
+        costs = mismatch(turned, self.pictures)
+        turn = costs.argmin(0)
+        best = costs[turn, np.arange(len(turn))]
+        of_things = np.full(known, np.inf)
+        np.minimum.at(of_things, self.things, best)
+
+        order = np.argsort(best, kind="stable")
+        rank = _rank_within(self.things[order])
+        order = order[rank < MOST_ORIENTATIONS][:count]
+        rotations = look @ rotation_z(2 * np.pi * turn[order] / TURNS) @ self.rotations[order]
+        return OrientedProposals(self.things[order], rotations, -of_things)
+
+
+def _rank_within(things: Index) -> Index:
+    """How many earlier elements are the same, for each element, (N,)."""
+    order = np.argsort(things, kind="stable")
+    first = np.searchsorted(things[order], things[order])
+    rank = np.empty(len(things), np.int64)
+    rank[order] = np.arange(len(things)) - first
+    return rank
+
+
+def spread_directions(count: int) -> Float:
+    """Unit vectors that are spread evenly over the sphere, on a spiral, (count, 3)."""
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count
+    azimuth = np.pi * (1 + np.sqrt(5)) * k
+    across = np.sqrt(1 - z**2)
+    return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], 1)
+
+
+def looking_from(directions: Float) -> Float:
+    """Rotations to the axes of cameras that look at the origin, (N, 3, 3), of directions, (N, 3).
+
+    Their rows are the camera's axes: x right, y down, z forward.
+    """
+    forward = -directions
+    aside = np.where(np.abs(forward[:, 2:]) < 0.9, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+    right = np.cross(forward, aside)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return np.stack([right, np.cross(forward, right), forward], 1)
+
+
+def _rendered(
+    caster: SurfaceCaster, thing: int, looks: Float
+) -> Iterator[tuple[Float, tuple[Float32, Float32, float]]]:
+    """The pictures of one thing from cameras with these axes, (N, 3, 3)."""
+    radius = float(caster.radii[thing])
+    focal = RENDERED / 2 * np.sqrt(DISTANCE**2 - 1)
+    lines = (np.arange(RENDERED) + 0.5 - RENDERED / 2) / focal
+    rays = np.stack([*np.meshgrid(lines, lines), np.ones((RENDERED, RENDERED))], -1).reshape(-1, 3)
+
+    origins = caster.centres[thing] - DISTANCE * radius * looks[:, 2]
+    depth, _ = caster.cast(
+        np.full(len(looks), thing), origins.astype(np.float32), (rays @ looks).astype(np.float32)
+    )
+    for look, image in zip(looks, depth.reshape(-1, RENDERED, RENDERED), strict=True):
+        picture = _picture(image, np.isfinite(image), focal, np.zeros(1))
+        if picture is not None:
+            yield look, (picture[0][0], picture[1][0], picture[2])
+
+
+def seen(image: MetricImage) -> tuple[Pictures | None, Float]:
+    """What a view shows of the thing, turned in the image plane by so many angles.
+
+    Returns:
+        The pictures, None where too little is seen; and the axes of a camera in the same place that
+        looks at the middle of the outline, columns, (3, 3), object frame.
+    """
+    shown = image.kind == THING
+    focal = float(image.intrinsics[[0, 1], [0, 1]].mean())
+    found = _picture(image.depth, shown, focal, 2 * np.pi * np.arange(TURNS) / TURNS)
+    if found is None:
+        return None, np.eye(3)
+    outline, depth, size = found
+
+    rows, columns = np.nonzero(shown)
+    x = (columns.mean() + 0.5 - image.intrinsics[0, 2]) / image.intrinsics[0, 0]
+    y = (rows.mean() + 0.5 - image.intrinsics[1, 2]) / image.intrinsics[1, 1]
+    ahead = np.array([x, y, 1.0]) / np.sqrt(x**2 + y**2 + 1)
+    look = image.pose[:3, :3] @ _from_z_to(ahead)
+    return Pictures(outline, depth, np.full(TURNS, size)), look
+
+
+def _from_z_to(direction: Float) -> Float:
+    """The smallest rotation that takes z to a unit vector, (3, 3)."""
+    axis = np.array([-direction[1], direction[0], 0.0])  # z x direction
+    skew = np.array([[0, 0, axis[1]], [0, 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + skew + skew @ skew / (1 + direction[2])
+
+
+def _picture(
+    depth: NDArray, shown: NDArray[np.bool_], focal: float, turns: Float
+) -> tuple[Float32, Float32, float] | None:
+    """Outlines and depths on grids that are turned by some angles, (A, C), and the size, metres.
+
+    None where too few pixels show the thing.
+    """
+    rows, columns = np.nonzero(shown)
+    if len(rows) < FEWEST_PIXELS:
+        return None
+    centre = np.array([columns.mean(), rows.mean()])
+    spread = float(np.sqrt(columns.var() + rows.var() + 1 / 6))  # a pixel is a square
+    middle = float(np.median(depth[rows, columns]))
+    size = spread * middle / focal
+
+    lines = (np.arange(GRID) + 0.5) / GRID * 2 - 1
+    cells = REACH * spread * np.stack(np.meshgrid(lines, lines), -1).reshape(-1, 2)
+    turned = np.einsum("aij,cj->aci", rotation_z(turns)[:, :2, :2], cells) + centre
+    column, row = np.rint(turned).astype(np.int64).transpose(2, 0, 1)
+    inside = (row >= 0) & (row < shown.shape[0]) & (column >= 0) & (column < shown.shape[1])
+    row = np.where(inside, row, 0)
+    column = np.where(inside, column, 0)
+
+    outline = inside & shown[row, column]
+    behind = np.where(outline, (depth[row, column] - middle) / size, 0)
+    return outline.astype(np.float32), np.clip(behind, -3, 3).astype(np.float32), size
+
+
+def mismatch(seen: Pictures, known: Pictures) -> Float32:
+    """How badly each of A pictures fits each of N others, (A, N)."""
+    both = seen.outline @ known.outline.T
+    one = seen.outline.sum(1)[:, None] + known.outline.sum(1) - both
+    overlap = both / np.maximum(one, 1)
+
+    # The mean squared difference where both show, without its mean.
+    count = np.maximum(both, 1)
+    mean = (seen.depth @ known.outline.T - seen.outline @ known.depth.T) / count
+    squares = (seen.depth**2) @ known.outline.T + seen.outline @ (known.depth**2).T
+    squares = (squares - 2 * seen.depth @ known.depth.T) / count - mean**2
+
+    ratio = np.log(seen.size[:, None] / known.size)
+    size = np.minimum((ratio / SIZE_DEVIATION) ** 2 / 2, LARGEST_SIZE_COST)
+    costs = OUTLINE_WEIGHT * (1 - overlap) + DEPTH_WEIGHT * np.sqrt(squares.clip(0))
+    return costs + SIZE_WEIGHT * size.astype(np.float32)
