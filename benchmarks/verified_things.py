@@ -1,14 +1,15 @@
 """Taught things recognised by features alone and verified by their geometry, at true size.
 
     python benchmarks/verified_things.py SCANS [--models ycb] [--draws 0 1] [--every 3] [--resting]
-    [--clutter 5] [--known even] [--save FOLDER]
+    [--clutter 5] [--any-orientation] [--known even] [--save FOLDER]
 
 SCANS holds the scans of the things that the memory knows, in metres, by their names: they are what
 is looked at. Surfaces, weights and views are those of the memory. Each draw shows every thing once,
 with an azimuth, views and errors of the sensor of its own. The camera stands five object radii
 away, between 25 cm from the surface and 45 cm from the centre. Things stand as they were scanned,
 or with ``--resting`` in any pose that they can rest in; with ``--clutter`` so many boxes stand
-around each, which hide parts of it.
+around each, which hide parts of it. With ``--any-orientation`` they hang in the air, turned at
+random about all axes, and are recognised as such.
 
 Prints after 1, 2, 3 and 5 random views: the share that is named right by features and size, and
 with the geometry; the expected calibration error (ten bins) and the share that is wrong with a
@@ -38,6 +39,7 @@ import tyro
 from numpy.typing import NDArray
 from rich.progress import track
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import ResultsError, UsageError
@@ -47,7 +49,7 @@ from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import ViewSphere, rotation_z
 from nextview.simulation.scene import boxes_around
-from nextview.simulation.sensed_camera import SensedCamera
+from nextview.simulation.sensed_camera import TABLE, SensedCamera
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
@@ -89,12 +91,14 @@ class Setting:
         views: how many views are taken.
         resting: whether they rest in any pose that they can, and not only as they were scanned.
         clutter: how many boxes stand around a thing.
+        any_orientation: whether they hang in the air, turned at random about all axes.
     """
 
     sensor: str
     views: int
     resting: bool
     clutter: int
+    any_orientation: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,6 +276,8 @@ def shown(taught: Taught, things: TaughtThings, thing: int, draw: int, setting: 
     if setting.resting:
         poses = np.random.default_rng([thing, draw, 1])
         turn = turn @ poses.choice(taught.resting_poses(thing))
+    if setting.any_orientation:
+        turn = Rotation.random(rng=np.random.default_rng([thing, draw, 3])).as_matrix()
     standing = rotated(mesh, turn)
     around = None
     if setting.clutter:
@@ -279,7 +285,11 @@ def shown(taught: Taught, things: TaughtThings, thing: int, draw: int, setting: 
             standing.vertices, setting.clutter, np.random.default_rng([thing, draw, 2])
         )
     camera = SensedCamera(
-        standing, setting.sensor, np.random.default_rng([thing, draw, 7]), around=around
+        standing,
+        setting.sensor,
+        np.random.default_rng([thing, draw, 7]),
+        around=around,
+        table=0.0 if setting.any_orientation else TABLE,
     )
     observations = []
     cameras = []
@@ -465,6 +475,7 @@ def main(
     known: Literal["all", "even", "odd"] = "all",
     resting: bool = False,
     clutter: int = 0,
+    any_orientation: bool = False,
     save: Path | None = None,
 ) -> None:
     """Show the things, recognise them, and print the tables.
@@ -479,13 +490,16 @@ def main(
         known: which of the things are taught; all are shown.
         resting: show things in any pose that they can rest in.
         clutter: number of boxes around each thing.
+        any_orientation: show things in the air, turned at random about all axes.
         save: folder in which the draws that are done are kept, and looked for.
     """
     taught = Taught.load(models, scans)
-    setting = Setting(sensor, max(views), resting, clutter)
+    setting = Setting(sensor, max(views), resting, clutter, any_orientation)
     everything = np.arange(len(taught.names))
     some = {"all": everything, "even": everything[::2], "odd": everything[1::2]}[known]
     things = taught.things(some)
+    if any_orientation:
+        things = things.in_any_orientation()
 
     outcomes: list[list[Outcome]] = []
     for draw in draws:
