@@ -18,14 +18,14 @@ from test_household import bottle, mug
 
 import nextview
 from nextview.cli.main import main
-from nextview.errors import SessionError, UsageError
+from nextview.errors import ModelError, SessionError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh
 from nextview.geometry.ray_caster import RayCaster, pixel_rays
 from nextview.geometry.resting import rotated
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.recognition.belief import FixedLength
 from nextview.recognition.poses import PoseCandidate, uncertainty_of
-from nextview.sensing import Frame
+from nextview.sensing import Frame, ObservedObject
 from nextview.session.episode_figure import draw_episode, without_specks
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.teaching.learn import learn
@@ -226,6 +226,45 @@ def test_what_has_no_geometry_is_known_by_features_alone(known, meshes):
     assert result.pose is None
     assert "the geometry of mug is not known" in result.why_no_pose
     assert system.recognise(meshes["block"], seed=2).pose is not None
+
+
+@pytest.mark.parametrize("turned", [(0.4, 1.9, -0.6), (2.2, -0.5, 1.1)])
+def test_a_thing_in_a_gripper_is_named_and_placed(system, turned):
+    true = placed("mug", 0.0)
+    turn = Rotation.from_rotvec(turned).as_matrix()
+    true[:3, :3] = turn
+    true[:3, 3] = (0.4, -0.25, 0.5) - turn @ (THINGS["mug"]().bounds.mean(0) + ORIGIN)
+
+    held = ObservedObject(support=False)
+    session = session_of(system, 2, object=held, distance=0.5, any_orientation=True)
+    scan = THINGS["mug"]().apply_translation(ORIGIN).apply_transform(true)
+    for seed, (up, around) in enumerate([(35, 20), (40, 100)]):
+        camera = pose_at(up, around, 0.5, (0.4, -0.25, 0.5))
+        depth, _ = cast([scan, TABLE], camera)
+        # of the arm and the table nothing is in the mask
+        mask = cast([scan], camera)[0] > 0
+        noise = 0.001 * depth**2 * np.random.default_rng(seed).normal(size=depth.shape)
+        measured = np.where(depth > 0, depth + noise, 0).astype(np.float32)
+        session.update(Frame(measured, INTRINSICS, camera, mask=mask, pixel_centre=0.5))
+
+    assert session.result.answer == "mug"
+    degrees, millimetres = off_by(session.result.pose, true, "mug")
+    assert degrees < 2
+    assert millimetres < 2.5
+
+
+def test_any_orientation_from_the_command_line(known, metric_scans, capsys):
+    file = metric_scans / "block.ply"
+    options = ["--models", str(known), "--unit", "m", "--json", "--any-orientation"]
+    main(["recognise", str(file), *options])
+    said = json.loads(capsys.readouterr().out)
+    assert said["answer"] == "block"
+    assert said["pose"] is not None
+
+
+def test_networks_know_no_orientations():
+    with pytest.raises(ModelError, match="any orientation"):
+        nextview.load(threads=1).session(any_orientation=True)
 
 
 def test_what_no_scan_explains_is_unknown_with_a_p_value(known, meshes):

@@ -104,7 +104,8 @@ class System:
             clearance: metres between the camera and what the frames show; 0.1 by default, 0 for
                 any.
             any_orientation: it is a taught thing that may be held, lean or fly: it need not rest
-                as it was taught. A frame takes about twice as long.
+                as it was taught. A frame takes about twice as long. What hangs in the air is found
+                by a mask, or near a point, with ``ObservedObject(support=False)``.
 
         Raises:
             ModelError: things in any orientation are recognised by their geometry, and the models
