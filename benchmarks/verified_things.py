@@ -8,8 +8,8 @@ is looked at. Surfaces, weights and views are those of the memory. Each draw sho
 with an azimuth, views and errors of the sensor of its own. The camera stands five object radii
 away, between 25 cm from the surface and 45 cm from the centre. Things stand as they were scanned,
 or with ``--resting`` in any pose that they can rest in; with ``--clutter`` so many boxes stand
-around each, which hide parts of it. With ``--any-orientation`` they hang in the air, turned at
-random about all axes, and are recognised as such.
+around each, which hide parts of it. With ``--any-orientation`` they hang in the middle of a round
+room, turned at random about all axes, and are recognised as such.
 
 Prints after 1, 2, 3 and 5 random views: the share that is named right by features and size, and
 with the geometry; the expected calibration error (ten bins) and the share that is wrong with a
@@ -35,6 +35,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import trimesh
 import tyro
 from numpy.typing import NDArray
 from rich.progress import track
@@ -78,6 +79,8 @@ COLUMNS = (
     "resting pose",
     "ms of CPU: median, worst",
 )
+ROOM = 1.5  # metres from a thing that hangs in the air to the wall
+FARTHEST = 25.0  # object radii from a small one
 ORDERS = (1, 2, 3, 4, 5, 6, 7, 8)  # of symmetries about the vertical
 ROUND = 6  # order from which a thing looks the same from all azimuths: fruit is not exactly round
 
@@ -91,7 +94,7 @@ class Setting:
         views: how many views are taken.
         resting: whether they rest in any pose that they can, and not only as they were scanned.
         clutter: how many boxes stand around a thing.
-        any_orientation: whether they hang in the air, turned at random about all axes.
+        any_orientation: whether they hang in a room, turned at random about all axes.
     """
 
     sensor: str
@@ -284,6 +287,8 @@ def shown(taught: Taught, things: TaughtThings, thing: int, draw: int, setting: 
         around = boxes_around(
             standing.vertices, setting.clutter, np.random.default_rng([thing, draw, 2])
         )
+    if setting.any_orientation:
+        around = room_around(standing)
     camera = SensedCamera(
         standing,
         setting.sensor,
@@ -313,6 +318,13 @@ def shown(taught: Taught, things: TaughtThings, thing: int, draw: int, setting: 
     evidence = things.log_evidence(observations)
     seconds = (time.process_time() - begun) / len(observations)
     return Episode(thing, observations, evidence, to_object @ in_truth, in_cameras, seconds)
+
+
+def room_around(mesh: Mesh) -> Mesh:
+    """The wall of a round room in whose middle a thing hangs: something is behind it everywhere."""
+    assert mesh.metres is not None
+    wall = trimesh.creation.icosphere(3, min(ROOM / mesh.metres, FARTHEST))
+    return replace(mesh, vertices=wall.vertices, faces=wall.faces.astype(np.int32), name="room")
 
 
 def judged(
@@ -490,7 +502,7 @@ def main(
         known: which of the things are taught; all are shown.
         resting: show things in any pose that they can rest in.
         clutter: number of boxes around each thing.
-        any_orientation: show things in the air, turned at random about all axes.
+        any_orientation: show things that hang in a room, turned at random about all axes.
         save: folder in which the draws that are done are kept, and looked for.
     """
     taught = Taught.load(models, scans)

@@ -90,6 +90,8 @@ class Verified:
             float64.
         misfit: how badly each hypothesis explains each view, (M, V) float64; 0 for exactly.
         noise_share: see ``ViewLikelihood``, of each hypothesis in each view, (M, V) float64.
+        remembered: whether features said something. Outlines, which propose things in any
+            orientation, are judged by the geometry anyway.
     """
 
     belief: Float
@@ -105,6 +107,7 @@ class Verified:
     explained: Float
     misfit: Float
     noise_share: Float
+    remembered: bool
 
     def judged(self, truth: int) -> JudgedEpisode:
         """The same as an example of the thing of this number, to fit weights to."""
@@ -118,8 +121,11 @@ class Verified:
 
         Features that speak against it add a little.
         """
+        misfit = float(self.misfit[0].mean())
+        if not self.remembered:
+            return misfit
         against = -np.log(max(self.by_features[self.things[0]], LEAST_BY_FEATURES))
-        return float(self.misfit[0].mean() + AGAINST_FEATURES * against)
+        return float(misfit + AGAINST_FEATURES * against)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,12 +137,14 @@ class _Proposed:
         rotations: from the axes of the scan files to the object frame, (M, 3, 3) float64.
         log_belief: before the geometry is looked at, (M,) float64.
         by_features: belief in each thing before that, (T,) float64, sums to 1.
+        remembered: see ``Verified``.
     """
 
     resting: NDArray[np.int64]
     rotations: Float
     log_belief: Float
     by_features: Float
+    remembered: bool
 
     def select(self, rows: NDArray) -> "_Proposed":
         """Some of the hypotheses, by index."""
@@ -217,7 +225,7 @@ class Verifier:
         by_features = np.zeros(len(self.caster.surfaces))
         np.add.at(by_features, self.owners, joint.sum(1))
         by_features /= by_features.sum()
-        proposed = _Proposed(proposals.hypotheses, turns, proposals.log_belief, by_features)
+        proposed = _Proposed(proposals.hypotheses, turns, proposals.log_belief, by_features, True)
 
         images = _images(observations)
         level = levelling([image.ground for image in images if image.ground is not None])
@@ -255,6 +263,7 @@ class Verifier:
             rotations=np.concatenate([one.rotations for one in found]),
             log_belief=by_outline[things],
             by_features=belief / belief.sum(),
+            remembered=False,
         )
         prior = replace(self.prior, tilt=ANY_TILT)
         return self._settled(proposed, images, TILTED_STAGES, prior, np.eye(3))
@@ -325,6 +334,7 @@ class Verifier:
             explained=np.stack([view.explained[rows] for view in judged], 1),
             misfit=np.stack([view.misfit[rows] for view in judged], 1),
             noise_share=np.stack([view.noise_share[rows] for view in judged], 1),
+            remembered=proposed.remembered,
         )
 
 
