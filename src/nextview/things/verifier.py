@@ -36,6 +36,7 @@ Float = NDArray[np.float64]
 ANY_TILT = 0.3  # radians by which a thing in any orientation is off its proposal: hardly held
 TILTED_PROPOSALS = 120  # of things in any orientation, of all views together
 AGAINST_FEATURES = 0.1  # misfit for each unit of log-belief that features hold against a thing
+TINY = 1e-300  # belief that has a logarithm
 LEAST_BY_FEATURES = 0.01  # belief by features below which it does not matter
 
 
@@ -90,8 +91,8 @@ class Verified:
             float64.
         misfit: how badly each hypothesis explains each view, (M, V) float64; 0 for exactly.
         noise_share: see ``ViewLikelihood``, of each hypothesis in each view, (M, V) float64.
-        remembered: whether features said something. Outlines, which propose things in any
-            orientation, are judged by the geometry anyway.
+        against: what features hold against each thing, nats, (T,) float64; 0 for things in any
+            orientation, whose outlines are judged by the geometry anyway.
     """
 
     belief: Float
@@ -107,7 +108,7 @@ class Verified:
     explained: Float
     misfit: Float
     noise_share: Float
-    remembered: bool
+    against: Float
 
     def judged(self, truth: int) -> JudgedEpisode:
         """The same as an example of the thing of this number, to fit weights to."""
@@ -121,11 +122,8 @@ class Verified:
 
         Features that speak against it add a little.
         """
-        misfit = float(self.misfit[0].mean())
-        if not self.remembered:
-            return misfit
-        against = -np.log(max(self.by_features[self.things[0]], LEAST_BY_FEATURES))
-        return float(misfit + AGAINST_FEATURES * against)
+        against = min(self.against[self.things[0]], -np.log(LEAST_BY_FEATURES))
+        return float(self.misfit[0].mean() + AGAINST_FEATURES * against)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,14 +135,14 @@ class _Proposed:
         rotations: from the axes of the scan files to the object frame, (M, 3, 3) float64.
         log_belief: before the geometry is looked at, (M,) float64.
         by_features: belief in each thing before that, (T,) float64, sums to 1.
-        remembered: see ``Verified``.
+        against: see ``Verified``.
     """
 
     resting: NDArray[np.int64]
     rotations: Float
     log_belief: Float
     by_features: Float
-    remembered: bool
+    against: Float
 
     def select(self, rows: NDArray) -> "_Proposed":
         """Some of the hypotheses, by index."""
@@ -225,7 +223,13 @@ class Verifier:
         by_features = np.zeros(len(self.caster.surfaces))
         np.add.at(by_features, self.owners, joint.sum(1))
         by_features /= by_features.sum()
-        proposed = _Proposed(proposals.hypotheses, turns, proposals.log_belief, by_features, True)
+        proposed = _Proposed(
+            resting=proposals.hypotheses,
+            rotations=turns,
+            log_belief=proposals.log_belief,
+            by_features=by_features,
+            against=-np.log(by_features + TINY),
+        )
 
         images = _images(observations)
         level = levelling([image.ground for image in images if image.ground is not None])
@@ -263,7 +267,7 @@ class Verifier:
             rotations=np.concatenate([one.rotations for one in found]),
             log_belief=by_outline[things],
             by_features=belief / belief.sum(),
-            remembered=False,
+            against=np.zeros(len(belief)),
         )
         prior = replace(self.prior, tilt=ANY_TILT)
         return self._settled(proposed, images, TILTED_STAGES, prior, np.eye(3))
@@ -334,7 +338,7 @@ class Verifier:
             explained=np.stack([view.explained[rows] for view in judged], 1),
             misfit=np.stack([view.misfit[rows] for view in judged], 1),
             noise_share=np.stack([view.noise_share[rows] for view in judged], 1),
-            remembered=proposed.remembered,
+            against=proposed.against,
         )
 
 
