@@ -2,7 +2,9 @@
 door.
 """
 
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,11 +12,12 @@ from scipy.spatial import cKDTree
 
 import nextview
 from nextview.data.samples import sample_mesh
-from nextview.errors import ModelError, UsageError
+from nextview.errors import ModelError, SessionError, UsageError
 from nextview.policies.base import Evidence
 from nextview.recognition.own_recogniser import own_recogniser
 from nextview.recognition.poses import PoseCandidate
 from nextview.recognition.protocol import JointBelief
+from nextview.simulation.simulated import SimulatedCamera
 
 NAMES = ("chair", "monitor", "table")
 
@@ -95,6 +98,57 @@ def test_poses_of_ones_own_arrive_in_the_result():
     result = nextview.load(recogniser=Posed(), threads=1).recognise(sample_mesh("chair"), seed=1)
     np.testing.assert_array_equal(result.pose, pose)
     assert (result.pose_uncertainty.degrees, result.novelty) == (3.0, 0.5)
+
+
+@dataclass(frozen=True)
+class ForThePose:
+    """A policy with a goal: any free view."""
+
+    sphere: Any
+    goal: str = "thing"
+    needs: tuple = ()
+
+    def seeking(self, goal):
+        return replace(self, goal=goal)
+
+    def next_views(self, state, rng):
+        return state.free.argmax(1)
+
+
+def test_for_the_goal_pose_a_session_goes_on_until_the_pose_is_sure():
+    turned = np.diag([-1.0, -1.0, 1.0, 1.0])  # half a turn about the vertical
+
+    class Unsure(NearestPoints):
+        """Knows the thing at once, and its pose from the third view on."""
+
+        def belief(self, observations):
+            second = 0.4 if len(observations) < 3 else 0.01
+            poses = (
+                PoseCandidate(NAMES[0], 0, np.eye(4), 1 - second),
+                PoseCandidate(NAMES[0], 0, turned, second),
+            )
+            return JointBelief(
+                np.array([0.99, *[0.01 / (len(NAMES) - 1)] * (len(NAMES) - 1)]), poses
+            )
+
+    system = nextview.load(recogniser=Unsure(), threads=1)
+    system = replace(system, policy=ForThePose(system.sphere))
+    camera = SimulatedCamera(sample_mesh("chair"))
+    taken = {}
+    for goal in ("thing", "pose"):
+        session = system.session(start=20, goal=goal)
+        assert session.policy.goal == goal
+        taken[goal] = len(session.run(camera).views)
+    assert taken == {"thing": 1, "pose": 3}
+
+    session = system.session(start=20)
+    session.update(camera.observe(session.pose))
+    with pytest.raises(SessionError, match="before the first view"):
+        session.goal = "pose"
+    with pytest.raises(UsageError, match="the goal is thing or pose, not speed"):
+        system.session(goal="speed")
+    with pytest.raises(UsageError, match="looks for no pose; discriminate does"):
+        nextview.load(policy="spread").session(goal="pose")
 
 
 class Fails(Filled):

@@ -24,7 +24,7 @@ from nextview.geometry.ray_caster import RayCaster, pixel_rays
 from nextview.geometry.resting import rotated
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.recognition.belief import FixedLength
-from nextview.recognition.poses import PoseCandidate, uncertainty_of
+from nextview.recognition.poses import PoseCandidate, share_of_likeliest, uncertainty_of
 from nextview.sensing import Frame, ObservedObject
 from nextview.session.episode_figure import draw_episode, without_specks
 from nextview.simulation.simulated import SimulatedCamera
@@ -591,3 +591,16 @@ def test_what_is_of_another_order_of_size_is_unknown(known, scale):
     result = system.recognise(make_mesh(carton.vertices, carton.faces, unit="m"), start=10)
     assert result.unknown or not result.seen
     assert result.pose is None
+
+
+def test_a_pose_is_as_sure_as_those_that_look_the_same():
+    half = About((0, 0, 1), 2)
+    first, opposite = candidate(probability=0.5), candidate((0, 0, 180), probability=0.3)
+    beside = candidate((0, 0, 90), probability=0.2)
+    assert share_of_likeliest([first, opposite, beside]) == pytest.approx(0.5)
+    known = [replace(each, symmetry=(half,)) for each in (first, opposite, beside)]
+    assert share_of_likeliest(known) == pytest.approx(0.8)
+    moved = candidate(at=(0.02, 0, 0), probability=0.5)
+    assert share_of_likeliest([first, moved]) == pytest.approx(0.5)
+    other = replace(beside, thing="another")
+    assert share_of_likeliest([first, other]) == 1

@@ -128,6 +128,14 @@ class ValuesViews(Protocol):
 
 
 @runtime_checkable
+class SeeksPose(Protocol):
+    """A policy that can look for the pose of a thing, and not only for which thing it is."""
+
+    def seeking(self, goal: Literal["thing", "pose"]) -> Policy:
+        """The same policy with this goal."""
+
+
+@runtime_checkable
 class ScoresViews(Protocol):
     """A policy on a grid that maximises the score less weighted travel; see ``off_grid``."""
 

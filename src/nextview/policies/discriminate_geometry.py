@@ -1,6 +1,6 @@
 """The policy that tells things of known geometry apart: it looks where a view tells most."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,10 @@ class DiscriminateGeometry:
 
     def __post_init__(self) -> None:
         check_weight(self.travel_weight)
+
+    def seeking(self, goal: Goal) -> "DiscriminateGeometry":
+        """The same policy for the thing, or for the thing and its pose."""
+        return replace(self, goal=goal)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
         """Choose the free view with the highest value; ties are drawn.

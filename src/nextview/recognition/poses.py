@@ -158,6 +158,27 @@ def uncertainty_of(candidates: Sequence[PoseCandidate], camera: float = 0.0) -> 
     return PoseUncertainty(float(degrees), float(millimetres))
 
 
+def share_of_likeliest(candidates: Sequence[PoseCandidate]) -> float:
+    """How sure the first of some poses is, given that it is the right thing.
+
+    Args:
+        candidates: of one or several things, the likeliest first.
+
+    Returns:
+        Probability of the poses of its thing that look the same as it, by a symmetry too, as a
+        share of that of all poses of its thing.
+    """
+    first = candidates[0]
+    own = [candidate for candidate in candidates if candidate.thing == first.thing]
+    same = [
+        candidate.probability
+        for candidate in own
+        if _turn_apart(first, candidate) < ALIKE_TURN
+        and float(np.linalg.norm(candidate.place - first.place)) < ALIKE_SHIFT
+    ]
+    return sum(same) / sum(candidate.probability for candidate in own)
+
+
 def _turn_apart(first: PoseCandidate, second: PoseCandidate) -> float:
     """Angle between two poses of one thing, degrees, but for its symmetries."""
     symmetries = first.symmetry or ()

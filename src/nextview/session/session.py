@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 from threading import RLock
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,12 +17,13 @@ from nextview.checks import number, one_line, plugin_errors, whole
 from nextview.errors import NoViewLeftError, ObservationError, PolicyError, SessionError, UsageError
 from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.viewsphere import Viewpoints, angle_between, azimuth_of, direction_of
-from nextview.policies.base import EpisodeState, Policy, ValuesViews
+from nextview.policies.base import EpisodeState, Policy, SeeksPose, ValuesViews
 from nextview.policies.off_grid import anywhere
 from nextview.recognition.belief import MUCH, Stopping, log_evidence_of
 from nextview.recognition.inference import Models, NetworkRecogniser
 from nextview.recognition.map_names import maps_among
 from nextview.recognition.novelty import Novelty, ViewScore, values_of
+from nextview.recognition.poses import share_of_likeliest
 from nextview.recognition.protocol import JudgesTogether, LooksAhead
 from nextview.sensing.frame import Frame
 from nextview.sensing.plausibility import ViewWarning, check_observation, check_views
@@ -155,6 +156,7 @@ class Session:
         self.stopping = stopping or Stopping.of(models.recogniser.calibration)
         self.unknown = unknown
         self.views: list[View] = []
+        self._goal: Goal = "thing"
         self.observers: list[Callable[[Session], None]] = []
         """Called, in order, after each view that was taken in, and when another next view was
         chosen.
@@ -323,6 +325,46 @@ class Session:
                     raise
 
     # What the robot can do
+
+    @property
+    def goal(self) -> Goal:
+        """What is to be found out: which "thing" it is, or its "pose" too.
+
+        For the pose, views are valued by what they tell of thing and pose, and the session goes on
+        until the likeliest pose is as sure as the thing has to be: turns of a symmetry make no
+        difference. Where no pose can be known it ends as for the thing. Set it before the first
+        view. ``UsageError``: the policy looks for no pose.
+        """
+        return self._goal
+
+    @goal.setter
+    def goal(self, given: Goal) -> None:
+        if given not in get_args(Goal):
+            raise UsageError(
+                f"the goal is {' or '.join(get_args(Goal))}, not {one_line(str(given))}"
+            )
+        with self._lock:
+            if given == self._goal:
+                return
+            if self.views:
+                raise SessionError("the goal is set before the first view")
+            if not isinstance(self.policy, SeeksPose):
+                raise UsageError(
+                    "this policy looks for no pose; discriminate does, for taught things of known"
+                    " geometry"
+                )
+            self.policy = self.policy.seeking(given)
+            self._goal = given
+            self._chooser = anywhere(self.policy, self.sphere)
+            self._episodes = self._begin(self.view)
+
+    def _pose_in_doubt(self, step: Step) -> bool:
+        """Whether the pose is wanted, and not as sure yet as the thing has to be."""
+        joint = step.joint[0] if len(step.joint) else None
+        if self._goal == "thing" or joint is None or not joint.poses:
+            return False
+        threshold = float(self.stopping.threshold_at(int(step.seen[0])))
+        return share_of_likeliest(joint.poses) < threshold
 
     @property
     def reachable(self) -> Reachable | None:
@@ -644,7 +686,11 @@ class Session:
             evidence[last],
             directions[last][None],
             lambda state: self._constrained(state, reach, object, here),
-            hold=lambda step: doubtful or self._suspicious([*episodes.steps, step], observations),
+            hold=lambda step: (
+                doubtful
+                or self._suspicious([*episodes.steps, step], observations)
+                or self._pose_in_doubt(step)
+            ),
         )
         steps = [*episodes.steps, taken.step]
         travel = self._travelled([int(step.views[0]) for step in steps], directions)

@@ -32,6 +32,7 @@ from nextview.recognition.protocol import KnowsAnyOrientation, Recogniser, tells
 from nextview.session.limits import Limits
 from nextview.session.result import Recognition
 from nextview.session.session import FrameCamera, Session
+from nextview.things.expected_views import Goal
 from nextview.things.recogniser import open_recogniser
 from nextview.things.several import SeveralRecognisers
 
@@ -82,6 +83,7 @@ class System:
         max_height: float | None = None,
         clearance: float | None = None,
         any_orientation: bool = False,
+        goal: Goal = "thing",
     ) -> Session:
         """One object under way, for whoever moves the camera. Those for a robot need no more than a
         distance.
@@ -106,6 +108,8 @@ class System:
             any_orientation: it is a taught thing that may be held, lean or fly: it need not rest
                 as it was taught. A frame takes about twice as long. What hangs in the air is found
                 by a mask, or near a point, with ``ObservedObject(support=False)``.
+            goal: "thing" looks until it is sure which thing it is; "pose" until its pose is as
+                sure, too, see ``Session.goal``.
 
         Raises:
             ModelError: things in any orientation are recognised by their geometry, and the models
@@ -118,6 +122,7 @@ class System:
         models = _in_any_orientation(self.models) if any_orientation else self.models
         session = Session(models, self.policy, self.sphere, start, *options)
         session.limits = Limits(min_height, max_height, clearance)
+        session.goal = goal
         return session
 
     def session_with(
