@@ -1,0 +1,64 @@
+"""The version stands in step everywhere, and what the workflows run is there."""
+
+import os
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import nextview
+
+ROOT = Path(__file__).parents[1]
+WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))
+
+
+def top_of_changelog() -> tuple[str, str]:
+    """The version of the newest section, and what stands in brackets behind it."""
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    found = re.search(r"^## (\S+) \(([^)]+)\)$", text, re.M)
+    assert found, "the newest section is called '## VERSION (DATE or unreleased)'"
+    return found[1], found[2]
+
+
+def test_version_citation_and_changelog_are_in_step():
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    cited = re.search(r"^version: (\S+)$", citation, re.M)
+    research = tomllib.loads((ROOT / "research/pyproject.toml").read_text())
+    assert cited
+    assert cited[1] == nextview.__version__
+    assert research["project"]["version"] == nextview.__version__
+    assert top_of_changelog()[0] == nextview.__version__
+
+
+@pytest.mark.skipif("NEXTVIEW_RELEASE" not in os.environ, reason="no release is made")
+def test_a_release_has_the_tag_of_its_version_and_a_date():
+    version, when = top_of_changelog()
+    assert os.environ["NEXTVIEW_RELEASE"] == f"v{version}"
+    assert re.fullmatch(r"\d{4}-\d{2}-\d{2}", when), "date the section before a release"
+
+
+@pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.name)
+def test_what_a_workflow_runs_is_there(workflow):
+    """Make's targets, files of the repository and extras that a workflow names."""
+    text = workflow.read_text(encoding="utf-8")
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for target in re.findall(r"\bmake ([\w./-]+)", text):
+        assert re.search(rf"^{re.escape(target)}:", makefile, re.M), target
+    for path in re.findall(r"(?<![\w./])(?:tests|workflow|samples|docs|\.ci)/[\w./-]+\w", text):
+        assert (ROOT / path).exists(), path
+    for folder, names in re.findall(r"(\.|\./research)\[([\w,-]+)\]", text):
+        project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text())
+        extras = project["project"]["optional-dependencies"]
+        assert set(names.split(",")) <= set(extras), names
+
+
+def test_ci_tries_every_python_that_is_promised():
+    promised = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"]
+    ci = (ROOT / ".github/workflows/ci.yml").read_text(encoding="utf-8")
+    pythons = re.search(r"python: \[(.*?)\]", ci)
+    assert pythons
+    tried = re.findall(r"\d+\.\d+", pythons[1])
+    assert f">={tried[0]}" == promised
+    assert len(tried) >= 4
+    assert all(system in ci for system in ("ubuntu", "macos", "windows"))
