@@ -50,6 +50,7 @@ exact a twentieth of the shifts is larger than twice that.
 """
 MENDED = 3.0  # standard deviations that noise does not explain, from which a shift is allowed for
 LEAST_MENDED = 0.006  # parts of the distance from the camera: smaller shifts are left as they are
+NOT_WORTH = 0.3  # parts of the least shift that is mended
 NOTICED = 2.5  # standard deviations that noise and depth errors do not explain
 
 
@@ -252,6 +253,11 @@ def _searched(latest: _Surface, earlier: Sequence[_Surface], start: Float) -> _F
         information = (directions.T * weight) @ directions + np.eye(3) / expected**2
         pull = (directions.T * weight) @ distances - (moved + start) / expected**2
         moved = moved + np.linalg.solve(information, pull)
+        if (
+            part == FURTHER[1]
+            and np.linalg.norm(moved) < NOT_WORTH * LEAST_MENDED * latest.distance
+        ):
+            break  # two steps lead nowhere: further ones would find no shift that is mended
         cost = float(np.log1p((distances / deviations) ** 2).mean())
     shift = -moved
     if np.linalg.norm(shift - start) > FARTHEST_SHIFT * expected:

@@ -551,7 +551,7 @@ class ObservedObject:
                     part = within(mask)
                     above[part] &= segmentation.above_plane(frame, plane, noise, part)
                 # a plane may lie above what is hidden or flat
-                mask = above if 2 * above.sum() > mask.sum() else mask
+                mask = above if 2 * np.count_nonzero(above) > np.count_nonzero(mask) else mask
         elif self.known is not None:
             if self.box is not None:
                 mask = segmentation.inside_box(frame, self.box)
@@ -561,7 +561,7 @@ class ObservedObject:
                 )
             if plane is not None:
                 mask &= segmentation.above_plane(frame, plane, noise)
-            if mask.sum() < FEWEST:
+            if np.count_nonzero(mask) < FEWEST:
                 raise ObservationError(
                     "nothing is seen where the object should be: a wrong pose, or a wrong box?"
                 )
@@ -612,7 +612,7 @@ class ObservedObject:
         mask = foot.pixels_of(chosen)
         if (labels[-1][~chosen] > 0).any():  # cells at the border may hold pixels of a neighbour
             mask = trimmed(frame.depth, mask, noise, height > STANDS * frame.depth)
-        if target == 0 or mask.sum() < FEWEST:
+        if target == 0 or np.count_nonzero(mask) < FEWEST:
             where = "of the object known so far" if earlier else "on the support plane"
             raise ObservationError(
                 f"this frame shows nothing {where}: check its pose, or aim the camera at the object"
@@ -725,7 +725,7 @@ class ObservedObject:
         Raises:
             ObservationError: too little is seen of the object.
         """
-        if mask.sum() < FEWEST:
+        if np.count_nonzero(mask) < FEWEST:
             raise ObservationError(TOO_LITTLE)
         part = within(mask, 2)
         corner = (part[0].start, part[1].start)
@@ -747,7 +747,7 @@ class ObservedObject:
     def _estimate(self, sightings: Sequence[Sighting], axes: Float) -> ObjectFrame:
         if self.known is not None:
             return self.known
-        shown = np.array([s.mask.sum() for s in sightings])
+        shown = np.array([np.count_nonzero(s.mask) for s in sightings])
         points = np.concatenate(
             [s.hull for s, n in zip(sightings, shown, strict=True) if n >= PART * shown.max()]
         )

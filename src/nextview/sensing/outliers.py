@@ -70,7 +70,7 @@ def _within_its_depths(points: Float, error: Float) -> Mask:
     if not len(points):
         return np.zeros(0, bool)
     depth = points[:, 2]
-    size = float(np.ptp(points[:, :2], axis=0).max())
+    size = float(max(np.ptp(points[:, 0]), np.ptp(points[:, 1])))
     share = min(MOST_TRIMMED, TRIMMED_BY_NOISE * float(np.median(error)) / max(size, 1e-9))
     nearest, farthest = np.quantile(depth, [share, 1 - share])
     return np.asarray((depth >= nearest) & (depth <= farthest))

@@ -101,8 +101,16 @@ def _block_sums(values: NDArray[np.floating], side: int) -> Float:
     left out.
     """
     height, width = (n // side for n in values.shape)
-    rows = values[: height * side].reshape(height, side, -1).sum(1)
-    return np.asarray(rows[:, : width * side].reshape(height, width, side).sum(2), np.float64)
+    of_rows = _sums_along(values[: height * side], side)
+    return np.asarray(_sums_along(of_rows[:, : width * side].T, side).T, np.float64)
+
+
+def _sums_along(values: NDArray[np.floating], side: int) -> NDArray[np.floating]:
+    """Sums of each ``side`` rows that follow each other: faster than a reduction over an axis."""
+    sums = values[::side].copy()
+    for first in range(1, side):
+        sums += values[first::side]
+    return sums
 
 
 @dataclass(frozen=True)
