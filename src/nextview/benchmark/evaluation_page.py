@@ -25,12 +25,12 @@ class EvaluationSettings:
     """What is judged.
 
     Attributes:
-        split: take only the objects of this one; needed where the predictions hold several.
-        deduplicate: of objects with the same label that look the same from every view, copies of
-            one mesh, judge only the first; the published numbers count them all.
-        cards: of the models that made the predictions; their scores are noted on these.
-        samples: of the bootstrap.
-        seed: decides the bootstrap and the orders of views.
+        split: use only objects of this split; needed if the predictions contain several.
+        deduplicate: of copies of a mesh under one label, evaluate only the first; the published
+            numbers count all.
+        cards: cards of the models that made the predictions; their scores are written into them.
+        samples: number of bootstrap samples.
+        seed: seed of the bootstrap and of the orders of views.
     """
 
     split: Literal["train", "test", "val"] | None = None
@@ -51,11 +51,10 @@ def write_evaluation(
     """Evaluate recogniser and maps on every view, beside the published scores.
 
     Args:
-        predictions: made by nextview predict.
+        predictions: predictions of nextview predict.
         out: folder for tables (.csv), settings and evaluate.html.
-        figures: write every figure of the page as PDF and SVG too, and the tables as CSV and LaTeX,
-            into this folder.
-        overwrite: replace the files of an earlier evaluation.
+        figures: folder for all figures as PDF and SVG, and all tables as CSV and LaTeX.
+        overwrite: replace an earlier evaluation.
 
     Raises:
         UsageError: the predictions hold several splits, and none is chosen.

@@ -48,13 +48,12 @@ def report(
     """Write one self-contained HTML page: tables, curves, and the worst failures.
 
     Args:
-        results: folder made by nextview benchmark.
-        out: the page; RESULTS/report.html by default.
-        store: take the pictures of the objects from this view store; by default from that of the
-            predictions, if it still is where it was.
-        figures: write every figure of it as PDF and SVG too, and its tables as CSV and LaTeX, into
-            this folder.
-        overwrite: replace an earlier page, and earlier figures.
+        results: folder of nextview benchmark.
+        out: page to write; by default RESULTS/report.html.
+        store: view store of the objects' pictures; by default that of the predictions, if it is
+            still in its place.
+        figures: folder for all figures as PDF and SVG, and all tables as CSV and LaTeX.
+        overwrite: replace an earlier page and earlier figures.
 
     Raises:
         ResultsError: there are no results, or fixed views only; or the page cannot be written.

@@ -33,22 +33,22 @@ class BenchmarkSettings:
     """What is run.
 
     Attributes:
-        policies: names, or MODULE:CLASS for your own; all that the predictions allow by default.
-        models: a folder with models of your own: the policies learned for them take part, by name.
-        thresholds: of the belief.
-        risks: error rates; the thresholds that promise them, by the recogniser's calibration, are
-            run too. With them thresholds stay; else they come down with the views, by the
-            recogniser's correlation.
-        views: compare the policies after these fixed numbers of views too (1 2 3 5).
-        stopping: MODULE:NAME of a stopping rule of your own, asked with each threshold.
-        uncalibrated: believe the plain sum of the logits, as published, whatever the recogniser's
-            card says.
-        split: take only the objects of this one; needed where the predictions hold several.
+        policies: names of policies, or MODULE:CLASS for your own; by default all that the
+            predictions allow.
+        models: folder of your own models, whose learned policies take part by name.
+        thresholds: thresholds of the belief.
+        risks: error rates; the thresholds that guarantee them by the recogniser's calibration are
+            run too. With risks, thresholds are constant; otherwise they decrease with the views.
+        views: numbers of views after which the policies are compared too, such as 1 2 3 5.
+        stopping: stopping rule of your own, MODULE:NAME, called with each threshold.
+        uncalibrated: use the plain sum of the logits, as published, instead of the calibration on
+            the card.
+        split: use only objects of this split; needed if the predictions contain several.
         runs: random first views of each object.
-        max_views: views at most.
-        reference: the policy that the others are compared with.
-        samples: of the bootstrap.
-        seed: decides first views, random policies and the bootstrap.
+        max_views: largest number of views.
+        reference: policy that the others are compared with.
+        samples: number of bootstrap samples.
+        seed: seed of first views, random policies and the bootstrap.
     """
 
     policies: tuple[str, ...] = ()
@@ -105,9 +105,9 @@ def run_benchmark(
     failed stands in the settings of the results.
 
     Args:
-        predictions: made by nextview predict.
+        predictions: predictions of nextview predict.
         out: folder for the results.
-        overwrite: replace the files of earlier results.
+        overwrite: replace earlier results.
 
     Raises:
         UsageError, RiskError, EntryError: settings make no sense, nothing promises a risk, or no

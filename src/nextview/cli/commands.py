@@ -32,32 +32,30 @@ EXPORTED = (
 )
 COMMANDS = {  # by name, in the order in which they are listed
     "recognise": Command(
-        f"{CLI}.recognise:recognise", "say what an object is: a mesh file, or captured views"
+        f"{CLI}.recognise:recognise", "recognise the object of a mesh or of captured frames"
     ),
     "demo": Command(f"{CLI}.recognise:demo", "recognise a sample object, and draw the episode"),
     "learn": Command(
         f"{TEACHING}.learn:learn_things",
-        "teach it your things: scans, or depth frames; minutes",
+        "teach it your objects from scans or depth frames",
         "{found}\nnext: nextview recognise MESH --models {out}; what was learned is drawn in"
         " {out}/learned.png",
     ),
     "explore": Command(
-        f"{CLI}.explore:explore", "choose views in the browser, and see what is believed"
+        f"{CLI}.explore:explore", "choose views in the browser, and watch the belief"
     ),
     "capture": Command(
-        f"{CLI}.scenes:capture", "write depth images of a mesh, as a camera would take them"
+        f"{CLI}.scenes:capture", "write depth images of a mesh, in the layout of BOP"
     ),
     "completion": Command(
-        f"{CLI}.completion:completion", "print what a shell completes: bash, zsh or fish"
+        f"{CLI}.completion:completion", "print completions for bash, zsh or fish"
     ),
     "list": Command(f"{CLI}.listing:show", "list the bundled models, or the view measures"),
     "download": Command(f"{CLI}.listing:download", "download ModelNet10 or ModelNet40"),
-    "scenes": Command(
-        f"{CLI}.scenes:scenes", "draw cluttered scenes, a target half hidden in each"
-    ),
+    "scenes": Command(f"{CLI}.scenes:scenes", "draw cluttered scenes, or rooms"),
     "render": Command(f"{CLI}.stores:render", "render every view of a dataset into a view store"),
-    "check": Command(f"{CLI}.stores:check", "check that a view store is sound"),
-    "measure": Command(f"{CLI}.stores:measure", "compute view measures, into the store"),
+    "check": Command(f"{CLI}.stores:check", "check a view store for damage"),
+    "measure": Command(f"{CLI}.stores:measure", "compute measures of the views in a store"),
     "train recogniser": Command(
         f"{TRAINING}.recogniser_training:train_recogniser",
         "train a recogniser",
@@ -79,9 +77,9 @@ COMMANDS = {  # by name, in the order in which they are listed
         " the networks' by {found.difference:.1g} at most",
     ),
     "export recogniser": Command(
-        f"{EXPORT}_recogniser", "turn a trained recogniser into a model", EXPORTED
+        f"{EXPORT}_recogniser", "export a trained recogniser as a model", EXPORTED
     ),
-    "export map": Command(f"{EXPORT}_map", "turn a trained map network into a model", EXPORTED),
+    "export map": Command(f"{EXPORT}_map", "export a trained map network as a model", EXPORTED),
     "predict": Command(f"{CLI}.predict:predict", "run the models over every view of a store, once"),
     "fit calibration": Command(
         f"{TRAINING}.card_fits:fit_calibration",
@@ -92,37 +90,37 @@ COMMANDS = {  # by name, in the order in which they are listed
     ),
     "fit size": Command(
         f"{TRAINING}.card_fits:fit_size",
-        "learn how large the objects of each class are",
+        "fit the sizes of the objects of each class",
         "sizes of {found.objects} objects; by {found.weighed_on} others, weight beside the logits"
         " {found.size.weight:.2f}; negative log-likelihood of single views {found.before:.3f} by"
         " shape alone, {found.after:.3f} with the size",
     ),
     "fit unknown": Command(
         f"{TRAINING}.unknown:fit_unknown",
-        "learn to notice objects of no known class",
+        "fit the detection of objects of unknown classes",
         "views of {found.objects} known objects; false-alarm rates by {found.held_out} others; "
         "meshes left out: {found.left_out}",
     ),
     "fit valleys": Command(
         f"{TRAINING}.card_fits:fit_valleys",
-        "find classes whose best views are a map's valleys",
+        "find classes for which a map's valley is better",
         "{found.objects} objects: the valley is better for these classes: {found.classes}",
     ),
     "evaluate": Command(
         "nextview.benchmark.evaluation_page:write_evaluation",
-        "judge a recogniser and its maps on every view",
+        "evaluate a recogniser and its maps on every view",
         "tables and evaluate.html are in {out}",
         f"{CLI}.leaderboard_table:print_evaluation",
     ),
     "benchmark": Command(
         "nextview.benchmark.run:run_benchmark",
-        "compare policies",
+        "compare next-view policies",
         "next: nextview report {out}",
         f"{CLI}.leaderboard_table:print_results",
     ),
     "benchmark-things": Command(
         "nextview.benchmark.thing_benchmark:benchmark_things",
-        "compare where to look next at taught things",
+        "compare next-view policies on taught things",
         "tables and figures are in {out}; one more policy: the same command with --policies",
         f"{CLI}.things_table:print_things",
     ),

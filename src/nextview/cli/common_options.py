@@ -21,27 +21,26 @@ PICTURES = (".png", ".pdf", ".svg")
 
 @dataclass(frozen=True)
 class EpisodeOptions:
-    """Who looks, and when it ends.
+    """Models, policy, and when the episode ends.
 
     Attributes:
-        models: bundled models by name, or a folder with models of your own.
-        policy: chooses the next view: gain (the predicted gain of a view less its weighted travel;
-            the default), MAP, MAP-peak or MAP-sphere-peak for a map of the models (lem, lcm),
-            discriminate (the default of taught things), random, random-all, furthest,
-            unidirectional, spread, spread-local, the card of a learned one (.json), or
-            MODULE:CLASS.
-        threshold: stop when the belief in one class reaches this after one view, less after
-            several.
-        risk: instead, stop at the lowest threshold at which at most this share of those who stop
-            early is wrong.
-        max_views: stop after so many views.
-        stopping: MODULE:NAME of a stopping rule of your own, docs/add_a_policy.md.
-        recogniser: MODULE:NAME of a recogniser of your own, docs/add_a_recogniser.md.
-        viewpoints: where the camera may look from: 40 or 12 views, rings:0,30,60x12 (elevations in
-            degrees by views on each ring), or fibonacci:60 (spread evenly over the upper half).
-        unknown: say "none of these" of an object that is as novel as at most this share of the
-            objects of known classes (0.02, the default: one in 50 of these is called unknown), or
-            of a size that the class never has; 0 always names a class.
+        models: name of bundled models (modelnet10, ycb), or folder of your own models.
+        policy: policy that chooses the next view: gain (predicted gain less weighted travel; the
+            default), discriminate (the default for taught things), MAP, MAP-peak or MAP-sphere-peak
+            for a map of the models (lem, lcm), random, random-all, furthest, unidirectional,
+            spread, spread-local, a card of a learned policy (.json), or MODULE:CLASS.
+        threshold: stop when the belief in one class reaches this value after one view; it decreases
+            with every view.
+        risk: instead of a threshold, the largest share of wrong answers among the episodes that
+            stop early.
+        max_views: largest number of views.
+        stopping: stopping rule of your own, MODULE:NAME (docs/add_a_policy.md).
+        recogniser: recogniser of your own, MODULE:NAME (docs/add_a_recogniser.md).
+        viewpoints: candidate viewpoints: 40 or 12 views, rings:0,30,60x12 (elevations in degrees,
+            views on each ring), or fibonacci:60 (spread evenly over the upper hemisphere).
+        unknown: p-value below which an object is called unknown; by default 0.02, so one known
+            object in 50 is. Objects of a size that the class never has are unknown too. 0 always
+            names a class.
     """
 
     models: str = "modelnet10"
@@ -57,31 +56,31 @@ class EpisodeOptions:
 
 @dataclass(frozen=True)
 class ObjectOptions:
-    """What is looked at.
+    """The object and the camera.
 
     Attributes:
-        up: a mesh file's up axis; z if not given, but y for GLB. Of a folder, also a direction in
-            its world; z if not given, but the normal of the support plane for 7-Scenes.
-        unit: a mesh file's unit of length: the size of an object says something of its class.
-        sensor: look at a mesh through a sensor with all its errors: kinect, stereo, setup, wrist or
-            none, or NAME:STRENGTH (docs/your_camera.md); clean renders if not given.
-        max_faces: refuse a mesh of more triangles, or a file of more than 60 bytes for each of
+        up: up axis of a mesh file; by default z, and y for GLB. For captured frames also a
+            direction in their world; by default z, and the normal of the support plane for
+            7-Scenes.
+        unit: unit of length of a mesh file; with it, size counts as evidence.
+        sensor: simulated depth camera: kinect, stereo, setup, wrist or none, or NAME:STRENGTH
+            (docs/your_camera.md); clean renders by default.
+        max_faces: largest number of triangles of a mesh; its file may have 60 bytes for each of
             these.
-        largest_part: of a mesh file, leave out all that is not connected to its largest part, such
-            as a plate or loose pieces of a scan.
-        point: of a folder: near the object that is meant, metres, in the capture's world.
-        box: of a folder: the upright box into which the object just fits, its low and its high
+        largest_part: keep only the largest connected part of a mesh, without tables or loose
+            pieces.
+        point: for captured frames: a point near the object, metres, in the world of the frames.
+        box: for captured frames: upright box that just contains the object: its low and its high
             corner, metres (heights along --up), or a JSON file with low, high and axes.
-        object_id: of a BOP folder with several objects: the one that is meant.
-        intrinsics: of a folder: FX FY CX CY, pixels, or a file with them: the pinhole matrix, or
-            what ROS, librealsense or Open3D wrote (JSON or YAML).
-        depth_scale: of a folder: metres that one step of the depth images stands for, if not as its
-            files say; 0.001 for millimetres.
-        depth_topic: of a ROS 2 bag with several topics of depth images.
-        world_frame: of a ROS 2 bag: the frame of tf that is the world, z up; the root of the tree
-            if not given.
-        raw: of a folder: take the depth as it is, without denoising.
-        by_shape: of a folder: the object's size says nothing of its class, as with toys.
+        object_id: for BOP folders with several objects: the number of the object.
+        intrinsics: for captured frames: FX FY CX CY, pixels, or a file with the pinhole matrix, or
+            a file of ROS, librealsense or Open3D (JSON or YAML).
+        depth_scale: for captured frames: metres per step of the depth images, such as 0.001 for
+            millimetres; by default as their files say.
+        depth_topic: for ROS 2 bags with several topics of depth images: the topic.
+        world_frame: for ROS 2 bags: tf frame of the world, z up; by default the root of the tree.
+        raw: for captured frames: use the depth without denoising.
+        by_shape: for captured frames: ignore the size of the object, as for toys and models.
     """
 
     up: Literal["y", "z"] | Three | None = None

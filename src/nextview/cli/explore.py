@@ -31,20 +31,18 @@ def explore(
     errors.
 
     Args:
-        path: a mesh file; a folder of meshes, or of class folders of them; a view store. The sample
-            objects if not given.
+        path: mesh file, folder of meshes or of class folders, or view store; by default the sample
+            objects.
         looking: who looks; exploring goes on where an episode would end.
-        compare: another policy, to walk beside it.
-        sensor: look through a sensor with all its errors: kinect, stereo, setup, wrist or none, or
-            NAME:STRENGTH.
-        start: where policies look first; drawn by the seed if not given.
-        up: the up axis of mesh files; z if not given, but y for GLB.
-        unit: the unit of length of mesh files: the size of an object says something of its class.
-        seed: decides the first view, whatever a policy draws and the errors of a sensor.
-        host: address to serve the page at; 0.0.0.0 lets every machine that reaches this one see and
-            drive the page.
-        port: of the page; the next free one if it is taken.
-        browser: by default the page opens in this machine's browser, where it has a screen.
+        compare: second policy, which walks beside the first.
+        sensor: simulated depth camera: kinect, stereo, setup, wrist or none, or NAME:STRENGTH.
+        start: index of the first view; by default random.
+        up: up axis of the mesh files; by default z, and y for GLB.
+        unit: unit of length of the mesh files; with it, size counts as evidence.
+        seed: seed of the first view, the policies and the sensor errors.
+        host: address to serve the page at; 0.0.0.0 opens it to every machine that reaches this one.
+        port: port of the page; the next free one if it is taken.
+        browser: do not open the page in a browser.
     """
     with extras():
         import viser  # noqa: F401  # a missing extra is named before models are opened

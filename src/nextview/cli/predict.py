@@ -31,17 +31,17 @@ def predict(
 
     Args:
         store: view store made by nextview render.
-        out: predictions to make (.npz), from which nextview benchmark replays policies.
-        split: only this split.
-        models: bundled models by name, or a folder with models of your own.
-        recogniser: instead, name of a bundled model or path of a card.
-        held_out: only the objects that this model (its name or card) held out of its training.
-        maps: maps to predict with those models, or NAME=CARD for others; all that those models
-            predict by default.
-        by_shape: recognise by shape alone. By default the size of the objects counts too, where the
-            store knows it (nextview render --unit) and the card of the recogniser says what sizes
-            mean (nextview fit size).
-        overwrite: replace the predictions that are there.
+        out: predictions to write (.npz), from which nextview benchmark replays policies.
+        split: predict only this split.
+        models: name of bundled models, or folder of your own models.
+        recogniser: recogniser to use instead: name of a bundled model, or path of a card.
+        held_out: predict only objects that this model (name or card) held out of its training.
+        maps: maps to predict with these models, or NAME=CARD for others; by default all that the
+            models predict.
+        by_shape: ignore the size of the objects. By default it counts if the store knows it
+            (nextview render --unit) and the card of the recogniser has size evidence (nextview fit
+            size).
+        overwrite: replace existing predictions.
     """
     if out.suffix != ".npz":
         raise UsageError(f"{out}: predictions are one .npz file; end the name in .npz")

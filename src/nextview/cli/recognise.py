@@ -18,11 +18,11 @@ DEMO_PICTURE = Path("nextview_demo.png")
 
 @dataclass(frozen=True)
 class Output:
-    """What is made of it.
+    """Files and output.
 
     Attributes:
         figure: write a picture of the episode to this file (PNG, PDF or SVG).
-        record: write the episode to this file (.rrd), for the Rerun viewer.
+        record: write a recording of the episode for the Rerun viewer to this file (.rrd).
         json: print JSON instead of a table.
         overwrite: replace these files if they exist.
     """
@@ -44,23 +44,22 @@ def recognise(
     seed: int = 0,
     any_orientation: bool = False,
 ) -> None:
-    """Recognise an object by next best views, and show where it looked and why.
+    """Recognise an object from as few views as needed, and show the views and the beliefs.
 
     The object is in a mesh file, or in captured depth images with poses: a ROS 2 bag, or a folder
-    in the layout of BOP, TUM RGB-D, 7-Scenes or a RealSense recorder. Of these the
-    view nearest to the one asked for answers. The object is what the masks show; else what lies in
-    the box; else the thing on the support plane that is nearest to the point, or at which the first
-    camera is aimed.
+    in the layout of BOP, TUM RGB-D, 7-Scenes or a RealSense recorder. For each requested view the
+    nearest captured one is used. The object is selected by the masks of the frames; otherwise by
+    --box; otherwise it is the thing on the support plane that is nearest to --point, or at which
+    the first camera points.
 
     Args:
         path: OFF, OBJ, PLY, STL or GLB file of one object that stands upright; or a folder or
             a bag of captured views, or one depth image (.png).
-        more: further ones; with --json each is a line.
-        start: first view; of the 40, 0 to 39 (ring * 8 + azimuth step); drawn by the seed if not
-            given.
-        seed: decides the first view, whatever the policy draws and the errors of a sensor.
-        any_orientation: the object is a taught thing that may be held, lean or fly: it need not
-            rest as it was taught.
+        more: more objects; with --json each is printed on its own line.
+        start: index of the first view, 0 to 39 for the 40 views (ring * 8 + azimuth step); by
+            default random.
+        seed: seed of the first view, the policy and the sensor errors.
+        any_orientation: the object is a taught thing in any orientation: held, leaning or thrown.
     """
     if more and (output.figure or output.record):
         raise UsageError(
@@ -97,10 +96,10 @@ def demo(
     """Recognise a sample object that ships with nextview, and draw the episode.
 
     Args:
-        shape: which one.
-        start: first view, 0 to 39.
-        figure: where to write the picture; nextview_demo.png, that of the last demo, if not given.
-        overwrite: replace a picture of another name if it exists.
+        shape: the sample object.
+        start: index of the first view, 0 to 39.
+        figure: file of the picture; by default nextview_demo.png, which is replaced.
+        overwrite: replace an existing picture of another name.
     """
     from nextview.data.samples import sample_mesh
 

@@ -41,17 +41,17 @@ def scenes(
 
     Args:
         meshes: dataset folder, CLASS/train|test/MESH or CLASS/MESH.
-        out: folder for the scenes; those that are there are kept.
-        levels: how much of the target shows, on the average over the 40 views: light 85 %, medium
-            65 %, heavy 45 %.
-        scenes: how many at each level, of each split; by default one around each object.
-        split: only this one.
-        held_out: only around objects that this model (its name or card) held out of its training,
-            for learning policies.
-        room: draw rooms; without --unit, of ModelNet10's classes at usual sizes.
-        unit: of rooms: the mesh files' unit of length. What is small lies on a table then, in any
-            pose that it can rest in.
-        seed: decides which objects are targets, and all that stands around them.
+        out: folder of the scenes; existing scenes are kept.
+        levels: levels of clutter: the visible share of the target is 85 % (light), 65 % (medium) or
+            45 % (heavy), averaged over the 40 views.
+        scenes: number of scenes at each level and of each split; by default one around each object.
+        split: draw only scenes of this split.
+        held_out: draw only scenes around objects that this model (name or card) held out of its
+            training.
+        room: draw rooms; without --unit, with ModelNet10's classes at usual sizes.
+        unit: for rooms: unit of length of the mesh files; small objects then lie on a table, in any
+            resting pose.
+        seed: seed of the targets and of everything around them.
     """
     if room:
         if held_out is not None or levels != ("light", "medium", "heavy"):
@@ -107,17 +107,16 @@ def capture(
     """Write depth images, poses and intrinsics of a mesh, for ``nextview recognise FOLDER``.
 
     Args:
-        mesh: OFF, OBJ, PLY, STL or GLB file of one object that stands upright.
-        out: folder to write, in the layout of the BOP challenge; whole or not there at all.
-        viewpoints: from where it is captured, as in nextview recognise.
-        table: the object stands on a table, which is seen too; without one, masks are written.
-        radius: object radius, metres, if the file's unit does not tell.
-        up: the file's up axis; z if not given, but y for GLB.
-        unit: the file's unit of length.
-        max_faces: refuse a mesh of more triangles, or a file of more than 60 bytes for each of
-            these.
-        largest_part: leave out all that is not connected to the largest part of the mesh.
-        overwrite: replace the files of an earlier capture.
+        mesh: OFF, OBJ, PLY, STL or GLB file of one upright object.
+        out: folder to write, in the layout of the BOP challenge.
+        viewpoints: viewpoints of the images.
+        table: put the object on a table, which is visible too; without one, masks are written.
+        radius: object radius, metres, if the unit of the file is not known.
+        up: up axis of the file; by default z, and y for GLB.
+        unit: unit of length of the file.
+        max_faces: largest number of triangles; the file may have 60 bytes for each of these.
+        largest_part: keep only the largest connected part of the mesh.
+        overwrite: replace an earlier capture.
     """
     from nextview.captured.writing import write_capture
 

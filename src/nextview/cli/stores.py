@@ -20,10 +20,10 @@ Split = Literal["train", "test", "val"]
 
 @dataclass(frozen=True)
 class Workers:
-    """Who does the work.
+    """Processes and machines.
 
     Attributes:
-        workers: processes; one for each core by default.
+        workers: number of processes; by default one for each core.
         scheduler: address of a dask.distributed scheduler to use instead, as tcp://HOST:8786.
     """
 
@@ -50,10 +50,10 @@ def render(
     scene around it.
 
     Args:
-        dataset: folder of meshes, or of scenes.
-        store: the store to make or to complete.
-        viewpoints: from where it is seen.
-        azimuths: views on each ring, if not 8 of the 40 and 12 of the 12.
+        dataset: folder of meshes or scenes.
+        store: view store to create or to complete.
+        viewpoints: viewpoints of the views.
+        azimuths: views on each ring; by default 8 for the 40 views and 12 for the 12.
         size: side of the images, pixels.
         overwrite: replace a store of other objects or settings.
     """
@@ -141,12 +141,13 @@ def measure(
 
     Args:
         store: view store made by nextview render.
-        measures: names (see nextview list measures), or MODULE:FUNCTION of your own; by default all
-            that need the depth alone.
-        split: only this split.
-        held_out: only the objects that this model (its name or card) held out of its training.
-        objects: only so many of these, spread evenly; twice as many later hold the same.
-        overwrite: measure anew what is there.
+        measures: names of measures (see nextview list measures), or MODULE:FUNCTION of your own; by
+            default all that need only the depth.
+        split: measure only this split.
+        held_out: measure only objects that this model (name or card) held out of its training.
+        objects: measure only this number of objects, spread evenly; twice the number later includes
+            the same ones.
+        overwrite: compute existing values again.
     """
     select = some_objects(ViewStore.open(store), split, held_out, objects)
     steps = view_measures.measure(

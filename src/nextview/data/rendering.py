@@ -66,7 +66,7 @@ class Deform:
     Attributes:
         stretch: scale each axis by a factor from 1/(1 + stretch) to 1 + stretch, drawn
             log-uniformly.
-        rotated: rotate about the vertical by any angle.
+        rotated: rotate by a random angle about the vertical.
     """
 
     stretch: float = 0.0
@@ -128,22 +128,23 @@ def render_object(camera: Camera, sphere: ViewSphere, size: int) -> dict[str, np
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """What is rendered, and how.
+    """Objects and images.
 
     Attributes:
-        seed: decides deformations and errors of a sensor: those of an object by its name alone.
+        seed: seed of the deformations and of the sensor errors; those of an object depend on it and
+            on the name alone.
         deform: how to make a new object of each mesh.
-        noise_seed: decides the errors of a sensor instead: the same objects, with other errors.
-        sensor: look through it with all its errors: NAME or NAME:STRENGTH (docs/your_camera.md);
-            clean by default.
-        unit: of length in the mesh files (mm, cm, inch, foot, m), so that sizes are known
+        noise_seed: seed of the sensor errors alone: the same objects with other errors.
+        sensor: simulated depth camera, NAME or NAME:STRENGTH (docs/your_camera.md); clean renders
+            by default.
+        unit: unit of length of the mesh files (mm, cm, inch, foot, m), so that sizes are known
             (ModelNet: inch).
-        split: only this split of the dataset.
-        held_out: only the objects that this model (its name or card) held out of its training.
-        meshes: of scenes: the folder of the meshes that they are made of.
-        max_faces: leave out a mesh of more triangles, or a file of more than 60 bytes for each of
+        split: render only this split of the dataset.
+        held_out: render only objects that this model (name or card) held out of its training.
+        meshes: for scenes: folder of their meshes.
+        max_faces: largest number of triangles of a mesh; its file may have 60 bytes for each of
             these.
-        largest_part: leave out all that is not connected to the largest part of each mesh.
+        largest_part: keep only the largest connected part of each mesh.
     """
 
     seed: int = 0

@@ -232,23 +232,23 @@ def learn_things(
     overwrite: bool = False,
     track: Track = silently,
 ) -> Learned:
-    """Teach the things in a folder, and write a folder of models that recognises them.
+    """Teach the things in a folder, and write a memory that recognises them.
 
-    Each mesh in the folder is a thing of its own name, as is each ROS 2 bag, and each folder of
-    depth frames with poses (BOP, TUM RGB-D, 7-Scenes or RealSense) or from a turntable; any other
-    folder is a class, and the meshes in it are its things. A run that was stopped goes on where it
-    was. Use what it writes with --models OUT, or ``nextview.load(models=OUT)``.
+    Each mesh file is a thing, as is each ROS 2 bag and each folder of depth frames with poses (BOP,
+    TUM RGB-D, 7-Scenes or RealSense) or from a turntable. Any other folder is a class, and the
+    meshes in it are its things. An interrupted run resumes. Use the memory with --models OUT, or
+    with ``nextview.load(models=OUT)``.
 
     Args:
-        folder: what is to be taught.
-        out: folder to write.
-        add: put the things beside those that OUT knows, which are not looked at again; so FOLDER
-            holds the new ones alone.
-        remove: forget the things of these names in OUT; nothing is added where FOLDER is OUT, too.
-        workers: processes; one for each core by default; 0 to work in this one.
-        scheduler: address of a dask.distributed scheduler whose workers see the same files, to use
-            instead.
-        overwrite: replace what OUT knows.
+        folder: folder of meshes, bags and folders of captured frames.
+        out: folder of the memory to write.
+        add: add the things to those that OUT knows, which are not processed again; FOLDER contains
+            only the new things.
+        remove: names of things to remove from OUT; if FOLDER is OUT, nothing is added.
+        workers: number of processes; by default one for each core; 0 uses this process.
+        scheduler: address of a dask.distributed scheduler to use instead, whose workers see the
+            same files.
+        overwrite: replace the memory in OUT.
         track: follows the things.
 
     Raises:

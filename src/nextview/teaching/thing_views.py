@@ -58,26 +58,26 @@ Parts = Iterator[NDArray[np.float32]]  # of embeddings, (.., F) each, in order
 
 @dataclass(frozen=True)
 class TeachingOptions:
-    """How things are looked at.
+    """How things are taught.
 
     Attributes:
-        unit: of the mesh files; then size counts as evidence.
-        up: the up axis of the mesh files; z by default, but y for GLB.
-        upright: the things only ever stand as their files have them; by default they may also lie.
-        sensor: the camera that will look at them: NAME or NAME:STRENGTH, see nextview render
-            --help.
-        largest_part: leave out all that is not connected to the largest part of each mesh.
-        any_size: take things of very different sizes as they are.
-        one_class: take things that all lie in one folder for a class, as beside others with --add.
-        turntable: depth frames without poses, beside camera-intrinsics.txt: the camera stood still,
-            and the thing turned once around by equal steps, counter-clockwise (ccw) or clockwise
-            (cw) as seen from above.
-        depth_scale: of captured frames: metres that one step of the depth images stands for, if
-            not as their files say; 0.001 for millimetres.
-        depth_topic: of ROS 2 bags with several topics of depth images.
-        world_frame: of ROS 2 bags: the frame of tf that is the world, z up; the root of the tree if
-            not given.
-        seed: of all random draws.
+        unit: unit of length of the mesh files; with it, size counts as evidence, and things are
+            recognised by their geometry.
+        up: up axis of the mesh files; by default z, and y for GLB.
+        upright: the things only stand as in their files; by default they may also lie.
+        sensor: camera that will look at the things: kinect, stereo, setup, wrist or none, or
+            NAME:STRENGTH.
+        largest_part: keep only the largest connected part of each mesh.
+        any_size: accept things of very different sizes.
+        one_class: things that are all in one folder are one class; --add assumes this.
+        turntable: the depth frames have no poses: the camera stood still, and the thing made one
+            full turn in equal steps, counter-clockwise (ccw) or clockwise (cw) seen from above;
+            camera-intrinsics.txt is beside them.
+        depth_scale: for captured frames: metres per step of the depth images, such as 0.001 for
+            millimetres; by default as their files say.
+        depth_topic: for ROS 2 bags with several topics of depth images: the topic.
+        world_frame: for ROS 2 bags: tf frame of the world, z up; by default the root of the tree.
+        seed: seed of all random draws.
     """
 
     unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None

@@ -58,13 +58,14 @@ def fit_calibration(
     predicting again. The size of the objects is not used.
 
     Args:
-        predictions: of the training split (nextview predict --held-out, or --split train).
-        card: of the recogniser; "calibration" is written into it. Fitted to the objects that it
-            calls held out.
-        sensed: predictions of the same objects through sensors (nextview render --sensor mix),
-            fitted to as well.
-        delta: how often a promised error rate may not hold.
-        seed: decides the walks over which is fitted.
+        predictions: predictions of the training split (nextview predict --held-out, or --split
+            train).
+        card: card of the recogniser, in which "calibration" is written. The fit uses the objects
+            that it lists as held out.
+        sensed: predictions of the same objects through sensors (nextview render --sensor mix), to
+            fit to as well.
+        delta: probability with which a guaranteed error rate may be wrong.
+        seed: seed of the random walks of the fit.
     """
     if not 0 < number(delta, "--delta") < 1:
         raise UsageError(f"delta is a probability between 0 and 1, not {delta}")

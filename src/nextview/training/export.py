@@ -216,14 +216,15 @@ def export_recogniser(
     Calibrate it afterwards with nextview fit calibration.
 
     Args:
-        run: folder made by nextview train recogniser.
-        store: that it was trained on.
+        run: folder of a run of nextview train recogniser.
+        store: view store that it was trained on.
         out: folder for NAME.onnx and NAME.json.
-        ensemble: further runs on the same store and input; the logits of all are averaged.
-        bits: that a weight takes in the file.
-        name: of the model; by default recogniser-DATASET, after the mesh folder of the store.
-        note: what else the card should say.
-        overwrite: replace a model of this name.
+        ensemble: further runs on the same store and input, whose logits are averaged with those of
+            RUN.
+        bits: bits per weight in the file.
+        name: name of the model; by default recogniser-DATASET, after the mesh folder of the store.
+        note: text to add to the card.
+        overwrite: replace an existing model.
 
     Raises:
         ModelError: a run is not finished or of another store, runs do not fit together, or the
@@ -304,14 +305,14 @@ def export_map(
     """Export a trained map network: ONNX, with a card of its validation scores.
 
     Args:
-        run: folder made by nextview train map.
-        store: that it was trained on.
+        run: folder of a run of nextview train map.
+        store: view store that it was trained on.
         out: folder for NAME.onnx and NAME.json.
-        predictions: that a map of the confidence was trained on.
-        bits: that a weight takes in the file.
-        name: of the model; by default MEASURE-DATASET, after the mesh folder of the store.
-        note: what else the card should say.
-        overwrite: replace a model of this name.
+        predictions: predictions that a map of the confidence was trained on.
+        bits: bits per weight in the file.
+        name: name of the model; by default MEASURE-DATASET, after the mesh folder of the store.
+        note: text to add to the card.
+        overwrite: replace an existing model.
     """
     views = ViewStore.open(store)
     recipe = read_recipe(run, MapRecipe)

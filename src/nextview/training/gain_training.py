@@ -328,20 +328,19 @@ def train_gain(
     An interrupted training starts over.
 
     Args:
-        predictions: of training objects that the recogniser has not seen (nextview predict
-            --held-out).
+        predictions: predictions of training objects that the recogniser has not seen (nextview
+            predict --held-out).
         out: card to write (NAME.json); the networks are written beside it (NAME.onnx).
-        validation: predictions of other such objects, which choose the epoch and the travel weight;
-            those among them are left out of the training. By default PREDICTIONS choose them, in
-            folds.
-        folds: without VALIDATION, so many policies are trained, at most one for each object, each
-            without its share of the objects, which validate it; the result is the mean of all.
-        travel_weight: of a grid cell of travel; by default the lowest at which the policy travels
-            no farther than a random walk in the local window.
-        local: let it choose in the local window only.
+        validation: predictions of other such objects, which choose the epoch and the travel weight.
+            By default PREDICTIONS choose them, in folds.
+        folds: without VALIDATION: number of folds; one policy is trained without each fold and
+            validated on it, and the result is the mean of all.
+        travel_weight: weight of a grid cell of travel; by default the lowest at which the policy
+            travels no farther than a random walk in the local window.
+        local: choose only views of the local window.
         sensed: predictions of the same objects through sensors (nextview render --sensor mix), to
             learn from as well.
-        overwrite: replace files of these names.
+        overwrite: replace existing files.
 
     Raises:
         UsageError, ResultsError: the card is not called NAME.json, or exists.

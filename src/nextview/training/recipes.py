@@ -14,9 +14,10 @@ class Hardware:
     """Devices and precision; see docs/training.md for several devices.
 
     Attributes:
-        devices: processes, each with its own GPU where there are any; they share every batch out.
-        accelerator: "auto" takes GPUs where there are any.
-        precision: 16-mixed on GPUs older than Ampere.
+        devices: number of processes, each with its own GPU if there are any; they share every
+            batch.
+        accelerator: "auto" uses GPUs if there are any.
+        precision: use 16-mixed on GPUs older than Ampere.
     """
 
     devices: int = 1
@@ -40,25 +41,26 @@ class RecogniserRecipe:
     """How the recogniser is trained.
 
     Attributes:
-        network: or EfficientNet-Lite0, a fifth of a ResNet-18's arithmetic.
-        layers: of the ResNet.
-        dropout: of EfficientNet-Lite0: chance that a pooled feature is dropped; the chance that a
-            block is skipped for a view rises from 0 at the first towards it at the last.
+        network: ResNet, or EfficientNet-Lite0 with a fifth of the computation of a ResNet-18.
+        layers: number of layers of the ResNet.
+        dropout: for EfficientNet-Lite0: probability of dropping a pooled feature; the probability
+            of skipping a block rises from 0 at the first to this value at the last.
         size: side of the input image, pixels.
         epochs: passes over the training objects.
-        views_per_object: of each object in one epoch, drawn at random.
-        batch: views a step.
+        views_per_object: random views of each object in one epoch.
+        batch: views per step.
         lr: peak learning rate of AdamW.
-        weight_decay: of AdamW.
-        smoothing: of the labels.
-        azimuth_bins_weight: weight of the loss for the azimuth bin from which the object is seen,
-            beside that of its class; 0 does without. All objects of a class have to face the same
-            way in their files, as ModelNet10's do.
-        validation_share: part of the training split held out for validation.
-        deformed_share: chance that a view is drawn from the deformed objects, where they are given.
-        seed: decides everything random.
-        ensemble_seed: of one network of an ensemble: its first weights and draws; --seed: what
-            validates all.
+        weight_decay: weight decay of AdamW.
+        smoothing: label smoothing.
+        azimuth_bins_weight: weight of the loss of the azimuth bin beside that of the class; 0 for
+            no bins. All objects of a class must have the same orientation in their files, as in
+            ModelNet10.
+        validation_share: share of the training split that is held out for validation.
+        deformed_share: probability that a view is drawn from the deformed objects, if there are
+            any.
+        seed: seed of all random draws.
+        ensemble_seed: seed of the initial weights and draws of one network of an ensemble; --seed
+            decides the validation objects of all.
         input: what the network sees: a depth camera's, or the shaded image.
         augment: by default views are varied: mirrored, shifted, scaled, partly hidden.
         balanced: by default rare classes are drawn more often; else every view comes once in turn.

@@ -77,13 +77,11 @@ def fit_unknown(
     beside the card, and its SHA-256 into the card. A run that was stopped begins anew.
 
     Args:
-        meshes: folder of the meshes that the recogniser was trained on; those of the test split are
-            left out.
-        card: of the recogniser.
-        sensor: through which half of the calibration views are taken, see
-            simulation.sensor.sensor_named.
-        seed: of all that is drawn.
-        workers: processes; one for each core by default.
+        meshes: folder of the meshes that the recogniser was trained on; its test split is not used.
+        card: card of the recogniser.
+        sensor: simulated depth camera of half of the calibration views, NAME or NAME:STRENGTH.
+        seed: seed of all random draws.
+        workers: number of processes; by default one for each core.
     """
     sensor_named(sensor)  # refused here, not by every object
     with card_to_fit(card) as (model, write):
