@@ -116,7 +116,7 @@ def test_adding_leaves_what_is_known_as_it_was_and_removing_takes_it_away(
         learn(models, models, remove=("mug",))
     with pytest.raises(UsageError, match=r"chair is known already"):
         learn(scans, models, add=True)
-    assert "knows things already; --add" in refused(capsys, "learn", str(scans), str(models))
+    assert "already knows things; --add" in refused(capsys, "learn", str(scans), str(models))
 
 
 def test_a_run_that_was_stopped_goes_on_and_gives_the_same(tmp_path, taught, scans, monkeypatch):

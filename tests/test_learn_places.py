@@ -204,7 +204,7 @@ def test_numbers_of_other_features_are_not_mixed_with_these(place, looked_at, ru
 
 
 def test_a_memory_of_nothing_is_not_written(place):
-    with pytest.raises(UsageError, match="would know nothing any more; delete it instead"):
+    with pytest.raises(UsageError, match="no thing would be left; delete the folder instead"):
         learn(place / "mine", place / "mine", remove=("box", "ball"), workers=0)
     assert known(place / "mine") == ["ball", "box"]
 

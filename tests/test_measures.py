@@ -128,7 +128,7 @@ def test_a_stopped_run_is_completed_by_the_next(store):
         ("own_measures:endless", "of chair.*, view 0, is not finite"),
         ("own_measures:leave", "measure own_measures:leave of chair.*: SystemExit"),
         ("own_measures:broken", "measure own_measures:broken of chair.*: AttributeError"),
-        ("own_measures:constant", "is no function"),
+        ("own_measures:constant", "is not a function"),
         ("no_such_module:none", "cannot be imported .ModuleNotFoundError"),
         ("own_measures:pixels", "needs the meshes"),
         ("beauty", "no measure is called 'beauty'; there are depth_entropy"),

@@ -281,7 +281,7 @@ REFUSED = {
     "an unknown type": (header_of("property quad x"), "property quad x"),
     "an index that is none": (
         header_of(*XYZ, "element face 1", CORNERS) + "3 0 1 1.5\n",
-        "no whole number",
+        "not a whole number",
     ),
     "a row too long": (
         header_of(*XYZ, "element face 1", CORNERS) + "3 0 1 2 7\n",
@@ -293,7 +293,7 @@ REFUSED = {
     ),
     "a word": (
         header_of(*XYZ, "element face 1", CORNERS) + "3 0 one 2\n",
-        "something else than numbers",
+        "something other than numbers",
     ),
     "less than no rows": (header_of(*XYZ, "element face -1", CORNERS), "announces -1 rows"),
     "rows that are no number": (

@@ -247,7 +247,7 @@ def test_gain_learns_in_scenes_what_to_make_of_what_shows(predictions, tmp_path)
         specs.objects[:, None], replay(str(made.card), specs, 4, 0).views
     ].all()
     replace(some_predictions(), splits=train).save(tmp_path / "alone.npz")
-    with pytest.raises(PredictionsError, match="of no scenes"):
+    with pytest.raises(PredictionsError, match="contains no scenes"):
         train_gain(tmp_path / "alone.npz", tmp_path / "alone.json", recipe=recipe, folds=2)
 
 

@@ -92,7 +92,7 @@ def test_a_store_without_its_root_or_another_folder_is_left_alone(store, furnitu
     with pytest.raises(DatasetError, match="there is no view store"):
         ViewStore.open(store)
     for overwrite in (False, True):
-        with pytest.raises(DatasetError, match="is there, and is no view store"):
+        with pytest.raises(DatasetError, match="exists and is not a view store"):
             list(render(furniture, store, SPHERE, 32, workers=0, overwrite=overwrite))
 
 

@@ -162,7 +162,7 @@ def test_a_measure_of_ones_own_is_kept_by_its_import_path(views, tmp_path, monke
         "mine_to_leave:none": "cannot be imported .SystemExit",
         "mine_to_measure:broken": "measure mine_to_measure:broken of b.*: AttributeError",
         "mine_to_measure:endless": "of b.*, view 0, is not finite",
-        "mine_to_measure:constant": "is no function",
+        "mine_to_measure:constant": "is not a function",
         "mine_to_measure:none": "cannot be imported",
         "no_such_module:none": "cannot be imported .ModuleNotFoundError",
     }.items():

@@ -109,7 +109,7 @@ def find_measure(name: str) -> Measure:
     with plugin_errors(lambda said: MeasureError(f"measure {name} cannot be imported ({said})")):
         found = plugin(path)
     if not callable(found):
-        raise MeasureError(f"measure {name} is no function of a view")
+        raise MeasureError(f"measure {name} is not a function of a view")
     return found if isinstance(found, Measure) else Measure(found)
 
 

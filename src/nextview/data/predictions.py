@@ -112,7 +112,7 @@ class Predictions:
                 raise PredictionsError(f"{name} of object {bad} is not a finite number")
 
         if not all(isinstance(name, str) for name in (*self.names, *self.classes, *self.models)):
-            raise PredictionsError("a name in these predictions is no text")
+            raise PredictionsError("a name in these predictions is not text")
         if len(set(self.names)) < n:
             raise PredictionsError("two objects of these predictions have the same name")
         if ((self.labels < 0) | (self.labels >= c)).any():

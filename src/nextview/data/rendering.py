@@ -341,7 +341,7 @@ def _begin(path: Path, wanted: Attributes, overwrite: bool) -> ViewStore:
     if not path.exists():
         return ViewStore.create(path, wanted)
     if not (path / "zarr.json").exists():
-        raise DatasetError(f"{path}: is there, and is no view store; give another name")
+        raise DatasetError(f"{path}: exists and is not a view store; give another name")
     store = ViewStore.open(path)
     there = store.attributes
     # what decides no view

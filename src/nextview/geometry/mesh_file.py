@@ -256,7 +256,7 @@ def _check_glb(data: bytes) -> None:
         if any(accessor.get("normalized") for accessor in used):
             raise MeshError("its positions are fractions of whole numbers, which are not read here")
         if min(accessor["count"] for accessor in used) < 0:
-            raise MeshError("it announces fewer than no numbers")
+            raise MeshError("it announces a negative number of elements")
 
 
 READERS: dict[str, Callable[[bytes, int], Shape]] = {  # by the suffix of a file's name

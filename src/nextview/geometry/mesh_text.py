@@ -97,5 +97,5 @@ def _parsed(text: bytes, kind: type) -> NDArray:
             return np.fromstring(text, kind, sep=" ")
         except (DeprecationWarning, ValueError):  # which of them depends on NumPy's version
             raise ValueError(
-                "there is something else than numbers where numbers are expected"
+                "something other than numbers stands where numbers are expected"
             ) from None

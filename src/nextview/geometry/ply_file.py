@@ -245,7 +245,7 @@ def _numbers_of_rows(body: bytes, rows: int) -> tuple[bytes, NDArray[np.int64]]:
     total = int(words.sum())
     found = numbers(text if total == len(begins) else text[: begins[total]])
     if len(found) != total:
-        raise MeshError("its rows hold something else than numbers")
+        raise MeshError("its rows contain something other than numbers")
     return found.tobytes(), BYTES_OF_NUMBER * words
 
 
@@ -357,7 +357,7 @@ def _walk(
             continue
         code = FORMAT_CODES.get(column.count.str[1:])
         if code is None:
-            raise MeshError(f"the lengths of its lists {column.name} are no whole numbers")
+            raise MeshError(f"the lengths of its lists {column.name} are not whole numbers")
         order = column.count.str[0].replace("|", "=")
         count = struct.Struct(order + code)
         steps.append((skipped, count.unpack_from, count.size, column.kind.itemsize))
@@ -412,7 +412,7 @@ def _corners(element: str, lists: dict[str, Lists]) -> Corners:
     with np.errstate(invalid="ignore"):
         corners = named.astype(np.int64)
     if (corners != named).any():
-        raise MeshError(f"an index of its element {element} is no whole number")
+        raise MeshError(f"an index of its element {element} is not a whole number")
     return corners, sizes
 
 

@@ -76,7 +76,7 @@ def _read_text(text: bytes, max_faces: int) -> tuple[NDArray[np.float64], NDArra
         raise MeshError("the file is cut short, endloop is missing")
     coordinates = numbers(b" ".join(found))
     if len(coordinates) != 3 * (len(found) - len(loops)):
-        raise MeshError("its vertices have something else than numbers")
+        raise MeshError("its vertices contain something other than numbers")
     vertices = coordinates.reshape(-1, 3)
     sizes = np.diff(loops, prepend=-1) - 1
     return vertices, triangulate(vertices, np.arange(len(vertices)), sizes, max_faces)

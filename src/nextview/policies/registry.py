@@ -99,7 +99,7 @@ def make_policy(
             return policy
         if not isinstance(policy, Gain):
             raise PolicyError(
-                f"{name}: this policy values no views that could be weighed by what shows"
+                f"{name}: this policy does not value views, so their visibility cannot be weighed"
             )
         return VisibleGain(policy, policy.travel_weight)
 
@@ -113,7 +113,7 @@ def make_policy(
         )
     if name.startswith(("true-", "oracle-", "best-", "worst-")) or name.endswith("-oracle-valley"):
         raise PolicyError(
-            f"{name} knows what no robot does: it takes part in nextview benchmark alone"
+            f"{name} uses information that no robot has, so it runs only in nextview benchmark"
         )
 
     known = [*policy_names(), *map_policy_names(maps), *bundled_policies(), f"{VISIBLE}{DEFAULT}"]

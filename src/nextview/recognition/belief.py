@@ -28,7 +28,7 @@ def fuse(logits: Floats, temperature: float = 1.0) -> Float:
     """
     logits = np.asarray(logits, np.float64)
     if not np.isfinite(logits).all():
-        raise ModelError("the recogniser gave a logit that is not a finite number")
+        raise ModelError("the recogniser returned a logit that is not a finite number")
     return _softmax(logits.sum(-2) / temperature)
 
 
@@ -219,7 +219,7 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
             ModelError: the evidence is not finite.
         """
         if not np.isfinite(total).all():
-            raise ModelError("the recogniser said something that is not a finite number")
+            raise ModelError("the recogniser returned a value that is not a finite number")
         total = np.asarray(total, np.float64)
         logs = total[..., :classes] / self.temperature_after(np.asarray(n_views)[..., None])
         if self.bin_correlation is None or total.shape[-1] == classes:

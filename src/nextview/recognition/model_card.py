@@ -58,9 +58,9 @@ class Symmetry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         if self.order == 1:
-            raise ModelError("a symmetry of the order 1 is none")
+            raise ModelError("a symmetry of order 1 is no symmetry")
         if abs(sum(value**2 for value in self.axis) - 1) > UNIT_LENGTH:
-            raise ModelError("the axis of a symmetry is no unit vector")
+            raise ModelError("the axis of a symmetry is not a unit vector")
 
 
 class Verification(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -86,7 +86,7 @@ class Verification(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if not row or list(row) != sorted(row):
                 raise ModelError("the residuals of known things do not ascend")
         if bool(self.usual) != bool(self.excess):
-            raise ModelError("of the residuals of known things one half is missing")
+            raise ModelError("the residuals of known things are incomplete")
 
 
 class Thing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

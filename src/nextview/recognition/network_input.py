@@ -62,7 +62,7 @@ def from_observations(spec: InputSpec, observations: Sequence[Observation]) -> N
             other.intrinsics, first.intrinsics
         ):
             raise ObservationError(
-                "views that are handed in together are from one camera: of one size and one pinhole"
+                "views that are passed together must be from one camera: of one size and pinhole"
             )
 
     array = {"geometry": "depth", "image": "picture", "cloud": "points"}[spec.kind]

@@ -145,7 +145,7 @@ class Novelty(Quantiles):
             raise ModelError(f"its neighbours are {len(self.neighbours)}, fewer than {NEIGHBOUR}")
         lengths = np.linalg.norm(self.neighbours.astype(np.float32), axis=1)
         if np.abs(lengths - 1).max() > ROUNDED:
-            raise ModelError("its neighbours are no unit vectors")
+            raise ModelError("its neighbours are not unit vectors")
 
         check_array("its standard", self.standard, np.floating, (2, 2))
         if (self.standard[:, 1] <= 0).any():

@@ -166,6 +166,9 @@ class LearnOptions(TypedDict, total=False):
         any_size: whether to accept things of very different sizes.
         one_class: whether things that are all in one folder are one class.
         turntable: direction in which a turntable turned, "ccw" or "cw", seen from above.
+        depth_scale: metres per step of captured depth images; by default as their files say.
+        depth_topic: topic of the depth images of ROS 2 bags with several.
+        world_frame: tf frame of the world in ROS 2 bags, z up; by default the root of the tree.
         seed: of all random draws; 0 by default.
         add: whether to add the things to those that the memory knows.
         remove: names of things to remove from the memory.
@@ -183,6 +186,9 @@ class LearnOptions(TypedDict, total=False):
     any_size: bool
     one_class: bool
     turntable: Literal["ccw", "cw"] | None
+    depth_scale: float | None
+    depth_topic: str | None
+    world_frame: str | None
     seed: int
     add: bool
     remove: tuple[str, ...]
@@ -274,7 +280,7 @@ def learn_things(
         work = Work(how, part, workers, scheduler, track)
         track(_teach(found.things, work, taught, left_out), len(found.things), "things")
         if not taught and nothing_new:
-            raise UsageError(f"{out}: would know nothing any more; delete it instead")
+            raise UsageError(f"{out}: no thing would be left; delete the folder instead")
         if not taught:
             raise DatasetError(
                 f"{folder}: none of its things could be taught ({'; '.join(left_out[:3])})"
@@ -297,7 +303,7 @@ def _check_places(out: Path, keeps: bool, overwrite: bool) -> None:
     card = out / CARD
     if card.exists() and not keeps and not overwrite:
         raise UsageError(
-            f"{out}: knows things already; --add puts others beside them, --overwrite replaces them"
+            f"{out}: already knows things; --add adds others, --overwrite replaces them"
         )
     check_new(out, keeps or overwrite, folder=True)
     for place in (card, out / PICTURE):

@@ -494,7 +494,8 @@ def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:
         )
     if VISIBILITY in recipe.inputs and scenes_of(p) is None:
         raise PredictionsError(
-            f"{path}: is of no scenes, in which all would show; choose other --inputs"
+            f"{path}: contains no scenes, and without them everything is visible; choose other"
+            " --inputs"
         )
     if p.azimuth_bins is None and (recipe.frame == "object" or "azimuth_bin" in recipe.inputs):
         other = "give --frame camera and --inputs without azimuth_bin"
