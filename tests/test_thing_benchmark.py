@@ -13,10 +13,10 @@ from nextview.benchmark.thing_benchmark import ThingSettings, benchmark_things
 from nextview.benchmark.thing_episodes import (
     SPHERE,
     VISIBLE_SHARES,
+    KeptArrays,
     Setting,
     ThingEpisode,
     hiding_boxes,
-    read_arrays,
 )
 from nextview.benchmark.thing_policies import Foresight, RingSteps
 from nextview.benchmark.thing_replay import EpisodeRuns, ThingRun
@@ -67,10 +67,10 @@ def results(made, tmp_path):
     return shutil.copytree(made, tmp_path / "out")
 
 
-def episode_of(knobs_memory, knobs, thing, file=None, occlusion="none"):
+def episode_of(knobs_memory, knobs, thing, folder=None, occlusion="none"):
     things = stage.opened(str(knobs_memory))
     mesh = load_mesh(knobs / f"{things.names[thing]}.ply", unit="m")
-    return ThingEpisode(things, lambda: mesh, thing, 0, Setting("wrist", occlusion), file)
+    return ThingEpisode(things, lambda: mesh, thing, 0, Setting("wrist", occlusion), folder)
 
 
 # From scans to tables
@@ -121,7 +121,7 @@ def test_a_view_is_sensed_once_and_another_policy_uses_what_is_there(
 
 
 def test_what_is_kept_is_what_the_recogniser_says_of_the_same_views(knobs_memory, knobs, tmp_path):
-    file = tmp_path / "episode.npz"
+    file = tmp_path / "episode"
     fresh = episode_of(knobs_memory, knobs, 0, file)
     views = [fresh.start, (fresh.start + 3) % len(SPHERE)]
     found, _ = fresh.verified(views)
@@ -157,12 +157,32 @@ def test_what_does_not_fit_is_refused_in_one_sentence(knobs, results, settings, 
         benchmark_things(knobs, tmp_path / "letters", settings, workers=0)
     (tmp_path / "scans").mkdir()
     shutil.copy(knobs / "can.ply", tmp_path / "scans")
-    with pytest.raises(NextviewError, match="holds no scan of knob"):
+    (tmp_path / "scans/can.ply").rename(tmp_path / "scans/pot.ply")
+    with pytest.raises(NextviewError, match="holds no scan of anything that"):
         benchmark_things(tmp_path / "scans", tmp_path / "new", settings, workers=0)
-    for damaged in (b"", b"PK\x03\x04 no archive"):
-        (results / "episodes/0000_00.npz").write_bytes(damaged)
-        with pytest.raises(ResultsError, match="is damaged"):
-            read_arrays(results / "episodes/0000_00.npz")
+    folder = results / "episodes/0000_00"
+    whole = (folder / "000000.npz").read_bytes()
+    for damaged in (b"", b"PK\x03\x04 no archive", whole[:-100]):
+        (folder / "000000.npz").write_bytes(damaged)
+        with pytest.raises(ResultsError, match=r"000000\.npz: is damaged .* remove its folder"):
+            KeptArrays(folder)
+    (folder / "000000.npz").write_bytes(whole[:400] + bytes(400) + whole[800:])
+    kept = KeptArrays(folder)
+    with pytest.raises(ResultsError, match="is damaged"):
+        [kept[name] for name in kept._packed]
+
+
+def test_some_of_the_things_are_shown_and_all_may_be_believed(
+    knobs, knobs_memory, settings, tmp_path
+):
+    (tmp_path / "scans").mkdir()
+    shutil.copy(knobs / "plain.ply", tmp_path / "scans")
+    few = replace(settings, policies=("random",))
+    tables = benchmark_things(tmp_path / "scans", tmp_path / "out", few, workers=0)
+    assert tables.episodes == 1
+    assert tables.alike["thing"].tolist() == ["plain"]
+    assert tables.alike["most_alike"].tolist() == ["knob"]
+    assert set(tables.measures["things"]) == {"all"}
 
 
 def test_boxes_leave_the_share_visible_that_was_asked_for(knobs_memory, knobs):
@@ -180,8 +200,8 @@ def test_boxes_leave_the_share_visible_that_was_asked_for(knobs_memory, knobs):
 def test_the_thing_that_is_most_alike_is_the_one_with_a_knob(knobs_memory):
     alike = how_alike(stage.opened(str(knobs_memory)))
     number = {name: k for k, name in enumerate(alike.names)}
-    assert alike.nearest[number["plain"]] == number["knob"]
-    assert alike.nearest[number["knob"]] == number["plain"]
+    assert alike.nearest[number["plain"]] == "knob"
+    assert alike.nearest[number["knob"]] == "plain"
     assert alike.confusable.sum() == 1
     assert not alike.confusable[number["can"]]
 
@@ -237,7 +257,7 @@ def test_measures_are_those_of_a_hand_count():
     wrong = ([False, False, True], [0.5, 0.98, 0.6], [0, 4, 1])
     good = ([False, True, True], [0.5, 0.9, 0.99], [0, 4, 2])
     episodes = [both("a_x", wrong, good), both("a_y", good, good), both("b_x", wrong, good)]
-    alike = Alikeness(("a_x", "a_y", "b_x"), np.array([1, 0, 0]), np.array([0.1, 0.2, 0.3]))
+    alike = Alikeness(("a_x", "a_y", "b_x"), ("a_y", "a_x", "a_x"), np.array([0.1, 0.2, 0.3]))
     how = Compared(("random", "spread"), (1, 2, 3), 0.97, True, 2000)
     tables = summarise_things(episodes, alike, how)
     rows = tables.measures.set_index(["things", "policy", "measure", "views"])["value"]
@@ -262,7 +282,7 @@ def test_measures_are_those_of_a_hand_count():
 def test_no_difference_is_no_discovery_and_a_sure_one_is():
     rng = np.random.default_rng(1)
     names = tuple(f"t{k}" for k in range(60))
-    alike = Alikeness(names, np.zeros(60, int), np.arange(60.0))
+    alike = Alikeness(names, names, np.arange(60.0))
     how = Compared(("random", "spread"), (1, 2), 0.97, False, 2000)
     found = []
     for lead in (0.0, 0.5):

@@ -1,5 +1,6 @@
 """Which things look most alike, by their surfaces alone: no answer of a recogniser counts."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,13 +23,13 @@ class Alikeness:
 
     Attributes:
         names: of the things.
-        nearest: which thing is most like each, (T,) int64; itself where none is of about its size.
-        distance: mean distance of the two surfaces at the best azimuth, in radii of the thing, (T,)
+        nearest: name of the thing that is most like each; its own where none is of about its size.
+        distance: mean distance of the two surfaces at the best azimuth, in mean radii, (T,)
             float64; infinity where none is of about its size.
     """
 
     names: tuple[str, ...]
-    nearest: NDArray[np.int64]
+    nearest: tuple[str, ...]
     distance: Float
 
     @property
@@ -37,15 +38,27 @@ class Alikeness:
         rank = np.argsort(np.argsort(self.distance, kind="stable"), kind="stable")
         return rank < len(self.names) // 2
 
+    def of(self, names: Collection[str]) -> "Alikeness":
+        """The same of some of the things; the nearest of each may be none of them.
 
-def how_alike(things: TaughtThings) -> Alikeness:
+        Args:
+            names: of these.
+        """
+        rows = [row for row, name in enumerate(self.names) if name in names]
+        some = tuple(self.names[row] for row in rows)
+        nearest = tuple(self.nearest[row] for row in rows)
+        return Alikeness(some, nearest, self.distance[rows])
+
+
+def distances_between(things: TaughtThings) -> Float:
     """Lay the surfaces of things over each other, as they stand in their files.
 
     Args:
-        things: of known geometry.
+        things: T of known geometry.
 
     Returns:
-        The nearest other thing of each.
+        Mean distance of two surfaces at the best azimuth, as a share of their mean radius, (T, T)
+        float64; infinity where they are of different sizes, and for a thing itself.
     """
     surfaces = things.verifier.caster.surfaces
     rng = np.random.default_rng(0)
@@ -63,8 +76,22 @@ def how_alike(things: TaughtThings) -> Alikeness:
         turned = points[first] @ turns.swapaxes(1, 2)
         there = np.asarray(trees[second].query(turned)[0]).mean(1)
         back = np.asarray(trees[first].query(points[second] @ turns)[0]).mean(1)
-        apart[first, second] = apart[second, first] = ((there + back) / 2).min()
-    distance = apart.min(1) / radii
-    own = np.arange(len(surfaces))
+        mean = (radii[first] + radii[second]) / 2
+        apart[first, second] = apart[second, first] = ((there + back) / 2).min() / mean
+    return apart
+
+
+def how_alike(things: TaughtThings) -> Alikeness:
+    """Which other thing is most like each, see ``distances_between``.
+
+    Args:
+        things: of known geometry.
+
+    Returns:
+        The nearest other thing of each.
+    """
+    apart = distances_between(things)
+    distance = apart.min(1)
+    own = np.arange(len(apart))
     nearest = np.where(np.isfinite(distance), apart.argmin(1), own)
-    return Alikeness(things.names, nearest, distance)
+    return Alikeness(things.names, tuple(things.names[k] for k in nearest), distance)

@@ -1,6 +1,6 @@
 """The benchmark of next views of taught things: from scans to a folder of tables, resumable.
 
-A folder of results holds ``episodes``, all that was sensed and verified, a file for each episode;
+A folder of results holds ``episodes``, all that was sensed and verified, a folder for each episode;
 ``runs``, what each policy made of it, a small file for each; the record ``benchmark.json``, which
 says how it was run; and the tables and figures, which every run writes anew.
 """
@@ -129,6 +129,11 @@ class _Job:
         return f"{self.thing:04d}_{self.draw:02d}"
 
     @property
+    def scan_name(self) -> str:
+        """Of the thing."""
+        return self.scan.stem
+
+    @property
     def runs_file(self) -> Path:
         """Where its runs are written."""
         return self.out / "runs" / f"{self.name}.json"
@@ -143,10 +148,10 @@ def benchmark_things(
 ) -> ThingTables:
     """Compare where to look next at things of known geometry: from scans to a table.
 
-    The scans are taught, unless --models names a memory that knows them. Then each is shown at its
-    true size through a sensor, and all policies go on from the same first view. Each view is sensed
-    once, and each set of views is verified once. Both are kept in OUT: a run that was stopped goes
-    on where it was, and one more policy is replayed in seconds.
+    The scans are taught, unless --models names a memory that knows them, and maybe more. Then each
+    is shown at its true size through a sensor, and all policies go on from the same first view.
+    Each view is sensed once, and each set of views is verified once. Both are kept in OUT: a run
+    that was stopped goes on where it was, and one more policy is replayed in seconds.
 
     A policy of your own, MODULE:CLASS, is made with the viewpoints. With needs = ("outlook",) it is
     given the leading hypotheses, things in poses, with the belief in each, and their surfaces; with
@@ -172,9 +177,8 @@ def benchmark_things(
     with only_one(out):
         models = _taught(scans, out, settings, workers, track)
         things = opened(models)
-        missing = [name for name in things.names if name not in found]
-        if missing:
-            raise DatasetError(f"{scans}: holds no scan of {missing[0]}, which {models} knows")
+        if not set(things.names) & set(found):
+            raise DatasetError(f"{scans}: holds no scan of anything that {models} knows")
         policies_of(settings.policies, things)  # says what is wrong with a name
         _check_same(out, settings, things)
 
@@ -185,7 +189,7 @@ def benchmark_things(
         track((done for done, _ in steps), len(jobs), "episodes")
 
         runs = [read_record(job.runs_file, EpisodeRuns, "runs", ResultsError) for job in jobs]
-        alike = how_alike(things)
+        alike = how_alike(things).of({job.scan_name for job in jobs})
         how = Compared(
             policies_in(runs),
             settings.views,
@@ -280,6 +284,7 @@ def _jobs(
         )
         for draw in range(settings.draws)
         for thing, name in enumerate(things.names)
+        if name in scans
     ]
 
 
@@ -296,9 +301,9 @@ def work(job: _Job) -> None:
     """Replay the policies of a job, and write down what they made of it."""
     things = opened(job.models)
     chosen = policies_of(job.policies, things)
-    file = job.out / "episodes" / f"{job.name}.npz"
+    folder = job.out / "episodes" / job.name
     episode = ThingEpisode(
-        things, partial(_mesh, job.scan, job.unit), job.thing, job.draw, job.setting, file
+        things, partial(_mesh, job.scan, job.unit), job.thing, job.draw, job.setting, folder
     )
     runs: dict[str, list[ThingRun]] = {}
     if job.runs_file.exists():

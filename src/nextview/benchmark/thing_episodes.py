@@ -2,14 +2,17 @@
 
 An episode is a thing at its true size on a table, alone or half hidden by boxes, before a sensor
 with errors of its own. Every view of it is sensed once, is looked at by the features once, and
-every set of views is verified once: exactly as ``Session`` would. All of it is kept in one file an
-episode, so that another policy is replayed without sensing anything again.
+every set of views is verified once: exactly as ``Session`` would. All of it is kept in a folder of
+its own, so that another policy is replayed without sensing anything again.
 """
 
 import time
 import zipfile
-from collections.abc import Callable, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
 
@@ -78,7 +81,7 @@ class ThingEpisode:
         thing: int,
         draw: int,
         setting: Setting,
-        file: Path | None = None,
+        folder: Path | None = None,
     ) -> None:
         """Place the thing, or go on with what was kept of it.
 
@@ -88,32 +91,24 @@ class ThingEpisode:
             thing: its number among them.
             draw: number of the draw.
             setting: how it is shown.
-            file: where all is kept; None for nowhere.
+            folder: where all is kept; None for nowhere.
         """
         self.things = things
         self.thing = thing
         self._mesh = mesh
         self._seed = (setting.seed, thing, draw)
         self._setting = setting
-        self._file = file
-        self._kept: dict[str, NDArray[Any]] = {} if file is None else read_arrays(file)
-        self._changed = False
+        self._kept = KeptArrays(folder)
         self._stage: _Stage | None = None
         self._views: dict[int, Observation] = {}
         self._verified: dict[frozenset[int], tuple[Verified, float]] = {}
         if "start" not in self._kept:
-            self._keep("start", np.array(self._first_view()))
+            self._kept["start"] = np.array(self._first_view())
         self.start = int(self._kept["start"])
-
-    def _keep(self, name: str, values: NDArray[Any]) -> None:
-        self._kept[name] = values
-        self._changed = True
 
     def save(self) -> None:
         """Write down what is new."""
-        if self._file is not None and self._changed:
-            write_arrays(self._file, self._kept)
-            self._changed = False
+        self._kept.save()
 
     @property
     def stage(self) -> "_Stage":
@@ -143,19 +138,19 @@ class ThingEpisode:
         camera = self.stage.camera(view)
         observation = camera.observe(SPHERE.poses[view])
         for name, values in _arrays_of(observation).items():
-            self._keep(f"{view}.{name}", values)
+            self._kept[f"{view}.{name}"] = values
         in_camera = np.full((4, 4), np.nan)
         if camera.true_pose is not None:
             in_camera = np.linalg.inv(camera.true_pose) @ self.stage.in_truth
-        self._keep(f"{view}.in_camera", in_camera)
+        self._kept[f"{view}.in_camera"] = in_camera
         if "true_pose" not in self._kept:
-            self._keep("true_pose", self.stage.true_pose)
+            self._kept["true_pose"] = self.stage.true_pose
 
     def log_evidence(self, view: int) -> NDArray[np.floating]:
         """What the features say of a view that shows the thing."""
         name = f"{view}.evidence"
         if name not in self._kept:
-            self._keep(name, self.things.log_evidence([self.observation(view)])[0])
+            self._kept[name] = self.things.log_evidence([self.observation(view)])[0]
         return self._kept[name]
 
     def seen(self, views: Sequence[int]) -> list[int]:
@@ -178,9 +173,9 @@ class ThingEpisode:
         evidence = np.stack([self.log_evidence(view) for view in views])
         begun = time.process_time()
         found = self.things.verify(observations, evidence)
-        self._keep(f"{name}.seconds", np.array(time.process_time() - begun))
+        self._kept[f"{name}.seconds"] = np.array(time.process_time() - begun)
         for part, values in vars(found).items():
-            self._keep(f"{name}.{part}", values)
+            self._kept[f"{name}.{part}"] = values
 
     def belief_in_truth(self, views: Sequence[int]) -> float:
         """Belief in the true thing after some views."""
@@ -363,7 +358,7 @@ def _arrays_of(observation: Observation) -> dict[str, NDArray[Any]]:
     return arrays | {"numbers": np.concatenate(numbers)}
 
 
-def _observation(kept: dict[str, NDArray[Any]], view: int) -> Observation:
+def _observation(kept: "KeptArrays", view: int) -> Observation:
     """The observation that some arrays hold."""
     numbers = kept[f"{view}.numbers"]
     scene = None
@@ -386,30 +381,72 @@ def _observation(kept: dict[str, NDArray[Any]], view: int) -> Observation:
     )
 
 
-def write_arrays(file: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    """Write arrays into one file, whole or not at all, in the layout of ``numpy.savez``.
+class KeptArrays:
+    """Arrays by name that are kept in a folder: a file for each time that new ones were written.
 
-    Depth images are mostly empty, so that the fastest compression is nearly as good as any.
+    The files have the layout of ``numpy.savez``. What is not asked for is not unpacked.
     """
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with new_file(file, overwrite=True) as part:
-        archive = zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
-        with archive:
-            for name, values in arrays.items():
-                with archive.open(f"{name}.npy", "w") as member:
-                    np.lib.format.write_array(member, np.asanyarray(values), allow_pickle=False)
+
+    def __init__(self, folder: Path | None) -> None:
+        """Look what is there.
+
+        Args:
+            folder: that need not be there yet; None to keep nothing.
+
+        Raises:
+            ResultsError: a file is damaged.
+        """
+        self._folder = folder
+        self._known: dict[str, NDArray[Any]] = {}
+        self._new: set[str] = set()
+        self._packed: dict[str, Any] = {}
+        files = [] if folder is None or not folder.is_dir() else sorted(folder.glob("*.npz"))
+        for file in files:
+            with _unpacked(file):
+                archive = np.load(BytesIO(file.read_bytes()), allow_pickle=False)
+            self._packed |= dict.fromkeys(archive.files, (file, archive))
+
+    def __contains__(self, name: str) -> bool:
+        """Whether there is an array of this name."""
+        return name in self._known or name in self._packed
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """The array of this name."""
+        if name not in self._known:
+            file, archive = self._packed[name]
+            with _unpacked(file):
+                self._known[name] = archive[name]
+        return self._known[name]
+
+    def __setitem__(self, name: str, values: NDArray[Any]) -> None:
+        """Keep an array."""
+        self._known[name] = np.asanyarray(values)
+        self._new.add(name)
+
+    def save(self) -> None:
+        """Write what is new into one more file, whole or not at all.
+
+        Depth images are mostly empty, so that the fastest compression is nearly as good as any.
+        """
+        if self._folder is None or not self._new:
+            return
+        self._folder.mkdir(parents=True, exist_ok=True)
+        number = len(list(self._folder.glob("*.npz")))
+        with new_file(self._folder / f"{number:06d}.npz") as part:
+            archive = zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
+            with archive:
+                for name in sorted(self._new):
+                    with archive.open(f"{name}.npy", "w") as member:
+                        np.lib.format.write_array(member, self._known[name], allow_pickle=False)
+        self._new.clear()
 
 
-def read_arrays(file: Path) -> dict[str, NDArray[Any]]:
-    """What ``write_arrays`` wrote; nothing if there is no such file.
-
-    Raises:
-        ResultsError: the file is damaged.
-    """
-    if not file.exists():
-        return {}
+@contextmanager
+def _unpacked(file: Path) -> Iterator[None]:
+    """Say in one sentence that a file is damaged."""
     try:
-        with file.open("rb") as content, np.load(content, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ResultsError(f"{file}: is damaged ({error}); remove it, and run again") from None
+        yield
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ResultsError(
+            f"{file}: is damaged ({error}); remove its folder, and run again"
+        ) from None

@@ -278,7 +278,7 @@ def _as_table(alike: Alikeness) -> "pd.DataFrame":
     return pd.DataFrame(
         {
             "thing": alike.names,
-            "most_alike": [alike.names[k] for k in alike.nearest],
+            "most_alike": alike.nearest,
             "distance": alike.distance,
             "confusable": alike.confusable,
         }
