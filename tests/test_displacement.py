@@ -16,6 +16,7 @@ import nextview
 from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.displacement import displacement
 from nextview.sensing.lean import FRAME_LEAN, lean_of
+from nextview.sensing.segmentation import Plane
 from nextview.session.pose_frame import PoseFrame
 
 CARTON = box((0.12, 0.07, 0.09), (0.02, 0, 0.045))
@@ -136,6 +137,10 @@ def test_the_displacement_moves_with_the_world():
 # A table that leans
 
 
+def plane_of(lean) -> Plane:
+    return Plane(np.array([*lean, 1.0]), 0.0)
+
+
 def leaning(degrees, azimuth) -> np.ndarray:
     a = np.radians(azimuth)
     axis = np.array([np.cos(a), np.sin(a), 0])
@@ -168,12 +173,12 @@ azimuths = st.lists(st.floats(0, 2 * np.pi), min_size=2, max_size=6)
 def test_depth_that_leans_every_plane_with_the_camera_is_no_lean(turns, forward, aside):
     """The same error in the camera's frame from all sides: never named, whatever its size."""
     poses = [pose_at(40, np.degrees(turn), 0.5) for turn in turns]
-    normals = []
+    planes = []
     for pose in poses:
         ahead = pose[:2, 2] / np.linalg.norm(pose[:2, 2])
         right = np.array([ahead[1], -ahead[0]])
-        normals.append(np.array([*(forward * ahead + aside * right), 1.0]))
-    found = lean_of(normals, poses, np.eye(3))
+        planes.append(plane_of(forward * ahead + aside * right))
+    found = lean_of(planes, poses, np.eye(3))
     assert not found.noticed
 
 
@@ -182,17 +187,19 @@ def test_from_all_sides_the_lean_is_the_mean():
     poses = [pose_at(40, azimuth, 0.5) for azimuth in range(0, 360, 45)]
     lean = np.array([0.03, -0.02])
     error = [0.02 * pose[:2, 2] / np.linalg.norm(pose[:2, 2]) for pose in poses]
-    found = lean_of([np.array([*(lean + e), 1.0]) for e in error], poses, np.eye(3))
+    found = lean_of([plane_of(lean + e) for e in error], poses, np.eye(3))
     np.testing.assert_allclose(found.lean, lean, atol=1e-4)
     assert found.deviation == pytest.approx(FRAME_LEAN / np.sqrt(len(poses)), rel=0.01)
 
 
 def test_frames_that_disagree_say_less_of_the_lean():
     poses = [pose_at(40, azimuth, 0.5) for azimuth in (0, 120, 240)]
-    alike = [np.array([0.03, 0, 1.0])] * 3
-    scattered = [np.array([x, y, 1.0]) for x, y in ((0.09, 0), (0, -0.06), (0, 0.06))]
+    alike = [plane_of((0.03, 0))] * 3
+    scattered = [plane_of(lean) for lean in ((0.09, 0), (0, -0.06), (0, 0.06))]
     assert lean_of(alike, poses, np.eye(3)).noticed
     assert not lean_of(scattered, poses, np.eye(3)).noticed
+    noisy = [replace(plane, lean_error=0.03) for plane in alike]
+    assert not lean_of(noisy, poses, np.eye(3)).noticed
 
 
 # In a session

@@ -32,16 +32,19 @@ FARTHEST_SHIFT = 5.0  # standard deviations from which it is no error of an arm
 POINTS = 200  # of a surface that are looked up in another frame
 FACETS = 3000  # of a surface in which points are looked up
 COMPARED = 2  # earlier frames, those from the nearest directions
-ALIKE = 60.0  # so many points are as good as all of them: neighbours err together
+ALIKE = 60.0  # so many points are as good as all that are looked up: neighbours err together
 SURFACE_ERROR = 0.003  # of a depth, as a part of it, beside the noise
 PLANE_ERROR = 0.002  # of the height of a support plane, as a part of the distance
 OUTLINE_PITCHES = 1.5  # distances of facets that an outline is blurred by
 NOT_HIDDEN = 0.02  # part of the depth by which a frame has to look past a point
-SAME_SIDE = 0.5  # cosine of the angle between the normals of one surface in two frames
+SAME_SIDE = 0.8  # cosine of the angle between the normals of one surface in two frames
 REACHES = (4.0, 2.5, 1.5, 1.0, 1.0)
 """Standard deviations of a point at which a pull counts half, in each step."""
 FURTHER = (1.0, 0.6, 0.3, 0.0, 0.0)
 """Parts of the shift to be expected by which points may still be off, in each step."""
+WORST_FIT = np.log(2)
+"""Mean of log(1 + squared deviation) that surfaces may have after the last step: one standard
+deviation. Nothing fits what has moved far."""
 FEWEST_PULLS = 20  # from which a shift is told
 DEPTH_ERROR = 0.01
 """Metres at a distance of 1 m, standard deviation of a shift by errors that a depth camera has in
@@ -230,8 +233,9 @@ class _Fit:
 
 
 def _searched(latest: _Surface, earlier: Sequence[_Surface], start: Float) -> _Fit | None:
-    """The best shift near one; None where too little tells, or it leads far away."""
+    """The best shift near one; None where too little tells, it leads far away, or nothing fits."""
     expected = float(np.hypot(CAMERA_PLACE, CAMERA_AIM * latest.distance))
+    looked_up = sum(len(one.sample) + len(latest.sample) for one in earlier)
     moved = -start
     information = np.eye(3) / expected**2
     cost = np.inf
@@ -249,7 +253,7 @@ def _searched(latest: _Surface, earlier: Sequence[_Surface], start: Float) -> _F
 
         scale = np.hypot(deviations, further)
         robust = 1 / (1 + (distances / (reach * scale)) ** 2)
-        weight = robust / scale**2 * min(1.0, ALIKE / len(distances))
+        weight = robust / scale**2 * min(1.0, ALIKE / looked_up)
         information = (directions.T * weight) @ directions + np.eye(3) / expected**2
         pull = (directions.T * weight) @ distances - (moved + start) / expected**2
         moved = moved + np.linalg.solve(information, pull)
@@ -260,7 +264,7 @@ def _searched(latest: _Surface, earlier: Sequence[_Surface], start: Float) -> _F
             break  # two steps lead nowhere: further ones would find no shift that is mended
         cost = float(np.log1p((distances / deviations) ** 2).mean())
     shift = -moved
-    if np.linalg.norm(shift - start) > FARTHEST_SHIFT * expected:
+    if np.linalg.norm(shift - start) > FARTHEST_SHIFT * expected or cost > WORST_FIT:
         return None
     return _Fit(shift, np.asarray(np.linalg.inv(information), np.float64), cost)
 
@@ -280,4 +284,5 @@ def _heights(latest: _Surface, earlier: Sequence[_Surface], moved: Float) -> _Pu
     foot = here - plane.height(here) * plane.normal + moved
     below = -np.array([float(other.height(foot)) for other in others])
     normals = np.array([other.normal for other in others])
-    return _Pulls(normals, below, np.full(len(others), PLANE_ERROR * latest.distance))
+    leans = np.array([float(np.hypot(plane.lean_error, other.lean_error)) for other in others])
+    return _Pulls(normals, below, latest.distance * np.hypot(PLANE_ERROR, leans))

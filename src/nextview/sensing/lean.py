@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.sensing.segmentation import Plane
+
 Float = NDArray[np.float64]
 
 DEPTH_LEAN = np.radians(2.0)
@@ -15,7 +17,7 @@ DEPTH_LEAN = np.radians(2.0)
 the camera sees it: of fifty frames of a real Kinect whose poses are exact, half lean by 1.3 degrees
 or more, and a tenth by 2.7.
 """
-FRAME_LEAN = np.radians(0.6)  # by how much the pose of a single frame leans it
+FRAME_LEAN = np.radians(0.5)  # by how much the pose of a single frame leans it, beside its noise
 UNKNOWN_LEAN = np.radians(30.0)  # deviation of a lean of which nothing is known
 NOTICED = 3.0  # standard deviations that errors do not explain
 LEAST_LEAN = np.radians(1.0)  # below which it does not matter
@@ -45,18 +47,19 @@ class Lean:
         return size > max(NOTICED * self.deviation, LEAST_LEAN)
 
 
-def lean_of(normals: Sequence[Float], cameras: Sequence[Float], axes: Float) -> Lean:
+def lean_of(planes: Sequence[Plane], cameras: Sequence[Float], axes: Float) -> Lean:
     """What some frames together say of the lean of the support plane.
 
     A camera whose depth errs leans the plane with itself: it leans another way in the world when
     the camera looks from another side. What stays the same in the world is the plane's own.
 
     Args:
-        normals: of the plane in each frame, world, (3,) each.
+        planes: the support plane as each frame shows it.
         cameras: camera-to-world poses, (4, 4) each.
         axes: rows x, y and z (up), (3, 3).
     """
-    leans = np.array([axes[:2] @ normal for normal in normals])
+    leans = np.array([axes[:2] @ plane.normal for plane in planes])
+    weights = 1 / (FRAME_LEAN**2 + np.array([plane.lean_error for plane in planes]) ** 2)
     ahead = np.array([axes[:2] @ pose[:3, 2] for pose in cameras])
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
 
@@ -65,12 +68,12 @@ def lean_of(normals: Sequence[Float], cameras: Sequence[Float], axes: Float) -> 
     turned = ahead @ [1, 1j]
     matrix = np.stack([np.ones(len(measured)), turned], 1)
     prior = np.diag([1 / UNKNOWN_LEAN**2, 1 / DEPTH_LEAN**2])
-    information = matrix.conj().T @ matrix / FRAME_LEAN**2 + prior
+    information = (matrix.conj().T * weights) @ matrix + prior
     covariance = np.linalg.inv(information)
-    found = covariance @ (matrix.conj().T @ measured) / FRAME_LEAN**2
+    found = covariance @ ((matrix.conj().T * weights) @ measured)
 
     # Frames that disagree by more than their poses should say less.
-    left = np.abs(measured - matrix @ found) ** 2 / (2 * FRAME_LEAN**2)
+    left = np.abs(measured - matrix @ found) ** 2 * weights / 2
     disagree = max(1.0, float(np.sqrt(left.sum() / max(1, len(left) - 1))))
     deviation = disagree * float(np.sqrt(covariance[0, 0].real))
     return Lean(np.array([found[0].real, found[0].imag]), deviation)

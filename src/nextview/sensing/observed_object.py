@@ -117,7 +117,7 @@ class Sighting:
             self,
             frame=self.frame.shifted(shift),
             hull=self.hull + shift,
-            plane=plane and Plane(plane.normal, plane.offset - float(plane.normal @ shift)),
+            plane=plane and replace(plane, offset=plane.offset - float(plane.normal @ shift)),
             shift=self.shift + shift,
         )
 
@@ -450,9 +450,9 @@ class ObservedObject:
         shown = [sighting for sighting in sightings if sighting.plane is not None]
         if self.up is None or len(shown) < 2:  # of one frame it may be an error of its depth
             return []
-        normals = [sighting.plane.normal for sighting in shown if sighting.plane is not None]
+        planes = [sighting.plane for sighting in shown if sighting.plane is not None]
         poses = [sighting.frame.camera_to_world for sighting in shown]
-        return plausibility.check_lean(lean_of(normals, poses, upright_axes(self.up)))
+        return plausibility.check_lean(lean_of(planes, poses, upright_axes(self.up)))
 
     def _near(self, samples: Samples) -> Mask:
         """Which samples lie in the sphere of the object, as it is known from earlier frames, (N,)

@@ -115,12 +115,18 @@ def _sums_along(values: NDArray[np.floating], side: int) -> NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Plane:
-    """Positions p with ``normal @ p + offset`` = 0, normal of unit length; above it that is the
-    height in metres.
+    """Positions p with ``normal @ p + offset`` = 0; above it that is the height in metres.
+
+    Attributes:
+        normal: of unit length, (3,).
+        offset: metres.
+        lean_error: by how much it may lean, as far as the thickness and the extent of what is seen
+            of it tell, radians, one standard deviation; 0 where that is not known.
     """
 
     normal: Float
     offset: float
+    lean_error: float = 0.0
 
     def height(self, points: Float) -> Float:
         """Of points (..., 3) above the plane, metres."""
@@ -224,9 +230,11 @@ def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:
         weight = 1 / tolerance[on, None] ** 2
         centre = (weight * points[on]).sum(0) / weight.sum()
         spread = points[on] - centre
-        normal = np.linalg.eigh((weight * spread).T @ spread)[1][:, 0]
-        normal *= np.sign(normal @ plane.normal) or 1.0
-        plane = Plane(normal, float(-normal @ centre))
+        squares, directions = np.linalg.eigh((weight * spread).T @ spread)
+        normal = directions[:, 0] * (np.sign(directions[:, 0] @ plane.normal) or 1.0)
+        # Neighbours err together: it may lean by half as much as a sample is off at its edge.
+        error = float(np.sqrt(max(squares[0], 0.0) / max(squares[1], 1e-12))) / 2
+        plane = Plane(normal, float(-normal @ centre), error)
     return plane
 
 

@@ -7,7 +7,7 @@ part of the object.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -74,7 +74,8 @@ def level_planes(samples: Samples, first: Plane) -> list[Plane]:
             break
         on = np.flatnonzero(left)[near[:, best]]
         weight = 1 / samples.tolerance[on] ** 2
-        parallel = Plane(first.normal, first.offset - float(weight @ height[on] / weight.sum()))
+        offset = first.offset - float(weight @ height[on] / weight.sum())
+        parallel = replace(first, offset=offset)
         better = refine_plane(parallel, samples.some(_only(on, len(height))), loose=2)
         planes.append(better if better.normal @ first.normal > PARALLEL else parallel)
         left &= np.abs(planes[-1].height(samples.points)) > 2 * samples.tolerance
