@@ -22,9 +22,7 @@ HIDDEN = 1.5  # object radii before its centre from which something else hides i
 
 @dataclass(frozen=True)
 class Taken:
-    """A captured view that answered a request, and how far off the direction asked for it is,
-    from the object.
-    """
+    """A captured view that answered a request, and its angular distance from it."""
 
     frame: CapturedFrame
     degrees_off: float

@@ -1,5 +1,4 @@
-"""Mistakes of a camera that are the same in all frames of a capture, and which of them makes the
-frames agree.
+"""Mistakes of a camera that are the same in all frames of a capture.
 
 Pictures that are flipped, a wrong focal length, and poses of a place beside the camera: each moves
 all that is seen with the camera, so that frames from different sides contradict each other.
@@ -40,8 +39,7 @@ NOT_OBSERVED = 1e-2
 
 
 def find_camera_mistake(views: Sequence[SurfaceView], poses: Float, intrinsics: Float) -> str:
-    """What is wrong with the camera of some frames, the end of a sentence; "" if nothing that would
-    explain them.
+    """Return what is wrong with the camera of some frames, in words; "" if nothing.
 
     Args:
         views: N frames.
@@ -133,9 +131,7 @@ def _moved(poses: Float, offset: Float) -> Float:
 
 
 def _fitted_offset(views: Sequence[SurfaceView], poses: Float) -> Float:
-    """The offset along the cameras' axes, (3,), metres, with which the frames contradict each
-    other least.
-    """
+    """Return the offset along the cameras' axes, (3,), metres, with fewest contradictions."""
     few = np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_FITTED)).astype(int))
     some = [views[i] for i in few]
 
@@ -155,8 +151,7 @@ def _fitted_offset(views: Sequence[SurfaceView], poses: Float) -> Float:
 
 
 def _offset_of_middles(views: Sequence[SurfaceView], poses: Float) -> Float:
-    """The offset, (3,), metres, with which the middles of what stands on the plane are nearest to
-    each other.
+    """Return the offset, (3,), metres, that brings the object's middles closest together.
 
     Least squares in the place w of the object and the offset d, with w - R d = R c + t for the
     middle c that a camera of the pose (R, t) sees. Cameras see the near side of the object: that is

@@ -1,6 +1,4 @@
-"""Check captured frames: leave out and count what cannot be used, and refuse poses that cannot
-be right.
-"""
+"""Check captured frames: leave out unusable ones, and refuse wrong poses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -71,7 +69,16 @@ def check_capture(capture: Capture, masked: bool = True) -> tuple[Capture, dict[
 
 
 def refuse_many(capture: Capture, refused: Mapping[str, str], total: int) -> None:
-    """Raise DatasetError if more than a tenth of so many frames, and more than one, are refused."""
+    """Refuse a capture of which too many frames cannot be used.
+
+    Args:
+        capture: the capture.
+        refused: reasons by the names of the frames.
+        total: number of all frames.
+
+    Raises:
+        DatasetError: they are more than one and more than a tenth.
+    """
     if len(refused) == total or len(refused) > max(1, MOST_REFUSED * total):
         what = f"{len(refused)} of {total} frames cannot be used"
         raise DatasetError(f"{capture.folder}: {what}: {summary(refused)}")
@@ -191,7 +198,15 @@ class Evidence:
 
     @classmethod
     def of(cls, views: Sequence[SurfaceView], poses: np.ndarray) -> "Evidence":
-        """That of frames with some poses, camera-to-world, (N, 4, 4)."""
+        """Compare frames under some poses.
+
+        Args:
+            views: surfaces that the frames show.
+            poses: camera-to-world, (N, 4, 4).
+
+        Returns:
+            The evidence.
+        """
         standing = [view.some(view.standing) for view in views]
         return cls(
             compare(views, poses),
@@ -201,8 +216,7 @@ class Evidence:
 
 
 def _to_blame(evidence: Evidence) -> dict[int, float]:
-    """Frames that contradict the others much more than these each other, the worst first, with the
-    confirmed share.
+    """Return frames that contradict the others most, worst first, with confirmed shares.
 
     A frame is blamed where most of its points are contradicted, or most of those that stand out of
     the largest plane; or, looked at sharply, many times as many of them as in the other frames.
@@ -234,8 +248,7 @@ def _enough_judged(agreement: Agreement) -> np.ndarray:
 
 
 def _disagreeing(evidence: Evidence, left: np.ndarray) -> bool:
-    """Whether frames, without those that are blamed, contradict each other about what stands on the
-    plane.
+    """Return whether the remaining frames contradict each other about the object.
 
     All of them do, or those from one frame on contradict those before.
     """
@@ -263,9 +276,7 @@ def _unexplained(capture: Capture, compared: np.ndarray, evidence: Evidence) -> 
 
 
 def _break(agreement: Agreement) -> int:
-    """The first of the frames that agree with each other, but not with those before; 0 if there
-    is none.
-    """
+    """Return the first frame that disagrees with those before; 0 if there is none."""
     count = len(agreement.confirmed)
     best = 0
     largest = 0.0
@@ -290,9 +301,7 @@ def _across(agreement: Agreement, first: int) -> Agreement:
 
 
 def _late_frames(capture: Capture, compared: np.ndarray, shifts: Sequence[Shift]) -> dict[str, str]:
-    """Frames with the poses of others and why they are left out; also those between them that
-    were not compared.
-    """
+    """Return frames with the poses of others, and why they are left out."""
     refused = {}
     for shift in shifts:
         reason = f"its pose is {_frames_late(shift)}"
@@ -315,9 +324,7 @@ def _shift_in_words(capture: Capture, compared: np.ndarray, shift: Shift) -> str
 
 
 def _frames_late(shift: Shift) -> str:
-    """By how many frames poses are late: one frame late: each frame has the pose of an earlier
-    one.
-    """
+    """Return by how many frames poses are late, in words."""
     many = "one frame" if abs(shift.frames) == 1 else f"{abs(shift.frames)} frames"
     if shift.frames > 0:
         return f"{many} late: each frame has the pose of an earlier one"
@@ -325,9 +332,7 @@ def _frames_late(shift: Shift) -> str:
 
 
 def _in_words(capture: Capture, mistake: PoseMistake, depth: float, unit: float) -> str:
-    """What a mistake looks like; of a scale whether it is that of the translations or of the
-    depth.
-    """
+    """Return what a mistake looks like, in words."""
     if mistake.scale == 1:
         return mistake.sentence
     said = [mistake.sentence] if mistake.sentence else []

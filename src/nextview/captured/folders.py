@@ -234,9 +234,7 @@ class _BoxFile(Struct, forbid_unknown_fields=True):
 
 
 def read_box(path: Path) -> Box:
-    """An upright box in a JSON file: "low" and "high", its corners, metres, and "axes", rows, if
-    not the world's.
-    """
+    """Read an upright box from a JSON file with "low", "high" and, if needed, "axes"."""
     box = read_record(path, _BoxFile, "a box", DatasetError)
     try:
         return Box(
@@ -268,9 +266,7 @@ LACKS_POSE = (
 
 
 def _bop_mask(folder: Path, name: str, here: list[int]) -> Path | None:
-    """The mask of an object by its place in an image; of all objects, without scene_gt.json, if
-    there is only one.
-    """
+    """Read the mask of an object by its number in an image."""
     which = f"{here[0]:06d}" if here else "*"
     masks = list(folder.glob(f"mask_visib/{name}_{which}.png"))
     return masks[0] if len(masks) == 1 else None
@@ -341,9 +337,7 @@ def _read_bop(folder: Path, intrinsics: Float | None, how: Reading) -> Views:
 
 
 def _from_world_to_camera(rotation: list[float], translation: list[float], where: str) -> Float:
-    """The camera-to-world pose of BOP's world-to-camera rotation, row by row, and translation,
-    millimetres.
-    """
+    """Convert BOP's world-to-camera transform to a camera-to-world pose."""
     pose = np.eye(4)
     pose[:3, :3] = np.reshape(rotation, (3, 3)).T
     pose[:3, 3] = -pose[:3, :3] @ (np.array(translation) * MILLIMETRES)
@@ -351,9 +345,7 @@ def _from_world_to_camera(rotation: list[float], translation: list[float], where
 
 
 def _read_tum(folder: Path, intrinsics: Float | None, _: Reading) -> Views:
-    """Views by depth.txt and groundtruth.txt; images of rgb.txt, and masks of the depth images'
-    names in mask/.
-    """
+    """Read views by depth.txt and groundtruth.txt, with images and masks if there are any."""
     if intrinsics is None:
         raise DatasetError(
             f"{folder}: the intrinsics are missing, which this layout does not hold; put the"
@@ -429,9 +421,7 @@ BAG = "ROS 2 bag"
 
 
 def _nearest(time: float, others: Float) -> int | None:
-    """Which of other times, (N,) seconds, is nearest, if it is near enough; a gap of just the
-    limit counts.
-    """
+    """Return which of other times, (N,) seconds, is nearest, if it is near enough."""
     gaps = np.abs(others - time)
     return int(gaps.argmin()) if len(gaps) and gaps.min() <= TOGETHER + 1e-6 else None
 
@@ -449,9 +439,7 @@ def _images(path: Path) -> tuple[Float, list[Path]]:
 
 
 def _trajectory(path: Path) -> tuple[Float, Float, int]:
-    """Times, (N,) seconds, camera-to-world poses, (N, 4, 4), and how many lines hold none: the
-    camera was lost.
-    """
+    """Read times, (N,) seconds, poses, (N, 4, 4), and the number of lines without one."""
     words = lines_of(path, 8, "times, positions and quaternions (x, y, z, w)")
     values = numbers_of(path, words, finite=False)
     length = np.linalg.norm(values[:, 4:], axis=1)

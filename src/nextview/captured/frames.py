@@ -179,12 +179,33 @@ class Capture:
 
 
 def pinhole_of(fx: float, fy: float, cx: float, cy: float) -> Float:
-    """Pinhole matrix, (3, 3), of focal lengths and principal point, pixels."""
+    """Return the pinhole matrix of focal lengths and a principal point.
+
+    Args:
+        fx: focal length along the rows, pixels.
+        fy: focal length along the columns, pixels.
+        cx: column of the principal point, pixels.
+        cy: row of the principal point, pixels.
+
+    Returns:
+        Matrix, (3, 3) float64.
+    """
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
 def rigid(pose: ArrayLike, where: str) -> Float:
-    """A copy of a rigid pose, (4, 4); a DatasetError that begins with ``where`` if it is none."""
+    """Check and copy a rigid pose.
+
+    Args:
+        pose: (4, 4).
+        where: beginning of the error message.
+
+    Returns:
+        The copy, (4, 4) float64.
+
+    Raises:
+        DatasetError: the pose is not rigid.
+    """
     try:
         return check_pose(pose)
     except ObservationError as error:
@@ -192,7 +213,19 @@ def rigid(pose: ArrayLike, where: str) -> Float:
 
 
 def lines_of(path: Path, columns: int, what: str) -> list[list[str]]:
-    """The words of each line that is no comment: at least one line, of so many words."""
+    """Read the words of each line that is no comment.
+
+    Args:
+        path: of the file.
+        columns: number of words in each line.
+        what: content of the file, for messages.
+
+    Returns:
+        The words of each line; at least one line.
+
+    Raises:
+        DatasetError: the file cannot be read, is empty, or has other lines.
+    """
     regular_file(path, f"a list of {what}", DatasetError, LARGEST_TEXT)
     try:
         lines = [(n, line.split()) for n, line in enumerate(path.read_text().splitlines(), 1)]
@@ -209,7 +242,19 @@ def lines_of(path: Path, columns: int, what: str) -> list[list[str]]:
 
 
 def numbers_of(path: Path, words: list[list[str]], finite: bool = True) -> Float:
-    """The numbers that words of a file stand for; a DatasetError names the file."""
+    """Convert the words of a file to numbers.
+
+    Args:
+        path: of the file, for messages.
+        words: of each line.
+        finite: whether all have to be finite.
+
+    Returns:
+        The numbers.
+
+    Raises:
+        DatasetError: a word is not a number, or not finite.
+    """
     try:
         values = np.array(words, np.float64)
     except ValueError as error:
@@ -222,7 +267,19 @@ def numbers_of(path: Path, words: list[list[str]], finite: bool = True) -> Float
 
 
 def read_table(path: Path, what: str, side: int) -> Float:
-    """A square table of numbers."""
+    """Read a square table of numbers.
+
+    Args:
+        path: of the file.
+        what: content of the file, for messages.
+        side: rows and columns.
+
+    Returns:
+        The table, (side, side) float64.
+
+    Raises:
+        DatasetError: the file holds another table.
+    """
     values = numbers_of(path, lines_of(path, side, what))
     if len(values) != side:
         raise DatasetError(f"{path}: not {what}, {side} x {side} numbers")

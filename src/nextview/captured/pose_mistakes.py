@@ -85,9 +85,16 @@ class Posed:
 
 
 def find_mistake(posed: Posed, as_read: Agreement) -> PoseMistake | None:
-    """The mistake without which frames agree much better; None if there is none.
+    """Return the mistake whose correction makes frames agree much better.
 
-    First each mistake alone is tried, then two at once.
+    First each mistake is tried alone, then two at once.
+
+    Args:
+        posed: the frames with their poses.
+        as_read: agreement of the frames as they are.
+
+    Returns:
+        The mistake; None if there is none.
     """
     overlap = as_read.judged / max(_judgeable(posed.views), 1)
     if overlap > NO_OVERLAP and as_read.share > CERTAIN_SHARE:
@@ -100,9 +107,7 @@ def find_mistake(posed: Posed, as_read: Agreement) -> PoseMistake | None:
 
 
 def _best(posed: Posed, as_read: Agreement, mistakes: Sequence[PoseMistake]) -> PoseMistake | None:
-    """Of the mistakes that explain much better what is seen, the one with the most confirmed
-    points.
-    """
+    """Return the mistake with the most confirmed points, if it explains much more."""
     best = None
     most_confirmed = 0.0
     for mistake in mistakes:
@@ -153,9 +158,7 @@ def _judgeable(views: Sequence[SurfaceView]) -> float:
 
 
 def _in_one_place(views: Sequence[SurfaceView], poses: Float) -> bool:
-    """Whether all cameras stand in one place: then a round thing agrees with itself however they
-    are turned.
-    """
+    """Return whether all cameras stand in one place, where rotations cannot be told."""
     depths = [np.median(view.points[:, 2]) for view in views if len(view.points)]
     places = poses[:, :3, 3]
     apart = np.linalg.norm(places - np.median(places, 0), axis=1)
@@ -174,9 +177,7 @@ def _relative_change(poses: Float, others: Float) -> NDArray[np.bool_]:
 
 
 def _single_mistakes(to_world: bool, unit: float) -> list[PoseMistake]:
-    """All but shifts, of poses that a layout stores as camera-to-world or not, in some unit,
-    metres.
-    """
+    """Return all mistakes but shifts, of poses in some convention and unit."""
     stored = "camera-to-world"
     other = "world-to-camera"
     if not to_world:

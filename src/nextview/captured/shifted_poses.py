@@ -65,8 +65,14 @@ class Shifted:
     _known: dict[tuple[int, int], Agreement] = field(default_factory=dict)
 
     def agreement(self, late: Index, late_there: Index) -> Agreement:
-        """Of frames, by row, whose poses are late by so many frames, with pictures, by column,
-        that are, (N,) each.
+        """Return the agreement of frames whose poses or pictures are late.
+
+        Args:
+            late: by how many frames the pose of each frame is late, by row, (N,).
+            late_there: the same of the frames that it is compared with, by column, (N,).
+
+        Returns:
+            The agreement.
         """
         count = len(self.views)
         confirmed = np.zeros((count, count))
@@ -80,9 +86,7 @@ class Shifted:
         return Agreement(confirmed, contradicted)
 
     def poses_of(self, late: Index) -> Float:
-        """The right poses of the frames if those in the capture are late by so many frames, (N,
-        4, 4).
-        """
+        """Return the right poses, (N, 4, 4), if those of the capture are late."""
         return self.poses[np.clip(self.indices + late, 0, len(self.poses) - 1)]
 
     def has_pose(self, late: Index) -> NDArray[np.bool_]:
@@ -105,8 +109,7 @@ class Shifted:
 
 
 def find_shifts(views: Sequence[SurfaceView], indices: Index, poses: Float) -> list[Shift]:
-    """Parts of a capture whose poses are late or early; none if no such parts explain what the
-    frames contradict.
+    """Find parts of a capture whose poses are late or early.
 
     Parts are added one by one, each where it explains most contradictions.
 
@@ -144,9 +147,7 @@ def find_shifts(views: Sequence[SurfaceView], indices: Index, poses: Float) -> l
 
 
 def _best_part(shifted: Shifted, late: Index, least: float) -> Shift | None:
-    """The part that explains most contradictions if its poses are later than is known; None if
-    fewer than ``least``.
-    """
+    """Return the part that explains most contradictions with later poses; or None."""
     best = None
     most_explained = least
     for frames in FRAME_SHIFTS:
@@ -164,8 +165,7 @@ def _best_part(shifted: Shifted, late: Index, least: float) -> Shift | None:
 
 
 def _explained_by_parts(shifted: Shifted, late: Index, later: Index) -> Float:
-    """How many contradictions vanish if the frames from one, by row, to another, by column, have
-    later poses.
+    """Count the contradictions that vanish with later poses, by first and last frame.
 
     Frames that have no later pose explain nothing.
     """
@@ -218,9 +218,7 @@ def _sum(sums: Float, rows: slice, columns: slice) -> float:
 
 
 def _explained(shifted: Shifted, late: Index, later: Index) -> float:
-    """How many contradictions vanish if the frames have later poses, of those that have such
-    poses.
-    """
+    """Count the contradictions that vanish with later poses."""
     usable = shifted.has_pose(later)
     pairs = usable[:, None] & usable
     before = shifted.agreement(late, late).contradicted[pairs]
@@ -229,9 +227,7 @@ def _explained(shifted: Shifted, late: Index, later: Index) -> float:
 
 
 def _is_explained(shifted: Shifted, as_read: Index, late: Index) -> bool:
-    """Whether frames whose poses relative to each other change contradict each other much less
-    with the later poses.
-    """
+    """Return whether frames contradict each other much less with later poses."""
     usable = shifted.has_pose(late)
     changed = _relative_change(shifted.poses_of(as_read), shifted.poses_of(late))
     changed &= usable[:, None] & usable

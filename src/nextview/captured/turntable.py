@@ -1,6 +1,4 @@
-"""Frames of a thing on a turntable before a camera that stands still: their poses follow from
-the even steps.
-"""
+"""Poses of frames of a thing on a turntable, from its even steps."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -44,11 +42,20 @@ def is_turntable(folder: Path) -> bool:
 
 
 def read_turntable(folder: Path, turn: str) -> Capture:
-    """A capture of a thing that turned once around in even steps, "ccw" or "cw" as seen from above.
+    """Read the frames of a thing on a turntable that made one full turn in even steps.
 
-    Depth images in millimetres, in the order of their names. The axis is the normal of the support
-    plane, where the surfaces that neighbouring frames show agree best; its foot becomes the world's
-    origin. DatasetError: they do not agree, or a frame does not show a thing on a plane.
+    The axis is the normal of the support plane at the place where the surfaces of neighbouring
+    frames agree best; its foot becomes the world's origin.
+
+    Args:
+        folder: depth images in millimetres, in the order of their names, and the pinhole matrix.
+        turn: "ccw" or "cw", as seen from above.
+
+    Returns:
+        The frames with their poses.
+
+    Raises:
+        DatasetError: the frames do not agree, or one does not show a thing on a plane.
     """
     k = read_table(folder / INTRINSICS, "the pinhole matrix", 3)
     way = 1 if turn == "ccw" else -1
@@ -97,8 +104,7 @@ def read_turntable(folder: Path, turn: str) -> Capture:
 
 
 def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
-    """Where the axis goes through the plane, (2,), and how far apart each frame and the next are,
-    metres, (N,).
+    """Return the axis in the plane, (2,), and the distance of neighbouring frames, (N,).
 
     By points and planes, upright: each point comes to lie on the plane of its nearest neighbour,
     least squares.

@@ -1,6 +1,4 @@
-"""Write captured views of a mesh in BOP's layout, from a camera that casts rays: what
-``captured`` reads.
-"""
+"""Write simulated views of a mesh in BOP's layout."""
 
 import json
 from collections.abc import Iterator
@@ -35,12 +33,22 @@ def write_capture(
     masks: bool = True,
     overwrite: bool = False,
 ) -> Iterator[int]:
-    """Write a folder of captured views, and box.json, the object's upright box, whole; yields how
-    many are done.
+    """Write a folder of captured views and box.json, the object's upright box.
 
-    The world, metres, is z up and has the axes of the mesh, whose object radius is ``radius``; its
-    origin is below the object's centre, at its lowest point. The object may stand on a ``table``
-    that is seen too, and have ``masks``.
+    The world, metres, has z up and the axes of the mesh. Its origin is below the object's centre,
+    at its lowest point.
+
+    Args:
+        mesh: the object.
+        folder: to write.
+        sphere: viewpoints of the views.
+        radius: of the object, metres.
+        table: whether the object stands on a table that is visible too.
+        masks: whether to write masks of the object.
+        overwrite: whether to replace an earlier capture.
+
+    Yields:
+        Number of views done.
     """
     number(radius, "the object radius, in metres,", above=0)
     _check_others(folder, len(sphere), masks)
@@ -104,8 +112,7 @@ def _write_images(
 
 
 def _check_others(folder: Path, views: int, masks: bool) -> None:
-    """Refuse a folder with images that reading the new views would take for theirs, but that are
-    not replaced.
+    """Refuse a folder with images that would be taken for those of the new views.
 
     Raises:
         ResultsError: it holds colour or grey images of views of these numbers, or masks where none

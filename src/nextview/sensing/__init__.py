@@ -1,6 +1,4 @@
-"""From a sensor frame to an observation: units and frames, support plane, segmentation, object
-frame, denoising.
-"""
+"""From a sensor frame to an observation: plane, segmentation, object frame, denoising."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -23,9 +21,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """``ObservedObject`` takes SciPy, which ``nextview recognise`` starts without: imported when
-    it is used.
-    """
+    """Import ``ObservedObject`` when it is used, because it takes SciPy."""
     if name == "ObservedObject":
         from nextview.sensing.observed_object import ObservedObject
 

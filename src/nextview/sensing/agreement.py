@@ -120,8 +120,7 @@ class SurfaceView:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How often points of one frame, by row, are confirmed and contradicted by another one, by
-    column.
+    """How often points of a frame (row) are confirmed or contradicted by another (column).
 
     Attributes:
         confirmed: number of points, (N, N).
@@ -150,9 +149,7 @@ class Agreement:
         return Agreement(self.confirmed[which][:, which], self.contradicted[which][:, which])
 
     def of_each(self) -> tuple[Float, Float]:
-        """The confirmed share and the number of judged points of each frame, both ways, (N,)
-        each.
-        """
+        """Confirmed share and number of judged points of each frame, both ways, (N,) each."""
         confirmed = self.confirmed.sum(0) + self.confirmed.sum(1)
         judged = confirmed + self.contradicted.sum(0) + self.contradicted.sum(1)
         share = np.where(judged > 0, confirmed / np.maximum(judged, 1), 1.0)
@@ -224,9 +221,7 @@ def compare(
 
 
 def _looked_up(picture: Picture, points: Float, tolerance: Float) -> tuple[Index, Mask, Mask]:
-    """Which points, (P, 3), lie in a picture; which of these it confirms, and which it
-    contradicts.
-    """
+    """Return which points, (P, 3), lie in a picture, and are confirmed or contradicted."""
     height, width = picture.nearest.shape
     k = picture.intrinsics
     ahead = points[:, 2] > LEAST_DEPTH
@@ -278,9 +273,7 @@ def _picture(frame: Frame, columns: int) -> Picture:
 
 
 def _surface_points(frame: Frame) -> Float:
-    """A grid of points on the object's mask; without one, on smooth surfaces in the middle of
-    the picture, (N, 3).
-    """
+    """Return a grid of points on the object, or on smooth surfaces in the middle, (N, 3)."""
     side = max(1, frame.shape[1] // POINT_GRID)
     first = side // 2
     grid = frame.depth[first::side, first::side]
@@ -302,8 +295,7 @@ def _is_smooth(grid: NDArray[np.float32]) -> Mask:
 
 
 def _blockwise(image: NDArray, side: int, choose: np.ufunc) -> NDArray:
-    """Minimum or maximum of each square of ``side`` pixels; rows and columns that fill none are
-    left out.
+    """Return the minimum or maximum of each square of ``side`` pixels.
 
     ``choose`` is ``np.minimum`` or ``np.maximum``. Rows come first: that is faster than a reduction
     over two axes.
@@ -319,9 +311,7 @@ def _blockwise(image: NDArray, side: int, choose: np.ufunc) -> NDArray:
 
 
 def _in_the_middle(grid: NDArray[np.float32]) -> Mask:
-    """What the camera looks at: the middle of a picture, (h, w), without what lies far behind
-    it.
-    """
+    """Return the middle of a picture, (h, w), without what lies far behind it."""
     height, width = grid.shape
     middle = grid[height // 3 : height - height // 3, width // 3 : width - width // 3]
     measured = middle[middle > 0]
@@ -335,9 +325,7 @@ def _in_the_middle(grid: NDArray[np.float32]) -> Mask:
 def _half_off_the_plane(
     points: Float, frame: Frame, noise: Noise, rng: np.random.Generator
 ) -> tuple[Float, Mask]:
-    """Some points, and which stand out of the largest plane of a frame: one half, if there are
-    so many.
-    """
+    """Return some points, half of them out of the largest plane if possible."""
     # The plane is searched in the camera's frame: the pose may be wrong.
     unposed = Frame(frame.depth, frame.intrinsics, pixel_centre=0.5)
     plane = find_plane(sample(unposed, unposed.depth > 0, noise), rng)

@@ -1,5 +1,4 @@
-"""Cut what stands on a plane into pieces along concave edges and jumps in depth: neighbours meet in
-such edges.
+"""Cut what stands on a plane into pieces along concave edges and depth jumps.
 
 After the convexity rule of LCCP (Stein et al., "Object Partitioning Using Local Convexity", CVPR
 2014), on the image. Objects have concave edges too: ``clusters`` joins the pieces of one object
@@ -137,9 +136,7 @@ def cut(
 def _grown(
     label: NDArray[np.int64], mask: Mask, inverse: Inverse, tolerance: Inverse
 ) -> NDArray[np.int64]:
-    """Pieces with the pixels of edges: each goes to the piece beside it from whose pixel it
-    differs least in depth.
-    """
+    """Assign the pixels of edges to the adjacent piece with the most similar depth."""
     wide = np.pad(label, 1)
     deep = np.pad(inverse, 1).ravel()
     limit = np.pad(tolerance, 1).ravel()
@@ -164,9 +161,7 @@ def _enlarged(small: NDArray[Any], step: int, shape: tuple[int, ...]) -> NDArray
 
 
 def _bottoms(depth: NDArray[np.float32], mask: Mask, height: NDArray[np.float32]) -> Mask:
-    """Pixels of holes of the mask that lie over the plane as a whole, (H, W) bool: the bottom of
-    a bowl.
-    """
+    """Return holes of the mask that lie over the plane, (H, W) bool, such as a bowl's bottom."""
     holes = holes_of(mask) & (depth > 0)
     label, count = ndimage.label(holes)
     if not count:
@@ -176,9 +171,7 @@ def _bottoms(depth: NDArray[np.float32], mask: Mask, height: NDArray[np.float32]
 
 
 def _smooth(depth: NDArray[np.float32], mask: Mask) -> Inverse:
-    """Mean inverse depth of those of 3 x 3 pixels that are in the mask, (H, W), 1/metres; NaN
-    outside of it.
-    """
+    """Return the mean inverse depth of 3 x 3 pixels of the mask, (H, W), 1/metres, else NaN."""
     weight = ndimage.uniform_filter(mask.astype(np.float32), 3, mode="constant")
     inverse = np.where(mask, 1 / np.where(mask, depth, 1), 0).astype(np.float32)
     total = ndimage.uniform_filter(inverse, 3, mode="constant")
@@ -186,8 +179,7 @@ def _smooth(depth: NDArray[np.float32], mask: Mask) -> Inverse:
 
 
 def _concave(inverse: Inverse, tolerance: Inverse) -> Mask:
-    """Pixels in a concave edge, (H, W) bool: farther than the line between two others to both sides
-    of them.
+    """Return the pixels in concave edges, (H, W) bool.
 
     Inverse depth is linear over the image of a plane; ``tolerance`` is of its unit, (H, W). Where
     one of the two is no pixel of a thing, as in a narrow strip that shows beside what hides the
@@ -208,9 +200,7 @@ def _concave(inverse: Inverse, tolerance: Inverse) -> Mask:
 
 
 def _touching(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse) -> Mask:
-    """Which two pieces meet in space, (pieces + 1, pieces + 1) bool: both lead to one depth at
-    their border.
-    """
+    """Return which pieces meet in space, (pieces + 1, pieces + 1) bool."""
     # Its own pixels do not tell: where one thing hides another one, a sensor gives a slope between
     # them.
     near, far = LED
@@ -285,9 +275,7 @@ def _hanging(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse, sta
 
 
 def _borders(label: NDArray[np.int64], counted: list[Mask]) -> NDArray[np.int64]:
-    """How many pairs of pixels side by side, of those ``counted``, each two pieces share,
-    (pieces + 1, pieces + 1).
-    """
+    """Count the pairs of adjacent pixels that pieces share, (pieces + 1, pieces + 1)."""
     n = int(label.max()) + 1
     count = np.zeros((n, n), np.int64)
     for (one, other), wanted in zip(NEXT, counted, strict=True):

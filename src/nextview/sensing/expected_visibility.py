@@ -1,6 +1,4 @@
-"""What depth frames say of each voxel around an object, and the share of it that is expected to
-show from elsewhere.
-"""
+"""Voxels around an object by depth frames, and its expected visibility from elsewhere."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -25,9 +23,7 @@ UNSEEN, FREE, OCCLUDER, OBJECT = np.arange(4, dtype=np.uint8)
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """A cube of n x n x n voxels about a ``centre``, its side twice ``half``, in object radii or
-    metres.
-    """
+    """A cube of n x n x n voxels about a ``centre``, of side twice ``half``."""
 
     n: int = 64
     half: float = 1.0
@@ -50,9 +46,7 @@ class VoxelGrid:
 
     @cached_property
     def middles(self) -> NDArray[np.float32]:
-        """Of the voxels, in the order of ``cells.ravel()``, (3, n^3): contiguous along each
-        axis, which is fast.
-        """
+        """Centres of the voxels in the order of ``cells.ravel()``, (3, n^3)."""
         return np.stack(np.meshgrid(*self.axes, indexing="ij")).reshape(3, -1)
 
     def within(self, radius: float) -> NDArray[np.bool_]:
@@ -63,9 +57,7 @@ class VoxelGrid:
         return x[:, None, None] + y[:, None] + z <= radius**2
 
     def cell_of(self, points: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """The voxel of each point, (P, 3), as an index into ``cells.ravel()``, and whether there
-        is one, each (P,).
-        """
+        """Return the index of the voxel of each point, (P, 3), and whether there is one."""
         at = np.floor((points - np.array(self.centre) + self.half) / self.pitch).astype(np.int64)
         inside = ((at >= 0) & (at < self.n)).all(1)
         at = np.where(inside[:, None], at, 0)
@@ -86,8 +78,14 @@ class Occupancy:
 
     @classmethod
     def unseen(cls, grid: VoxelGrid, region: NDArray[np.bool_] | None = None) -> "Occupancy":
-        """Before the first frame; outside of a region, (n, n, n) bool, if one is given, all is
-        known to be free.
+        """Return the occupancy before the first frame.
+
+        Args:
+            grid: the voxels.
+            region: voxels that are unknown, (n, n, n) bool; all others are free. None for all.
+
+        Returns:
+            The occupancy.
         """
         return cls(
             grid,
@@ -102,12 +100,21 @@ class Occupancy:
         object_mask: NDArray[np.bool_] | None = None,
         background_free: bool = True,
     ) -> "Occupancy":
-        """With what one more depth frame says.
+        """Return the occupancy after one more depth frame.
 
-        The voxels that its points lie in are occupied. A voxel is free if its middle lies in front
-        of what the pixel that it falls on shows. So pixels have to be finer than voxels, or
-        surfaces get holes. By default all pixels show the object, and nothing is there where
-        nothing was measured: not so for sensors.
+        Voxels that contain points of the frame are occupied. Voxels are free if their middle lies
+        in front of what their pixel shows. So pixels must be finer than voxels, or surfaces get
+        holes.
+
+        Args:
+            depth: (H, W), in the unit of the grid; 0 where nothing was measured.
+            pose: camera-to-world, (4, 4), in the frame of the grid.
+            intrinsics: pinhole matrix, (3, 3), pixels.
+            object_mask: pixels of the object, (H, W) bool; None if all are.
+            background_free: whether nothing is there where nothing was measured, as in renders.
+
+        Returns:
+            The occupancy.
         """
         depth = np.asarray(depth).astype(np.float32, copy=False)
         grid = self.grid
@@ -186,7 +193,15 @@ class SeenScene:
 
     @classmethod
     def of(cls, views: Iterable[SceneView], grid: VoxelGrid = GRID) -> Self:
-        """After some frames."""
+        """Return what some frames show of a scene.
+
+        Args:
+            views: the frames.
+            grid: the voxels.
+
+        Returns:
+            The scene.
+        """
         return reduce(cls.seen, views, cls.unseen(grid))
 
     def seen(self, view: SceneView) -> Self:
@@ -212,8 +227,7 @@ class SeenScene:
 
 @dataclass(frozen=True)
 class Visibility:
-    """Share of an object that shows from V positions, (V,) float64, 0 to 1, by what unseen space
-    is.
+    """Visible share of an object from V positions, (V,) float64, by what unseen space is.
 
     Attributes:
         least: all of it solid.
@@ -232,13 +246,20 @@ def expected_visibility(
     density: float = DENSITY,
     unseen_part: float = UNSEEN_PART,
 ) -> Visibility:
-    """Share of the object to which the line of sight will be clear of other things, from each
-    position.
+    """Return the expected visible share of the object from each position.
 
-    The object is what was seen of it, and unseen voxels of its unit ball above the table, which
-    count for less. It does not hide itself. Unseen space elsewhere lets a sight of length s through
-    with probability exp(-density * s). The cameras stand at ``positions``, (V, 3), object frame,
-    object radii.
+    The object is what was seen of it, and the unseen voxels of its unit ball above the table, with
+    a lower weight. It does not hide itself. Unseen space elsewhere lets a line of sight of length s
+    pass with probability exp(-density * s).
+
+    Args:
+        seen: the scene so far.
+        positions: of the cameras, (V, 3), object frame, object radii.
+        density: of things in unseen space, per object radius.
+        unseen_part: weight of unseen voxels that may be the object's.
+
+    Returns:
+        Shares of the object whose line of sight is clear of other things.
     """
     lines = sight_lines(seen.occupancy.grid, np.asarray(positions, np.float64).tobytes())
     return lines.visibility(seen, density, unseen_part)
@@ -246,15 +267,21 @@ def expected_visibility(
 
 @lru_cache(maxsize=64)
 def sight_lines(grid: VoxelGrid, positions: bytes) -> "SightLines":
-    """Sight lines to the bytes of (V, 3) float64: the same ones are asked for again and again."""
+    """Return sight lines, which are kept because the same ones are needed again and again.
+
+    Args:
+        grid: the voxels.
+        positions: bytes of the camera positions, (V, 3) float64.
+
+    Returns:
+        The sight lines.
+    """
     return SightLines(grid, np.frombuffer(positions).reshape(-1, 3))
 
 
 @dataclass(frozen=True)
 class SightLines:
-    """The voxels between an object's parts, on a grid, and some cameras, (V, 3); computed once
-    for all scenes.
-    """
+    """The voxels between an object's parts and cameras, (V, 3); computed once."""
 
     grid: VoxelGrid
     positions: NDArray[np.float64]
@@ -277,9 +304,7 @@ class SightLines:
 
     @cached_property
     def passed(self) -> "csr_array":
-        """How often the line from each part to each camera, in steps of a voxel, is in each
-        voxel, (P * V, n^3).
-        """
+        """How often the line from each part to each camera is in each voxel, (P * V, n^3)."""
         from scipy.sparse import csr_array  # slow to import, and few sessions are about scenes
 
         grid = self.grid
@@ -307,15 +332,22 @@ class SightLines:
 
     @cached_property
     def asked(self) -> NDArray[np.bool_]:
-        """The voxels that the answer depends on, (n, n, n): frames need not be asked about
-        others.
-        """
+        """The voxels that the answer depends on, (n, n, n)."""
         found = self.own.copy()
         found.reshape(-1)[self.passed.indices] = True
         return found
 
     def visibility(self, seen: SeenScene, density: float, unseen_part: float) -> Visibility:
-        """See ``expected_visibility``."""
+        """Return the expected visibility; see ``expected_visibility``.
+
+        Args:
+            seen: the scene so far.
+            density: of things in unseen space, per object radius.
+            unseen_part: weight of unseen voxels that may be the object's.
+
+        Returns:
+            The visibility from each position.
+        """
         cells = seen.occupancy.cells
         own = self.own
         above = self.grid.middles[2][own.reshape(-1)] > seen.floor

@@ -1,5 +1,4 @@
-"""Clean a depth image by a small plane for every pixel of the object, and look at these as the
-networks were taught to.
+"""Fit a small plane to every pixel of the object, and render these for the networks.
 
 The sloped facet model of Haralick and Watson (A facet model for image data, Computer Graphics and
 Image Processing 15, 1981), on inverse depth, where planes of the world are planes of the image: 1/z
@@ -41,9 +40,7 @@ LAYER = 0.03
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of inverse depth, 1/metres, at ascending depths, and how many pixels
-    err together.
-    """
+    """Standard deviation of inverse depth, 1/metres, by depth, and its correlation length."""
 
     depths: NDArray[np.float64]
     sigmas: NDArray[np.float64]
@@ -55,11 +52,17 @@ class Noise:
 
 
 def estimate_noise(depth: NDArray[np.float32], usable: NDArray[np.bool_]) -> Noise:
-    """Measure the noise of a depth image, (H, W), metres, on its usable pixels, (H, W) bool; zero
-    where they are few.
+    """Measure the noise of a depth image.
 
-    On a plane the second difference of inverse depth along a row is noise alone, with the variance
-    6 sigma^2 if its pixels do not err together; the median of its size does not mind the edges.
+    On a plane the second difference of inverse depth along a row is pure noise, with the variance 6
+    sigma^2 if its pixels are independent. The median of its size is not affected by edges.
+
+    Args:
+        depth: (H, W) float32, metres.
+        usable: pixels to use, (H, W) bool.
+
+    Returns:
+        The noise; zero if there are few pixels.
     """
     q = np.where(usable, 1 / np.where(usable, depth, 1), np.nan)
     found = []
@@ -119,18 +122,34 @@ class Facets:
 
 
 def drop_flying(depth: NDArray[np.float32], usable: Mask, noise: float, pitch: float) -> Mask:
-    """The usable pixels, (H, W) bool, without those that hang in the air between two surfaces.
+    """Return the usable pixels without flying pixels.
 
-    A pixel stays if at least three of its eight neighbours are on its surface: as near in depth as
-    noise of inverse depth, 1/metres, and a steep slope allow. ``pitch`` is the angle between
-    neighbouring pixels, radians.
+    Pixels stay if at least three of their eight neighbours are on their surface: as close in depth
+    as the noise and a steep slope allow.
+
+    Args:
+        depth: (H, W) float32, metres.
+        usable: pixels with a depth, (H, W) bool.
+        noise: of inverse depth, 1/metres.
+        pitch: angle between neighbouring pixels, radians.
+
+    Returns:
+        The remaining pixels, (H, W) bool.
     """
     tolerance = 5 * noise * depth**2 + STEEPEST * pitch * depth
     return usable & (count_beside(depth, tolerance) >= 3)
 
 
 def count_beside(picture: NDArray[np.float32], limit: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """How many of the eight pixels beside each, (H, W), differ from it by less than its limit."""
+    """Count the neighbours of each pixel that differ from it by less than its limit.
+
+    Args:
+        picture: (H, W) float32.
+        limit: of each pixel, (H, W).
+
+    Returns:
+        Counts, (H, W) uint8, 0 to 8.
+    """
     height, width = picture.shape
     count = np.zeros(picture.shape, np.uint8)
     for down, right in ((0, 1), (1, -1), (1, 0), (1, 1)):
@@ -151,13 +170,23 @@ def fit_facets(
     coarse: int = 1,
     frame_noise: Noise | None = None,
 ) -> Facets:
-    """Facets of an object, whose pixels are ``mask``, in a depth image, or in a part of it that
-    starts at ``corner``.
+    """Fit facets to the pixels of an object in a depth image, or in a part of it.
 
-    One for each square of ``coarse`` pixels; none where there are too few pixels to fit one.
-    ``intrinsics`` are of the whole frame, as is ``frame_noise``: a thin object has too few pixels
-    in a row to tell. Without ``denoise`` every pixel keeps its depth, holes stay, and so do flying
-    pixels.
+    There is one for each square of ``coarse`` pixels, and none where there are too few pixels to
+    fit one.
+
+    Args:
+        depth: (H, W) float32, metres; of the frame or of a part of it.
+        mask: pixels of the object, (H, W) bool.
+        intrinsics: pinhole matrix of the whole frame, (3, 3), pixels.
+        corner: row and column in the frame at which the part starts.
+        denoise: whether to smooth the depth, fill holes and drop flying pixels.
+        coarse: side of the squares, pixels.
+        frame_noise: noise of the whole frame, for thin objects with too few pixels in a row; None
+            to measure it here.
+
+    Returns:
+        The facets.
     """
     focal = intrinsics[[0, 1], [0, 1]]
     h, w = depth.shape
@@ -214,9 +243,7 @@ def fit_facets(
 def _typical_noise(
     depth: NDArray[np.float32], usable: Mask, frame_noise: Noise | None
 ) -> tuple[float, int]:
-    """The noise at the object's median depth, and its grain: its own, or the frame's where that
-    is smaller.
-    """
+    """Return the noise at the object's median depth, and its grain."""
     few = slice(None, None, max(1, len(depth) // ROWS))
     typical = float(np.median(depth[usable]))
     measured = estimate_noise(depth[few], usable[few])
@@ -259,8 +286,7 @@ def _blocks(images: Float, side: int) -> Float:
 
 
 def _radii(noise: float, inverse: float, pitch: Float, grain: float) -> tuple[int, int]:
-    """Half sides of two windows that grow with the noise, pixels, the larger first; slopes of the
-    smaller are accurate.
+    """Return half sides of two windows that grow with the noise, pixels, larger first.
 
     The slope of a plane fitted to k x k pixels that err for themselves has the standard deviation
     sigma sqrt(12) / k^2 per pixel; where grains of g x g pixels err together it is g times that.
@@ -273,8 +299,7 @@ def _radii(noise: float, inverse: float, pitch: Float, grain: float) -> tuple[in
 
 
 def _fit(sums: Float, radius: int, enough: float) -> Float:
-    """Planes of windows of (2 radius + 1)^2 cells around every cell, (H W, 4): slopes, value at x =
-    y = 0, variance.
+    """Fit planes to windows around every cell, (H W, 4): slopes, value, variance.
 
     The last, of the residuals, is infinite for windows with fewer than ``enough`` pixels.
     """
@@ -305,8 +330,7 @@ def _choose(
     noise: float,
     radii: tuple[int, int],
 ) -> Float:
-    """For every wanted cell the plane of the largest window that shows only the cell's own surface,
-    (N, 3), or NaN.
+    """Return the plane of the largest window on each cell's own surface, (N, 3), or NaN.
 
     First the windows around the cell, the larger one before the smaller; then small ones that have
     it at their rim. Windows lie so densely that one is centred within half the small radius of
@@ -346,9 +370,7 @@ def _nearest_window(
     own: Float,
     reach: int,
 ) -> Float:
-    """Of the windows, (H W, 4), around each cell and a reach beside it, the plane that fits it
-    best, (N, 3), or NaN.
-    """
+    """Return the best-fitting plane of windows at and beside each cell, (N, 3), or NaN."""
     steps = (-max(1, reach), 0, max(1, reach))
     down = np.stack([np.clip(rows + step, 0, shape[0] - 1) * shape[1] for step in steps])
     right = np.stack([np.clip(columns + step, 0, shape[1] - 1) for step in steps])
@@ -361,16 +383,12 @@ def _nearest_window(
 
 
 def _deviation(planes: Float, here: Float, own: Float) -> Float:
-    """Distance of planes, (..., N, 3 or more), at x and y, (N, 2), from the cells' own inverse
-    depth, (N,), or NaN.
-    """
+    """Return the distance of planes from the cells' own inverse depth, (N,), or NaN."""
     return planes[..., 0] * here[:, 0] + planes[..., 1] * here[:, 1] + planes[..., 2] - own
 
 
 def virtual_pose(pose: Float) -> Float:
-    """The pose, (4, 4), that the networks would have looked from: in a camera's direction, at
-    their distance, level.
-    """
+    """Return the level pose, (4, 4), at the networks' distance in a camera's direction."""
     position = pose[:3, 3]
     outward = position / np.linalg.norm(position) if position.any() else -pose[:3, 2]
     right = np.array([-outward[1], outward[0], 0.0])
@@ -386,12 +404,19 @@ def virtual_pose(pose: Float) -> Float:
 def look_again(
     facets: Facets, pose: Float, radius: float, size: int
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """The depth image of the facets from the virtual pose, object radii, and the facet in each
-    pixel, -1 for none.
+    """Render facets from the virtual pose.
 
-    Each facet is cast where the virtual camera sees it; a pixel shows the nearest surface, at the
-    depth where its own ray meets the facet's plane, so that planes stay planes. ``pose`` is that of
-    the camera that saw them, object frame, object radii; ``radius`` in metres.
+    Each facet is drawn where the virtual camera sees it. A pixel shows the nearest surface, at the
+    depth where its own ray meets the plane of the facet, so that planes stay planes.
+
+    Args:
+        facets: the facets.
+        pose: of the camera that saw them, (4, 4), object frame, object radii.
+        radius: of the object, metres.
+        size: side of the image, pixels.
+
+    Returns:
+        Depth, (size, size) float32, object radii, and the facet of each pixel, int64, -1 for none.
     """
     target = virtual_pose(pose)
     focal = pinhole(size, DISTANCE)[0, 0]

@@ -33,8 +33,9 @@ LUMA = np.array([0.299, 0.587, 0.114])
 
 @dataclass(frozen=True)
 class Frame:
-    """What a depth camera gave at one moment. Only depth and intrinsics are needed.
-    ObservationError names mistakes.
+    """The output of a depth camera at one moment; only depth and intrinsics are needed.
+
+    ObservationError names likely mistakes.
 
     Attributes:
         depth: along the optical axis, (H, W). Handed in as float metres, where NaN, infinity, zero
@@ -133,14 +134,30 @@ class Frame:
         return x.astype(np.float32), y.astype(np.float32)
 
     def positions(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """What some pixels show, (N, 3) float64, world, metres."""
+        """Return the positions that pixels show in the world.
+
+        Args:
+            rows: of the pixels, (N,) int64.
+            columns: of the pixels, (N,) int64.
+
+        Returns:
+            Positions, (N, 3) float64, metres.
+        """
         pose = self.camera_to_world
         return self.positions_in_camera(rows, columns) @ pose[:3, :3].T + pose[:3, 3]
 
     def positions_in_camera(
         self, rows: NDArray[np.int64], columns: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """What some pixels show, (N, 3) float64, camera frame, metres."""
+        """Return the positions that pixels show in the camera frame.
+
+        Args:
+            rows: of the pixels, (N,) int64.
+            columns: of the pixels, (N,) int64.
+
+        Returns:
+            Positions, (N, 3) float64, metres.
+        """
         x, y = self.rays
         z = self.depth[rows, columns].astype(np.float64)
         return np.stack([x[columns], y[rows], np.ones(len(z))], 1) * z[:, None]
@@ -148,8 +165,15 @@ class Frame:
     def along(
         self, direction: NDArray[np.float64], offset: float = 0.0, part: Part = WHOLE
     ) -> NDArray[np.float32]:
-        """``direction @ position + offset`` of what every pixel shows, world, (H, W) float32;
-        void at depth 0.
+        """Return ``direction @ position + offset`` of what every pixel shows.
+
+        Args:
+            direction: world, (3,).
+            offset: metres.
+            part: rows and columns to compute.
+
+        Returns:
+            Values, (H, W) float32; undefined where the depth is 0.
         """
         (x, y), pose = self.rays, self.camera_to_world
         a, b, c = (pose[:3, :3].T @ direction).astype(np.float32)
@@ -158,7 +182,15 @@ class Frame:
 
 
 def within(shown: NDArray[np.float32 | np.bool_], margin: int = 0) -> Part:
-    """Rows and columns of a depth image, or a mask, that hold all that it shows, and a margin."""
+    """Return the rows and columns of an image that hold all that it shows.
+
+    Args:
+        shown: depth image or mask, (H, W).
+        margin: pixels to add on each side.
+
+    Returns:
+        Slices of the rows and columns.
+    """
     at = [np.flatnonzero(shown.any(1 - axis)) for axis in (0, 1)]
     low, high = zip(*((k[0], k[-1] + 1) if len(k) else (0, 0) for k in at), strict=True)
     return spans(np.array(low) - margin, np.array(high) + margin * bool(high[0]), shown.shape)
@@ -173,7 +205,16 @@ def holes_of(shown: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def spans(low: NDArray[np.floating], high: NDArray[np.floating], shape: tuple[int, ...]) -> Part:
-    """Rows and columns of a picture from ``low``, (2,), to before ``high``, (2,)."""
+    """Return the rows and columns of a rectangle, clipped to the picture.
+
+    Args:
+        low: first row and column, (2,).
+        high: row and column behind the last, (2,).
+        shape: rows and columns of the picture.
+
+    Returns:
+        Slices of the rows and columns.
+    """
     first, last = (np.clip(np.floor(at), 0, shape).astype(int).tolist() for at in (low, high))
     return slice(first[0], last[0]), slice(first[1], last[1])
 
@@ -255,9 +296,7 @@ def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> NDArray[
 
 
 def check_pose(pose: ArrayLike) -> NDArray[np.float64]:
-    """A copy of a rigid pose, (4, 4); an ObservationError names the likely mistake if it is not
-    rigid.
-    """
+    """Copy a rigid pose, (4, 4); ObservationError names the likely mistake."""
     pose = _matrix(pose, "the pose", (4, 4))
     if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
         transposed = np.allclose(pose[:, 3], [0, 0, 0, 1], atol=1e-6)

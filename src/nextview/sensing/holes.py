@@ -47,8 +47,7 @@ def fill_regular_gaps(depth: Depth) -> tuple[Depth, NDArray[np.int64] | None]:
 
 
 def filled_mask(mask: Mask, source: NDArray[np.int64]) -> Mask:
-    """The mask of an image whose gaps were filled: where it has the same gaps, they are filled,
-    too.
+    """Fill the gaps of a mask where the image had the same gaps.
 
     Args:
         mask: (H, W) bool.
@@ -74,9 +73,7 @@ def _period(measured: Mask) -> int:
 
 
 def _fill_once(inverse: Depth, source: NDArray[np.int64], widest: int) -> None:
-    """Fill, in place, the holes between two pixels of a row or a column, at most ``widest``
-    pixels wide.
-    """
+    """Fill holes in rows and columns in place, at most ``widest`` pixels wide."""
     best_span = np.full(inverse.size, np.iinfo(np.int32).max, np.int32)
     best_value = inverse.ravel().copy()
     best_source = source.ravel().copy()

@@ -1,6 +1,4 @@
-"""Masks as segmenters give them: pixels at their edge that belong to what is behind are taken
-away.
-"""
+"""Remove pixels at the edge of a mask that belong to the background."""
 
 import numpy as np
 from numpy.typing import NDArray

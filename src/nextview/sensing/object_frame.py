@@ -16,8 +16,9 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ObjectFrame:
-    """The object's centre, (3,) metres, world, radius and axes. Positions in the object frame are
-    in object radii.
+    """The object's centre, (3,), world, metres, its radius and its axes.
+
+    Positions in the object frame are in object radii.
 
     ``radius``, metres, is that of the sphere about the centre that holds the object; the rows of
     ``axes``, (3, 3), are the object's x, y and z (up) in the world. UsageError if they are no
@@ -34,20 +35,21 @@ class ObjectFrame:
         object.__setattr__(self, "axes", _rotation(self.axes, "the object's axes"))
 
     def pose_in_object(self, pose: ArrayLike) -> Float:
-        """A camera-to-world pose, (..., 4, 4), metres, as a pose in the object frame, object
-        radii.
-        """
+        """Convert camera-to-world poses, (..., 4, 4), metres, to the object frame, object radii."""
         pose = np.array(pose, np.float64)
         pose[..., :3, 3] = (pose[..., :3, 3] - self.centre) @ self.axes.T / self.radius
         pose[..., :3, :3] = self.axes @ pose[..., :3, :3]
         return pose
 
     def pose_in_world(self, pose: ArrayLike, distance: float | None = None) -> Float:
-        """A pose in the object frame, (..., 4, 4), object radii, as a camera-to-world pose in
-        metres; OpenCV axes.
+        """Convert poses in the object frame to camera-to-world poses.
 
-        With a ``distance`` it stands so far from the object's centre instead, metres, in the same
-        direction.
+        Args:
+            pose: (..., 4, 4), object frame, object radii.
+            distance: of the cameras from the object's centre, metres; None to keep their distance.
+
+        Returns:
+            Poses, (..., 4, 4), world, metres, OpenCV axes.
         """
         pose = np.array(pose, np.float64)
         position = pose[..., :3, 3] * self.radius
@@ -60,8 +62,7 @@ class ObjectFrame:
 
 @dataclass(frozen=True)
 class Box:
-    """An upright box in the world that an object just fits into: ``low <= axes @ position <= high``
-    inside.
+    """An upright box in the world that fits the object tightly.
 
     The corners ``low`` and ``high`` are (3,), metres; the rows of ``axes``, (3, 3), are the box's
     x, y and z (up) in the world, by default the world's own. UsageError if it has no inside, or the
@@ -93,7 +94,18 @@ class Box:
 
 
 def three(values: Any, what: str) -> Float:
-    """Three real numbers that can be metres, (3,) float64; UsageError if they are not."""
+    """Check three real numbers that can be metres.
+
+    Args:
+        values: the numbers.
+        what: name of the numbers in the error message.
+
+    Returns:
+        The numbers, (3,) float64.
+
+    Raises:
+        UsageError: they are not three such numbers.
+    """
     given = points([values], f"{what}, in a list,")[0]
     if not (np.abs(given) < LARGEST).all():
         raise UsageError(f"{what} is three numbers, metres, not {given.tolist()}")
@@ -112,10 +124,17 @@ def _rotation(values: Any, what: str) -> Float:
 
 
 def upright_axes(up: ArrayLike, front: ArrayLike | None = None) -> Float:
-    """Axes with z along ``up``, (3,), and x as near to the ``front``, (3,), as can be: rows x, y,
-    z, (3, 3) float64.
+    """Return axes with z along a direction and x as close as possible to another.
 
-    The front is the world's x by default; its y where x is up.
+    Args:
+        up: direction of z, (3,).
+        front: direction of x, (3,); None for the world's x, or its y where x is up.
+
+    Returns:
+        Rows x, y and z, (3, 3) float64.
+
+    Raises:
+        UsageError: up is not a direction.
     """
     z = three(up, "up")
     if not z.any():
@@ -129,11 +148,22 @@ def upright_axes(up: ArrayLike, front: ArrayLike | None = None) -> Float:
 
 
 def enclose(points: Float, axes: Float, floor: float | None) -> ObjectFrame:
-    """The object frame of points on an object, (N, 3), world, metres.
+    """Return the object frame of points on an object.
 
-    The centre is the middle of the smallest circle around all seen from above, and half way between
-    top and bottom, which is the ``floor`` where the object stands on one. Of two walls of a box
-    that meet at a right angle a circle gives the middle of the whole box.
+    The centre is the middle of the smallest circle around all points seen from above, half way
+    between top and bottom. Of two walls of a box that meet at a right angle, a circle gives the
+    middle of the whole box.
+
+    Args:
+        points: (N, 3), world, metres.
+        axes: rows x, y and z of the object frame, (3, 3).
+        floor: height of the support plane; None for the lowest point.
+
+    Returns:
+        The object frame.
+
+    Raises:
+        ObservationError: all points are in one place.
     """
     upright = points @ axes.T
     low = upright.min(0)

@@ -111,9 +111,7 @@ def _enough_neighbours(
 
 
 def _groups(rows: Index, columns: Index, layers: Index) -> Index:
-    """The group of each point, (N,): cells of the view, as wide as deep, that touch are of one
-    group.
-    """
+    """Return the group of each point, (N,): touching cells of the view are one group."""
     at = (rows - rows.min(), columns - columns.min(), layers)
     size = [int(index.max()) + 1 for index in at]
     cells = np.zeros(size, bool)

@@ -77,8 +77,16 @@ class ViewWarning:
 
 
 def refuse_far(frame: Frame, last: Frame | None, target: Float | None, radius: float) -> None:
-    """Refuse a camera that is much farther from where it stood, or from its target, than
-    anything that it sees.
+    """Refuse a camera that is much farther away than anything that it sees.
+
+    Args:
+        frame: the frame.
+        last: the frame before; None for a first one.
+        target: where the object is expected, world, (3,); None if it is not known.
+        radius: of the object, metres.
+
+    Raises:
+        ObservationError: the camera is too far from where it was, or from its target.
     """
     camera = frame.camera_to_world[:3, 3]
     farthest = float(frame.depth.max())
@@ -152,10 +160,20 @@ def check_steps(frame: Frame, height: float, up: Float) -> list[ViewWarning]:
 def refuse_depth_scale(
     frame: Frame, last: Frame | None, target: Float | None, radius: float
 ) -> None:
-    """Refuse depth that is some times too large, as 16 bits in steps of less than a millimetre are.
+    """Refuse depth that is several times too large.
 
-    Either all that is seen lies behind the target, at so many times its distance. Or the frame and
-    the last one contradict each other, and would not if the depth of both were smaller.
+    16-bit depth in steps of less than a millimetre is. Either everything visible lies behind the
+    target, at a multiple of its distance; or the frame and the last one contradict each other, and
+    would not if the depth of both were smaller.
+
+    Args:
+        frame: the frame.
+        last: the frame before; None for a first one.
+        target: where the object is expected, world, (3,); None if it is not known.
+        radius: of the object, metres.
+
+    Raises:
+        ObservationError: the depth is too large, with the likely factor.
     """
     times = 0.0
     if target is not None and frame.mask is None:
@@ -194,9 +212,7 @@ def _times_behind(frame: Frame, target: Float, radius: float) -> float:
 
 
 def _times_too_large(frame: Frame, last: Frame) -> float:
-    """How many times smaller the depth of two frames has to be for them to agree; 0 if they do,
-    or never.
-    """
+    """Return by how much two depths are too large to agree; 0 if they agree or never do."""
     as_given, share = _agreeing(last, frame, 1.0)
     if as_given >= FEWEST_SHARED and share > HALF_AGREES:
         return 0.0
@@ -207,9 +223,7 @@ def _times_too_large(frame: Frame, last: Frame) -> float:
 
 
 def _agreeing(first: Frame, second: Frame, scale: float) -> tuple[int, float]:
-    """How many points of a frame another one confirms, and their share of those that it confirms
-    or sees through.
-    """
+    """Return the number and the share of the points of a frame that another confirms."""
     step = max(1, int(np.sqrt(first.depth.size / SAMPLE)))
     rows, columns = np.nonzero(first.depth[::step, ::step])
     points = scale * first.positions_in_camera(step * rows, step * columns)
@@ -262,8 +276,14 @@ def check_frame(frame: Frame) -> list[ViewWarning]:
 
 
 def check_point(aside: Float, radius: float) -> list[ViewWarning]:
-    """Whether what was found is far from the point that asked for it, by so much, metres, (2,);
-    usually not.
+    """Warn if the object is far from the point that asked for it.
+
+    Args:
+        aside: offset from the point, metres, (2,).
+        radius: of the object, metres.
+
+    Returns:
+        The warning, if any.
     """
     distance = float(np.linalg.norm(aside))
     if distance <= ASIDE * radius:
@@ -330,7 +350,15 @@ def check_lean(lean: Lean) -> list[ViewWarning]:
 
 
 def check_pose_moved(frame: Frame, last: Frame) -> list[ViewWarning]:
-    """Whether the picture changed since the last frame though the pose did not; usually not."""
+    """Warn if the picture changed since the last frame, but the pose did not.
+
+    Args:
+        frame: the frame.
+        last: the frame before.
+
+    Returns:
+        The warning, if any.
+    """
     if (
         frame.shape != last.shape
         or np.abs(frame.camera_to_world - last.camera_to_world).max() > STILL
@@ -376,9 +404,7 @@ def _surface(observation: Observation, seen: NDArray[np.int64]) -> Float:
 
 
 def _reach(points: Float, pose: Float) -> float:
-    """How far from the origin the outermost points are, but for two in a hundred that a sensor
-    may have made up.
-    """
+    """Return the distance of the outermost points from the origin, without flying pixels."""
     squares = ((points @ pose[:3, :3].T + pose[:3, 3]) ** 2).sum(1)
     rank = int(0.98 * (len(squares) - 1))
     return float(np.sqrt(np.partition(squares, rank)[rank]))
@@ -436,8 +462,14 @@ def _diagnose(points: Float, pose: Float) -> tuple[str, str]:
 
 
 def check_views(first: Observation, second: Observation) -> list[ViewWarning]:
-    """Whether one of two views of an object looks through a surface that the other saw; usually
-    not.
+    """Warn if one of two views of an object looks through a surface that the other saw.
+
+    Args:
+        first: the one view.
+        second: the other view.
+
+    Returns:
+        The warning, if any.
     """
     share = max(_seen_through(first, second), _seen_through(second, first))
     if share < CONTRADICTION:
@@ -450,8 +482,7 @@ def check_views(first: Observation, second: Observation) -> list[ViewWarning]:
 
 
 def _seen_through(first: Observation, second: Observation) -> float:
-    """Share of the surface in the first view, within the second's picture, through which the second
-    looks.
+    """Return the share of the first view's surface that the second view looks through.
 
     Where all that the second camera saw is known, it has to have measured something behind: a hole
     is no contradiction.

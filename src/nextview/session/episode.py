@@ -159,14 +159,22 @@ class Episodes:
         directions: Float | None = None,
         constrain: Constrain = unconstrained,
     ) -> Step:
-        """Take in the evidence of one view in every running episode; stop or choose its next view.
+        """Take in one view of every running episode, and stop it or choose its next view.
 
-        A view in which nothing was seen is taken, but changes no belief and ends no episode as a
-        confident one. Where this raises, nothing is taken in: the same view can be handed in again.
-        ``directions`` are unit vectors towards where the cameras really stood, (A, 3), in all
-        updates or in none; by default they stood at ``current``. The nearest views then count as
-        taken, those within VISITED as visited too, and azimuths and travel are measured from the
-        places. ``constrain`` is asked before the policy. An episode without a free view ends.
+        Where nothing is seen, the view counts as taken, but changes no belief and ends no episode
+        with confidence. If this raises, nothing is taken in, and the same view can be passed again.
+        Where the cameras stood elsewhere, the nearest views count as taken, those within VISITED as
+        visited too, and azimuths and travel are measured from the places. An episode without a free
+        view ends.
+
+        Args:
+            evidence: of the views of the A running episodes.
+            directions: unit vectors towards the actual cameras, (A, 3), in all updates or in none;
+                None if they stood at ``current``.
+            constrain: marks the views that can be reached; called before the policy.
+
+        Returns:
+            What was taken in.
         """
         taken = self.next_step(evidence, directions, constrain)
         self.keep(taken)
@@ -179,9 +187,18 @@ class Episodes:
         constrain: Constrain = unconstrained,
         hold: Callable[[Step], bool] = lambda step: False,
     ) -> Taken:
-        """What ``update`` would take in. Nothing is changed; ``keep`` takes it in.
+        """Return what ``update`` would take in, without changing anything; ``keep`` takes it in.
 
-        No threshold stops on ``hold``, which is asked where belief is enough.
+        Args:
+            evidence: of the views of the A running episodes.
+            directions: unit vectors towards the actual cameras, (A, 3); None if they stood at
+                ``current``.
+            constrain: marks the views that can be reached.
+            hold: called where the belief is high enough to stop; no episode stops if it returns
+                True.
+
+        Returns:
+            What would be taken in.
         """
         taken = self._taken(evidence, directions)
         step = taken.step
@@ -204,11 +221,13 @@ class Episodes:
         directions: Float | None = None,
         joint: tuple[JointBelief | None, ...] | None = None,
     ) -> None:
-        """Take in a view after which it is known that the episodes went on: neither stop nor
-        choose.
+        """Take in a view of episodes that are known to go on, without stopping or choosing.
 
-        ``joint`` is what all views said together after it, where that is known: they are not judged
-        once more.
+        Args:
+            evidence: of the views of the A running episodes.
+            directions: unit vectors towards the actual cameras, (A, 3); None if they stood at
+                ``current``.
+            joint: what all views said together after it, if it is known; they are not judged again.
         """
         self.keep(self._taken(evidence, directions, joint))
 
@@ -219,8 +238,7 @@ class Episodes:
         self._go(taken.step)
 
     def next_choice(self, constrain: Constrain = unconstrained) -> Step:
-        """Ask the policy once more where to go from here, for what ``constrain`` says has changed;
-        see ``update``.
+        """Ask the policy again, for changes that ``constrain`` marks; see ``update``.
 
         Nothing is changed; ``keep_choice`` takes in the last step with other ``next_views``. Where
         no view is free any more the episode ends.
@@ -283,7 +301,15 @@ class Episodes:
         )
 
     def outlooks(self, step: Step, some: NDArray[np.bool_]) -> list[Any]:
-        """What can be foreseen after a step in some of its episodes, None where that is nothing."""
+        """Return what can be foreseen after a step in some of its episodes.
+
+        Args:
+            step: the step.
+            some: which of its episodes, (A,) bool.
+
+        Returns:
+            An outlook for each of these, None where nothing can be foreseen.
+        """
         rows = np.flatnonzero(some)
         if self.outlook is None or not any(step.joint):
             return [None] * len(rows)
@@ -403,8 +429,9 @@ class Episodes:
     def _observations(
         self, last: Step, episodes: NDArray[np.int64], counted: bool = False
     ) -> list[list[Observation]]:
-        """All views so far of some episodes, the last step included; ``counted``: those that are
-        evidence.
+        """Return all views of some episodes, the last step included.
+
+        ``counted`` leaves out those that are no evidence.
         """
         found: dict[int, list[Observation]] = {int(episode): [] for episode in episodes}
         for step in (*self.steps, last):
@@ -553,7 +580,22 @@ def run_episodes(
     constrain: Constrain = unconstrained,
     visibility: Visible | None = None,
 ) -> Episodes:
-    """Run episodes to their end."""
+    """Run episodes to their end.
+
+    Args:
+        observe: returns the evidence of some episodes, (A,), each at one view, (A,).
+        sphere: the candidate views.
+        policy: chooses the next views.
+        starts: first view of each episode, (E,) int64.
+        stopping: ends the episodes.
+        rng: source of all random numbers.
+        calibration: turns sums of evidence into belief.
+        constrain: marks the views that can be reached.
+        visibility: returns the expected visible shares, for policies that need them.
+
+    Returns:
+        The finished episodes.
+    """
     episodes = Episodes(sphere, policy, starts, stopping, rng, calibration, visibility)
     while len(episodes.running):
         episodes.update(

@@ -1,6 +1,4 @@
-"""A picture of one episode: what was seen, what was believed, what the policy decided by, and
-the path.
-"""
+"""The figure of an episode: views, beliefs, values of the candidates, and the path."""
 
 import itertools
 from collections.abc import Sequence
@@ -51,8 +49,11 @@ NUMBER: dict[str, Any] = {
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure into a PNG, PDF or SVG file, whole or not at all; one of that name is
-    replaced.
+    """Write a figure to a PNG, PDF or SVG file, complete or not at all.
+
+    Args:
+        figure: the figure.
+        path: of the file, which is replaced.
 
     Raises:
         UsageError: it is another format.
@@ -79,12 +80,22 @@ def draw_episode(
     posed: Triangles | None = None,
     displaced: NDArray[np.float64] | None = None,
 ) -> Figure:
-    """A column for each view (image, belief, what the policy valued the views at); beside them
-    object and path.
+    """Draw a column for each view, and beside them the object and the path.
 
-    ``posed`` is a surface in the object frame and object radii whose outline is drawn over the
-    images, and ``displaced``, (views, 3), by how much each view shows it beside that place; not at
-    all if not given.
+    Each column shows the image, the belief, and the policy's values of the candidate views.
+
+    Args:
+        views: of the episode, in order.
+        classes: names of the classes.
+        sphere: the candidate views.
+        stopping: the rule that ended the episode.
+        heading: of the figure.
+        posed: surface whose outline is drawn over the images, object frame, object radii; None for
+            none.
+        displaced: displacement of that surface in each view, (views, 3); None for none.
+
+    Returns:
+        The figure.
     """
     caster = None if posed is None else RayCaster([posed])
     if displaced is None:
@@ -139,9 +150,7 @@ def draw_episode(
 
 
 def _best_side(path: NDArray[np.float64]) -> float:
-    """The azimuth, radians, from which the way is seen best: before the eye, its places apart,
-    and not straight on.
-    """
+    """Return the azimuth, radians, from which the path is seen best."""
     found = []
     for azimuth in np.radians(np.arange(20, 380, 45)):
         pose = look_at_origin(np.radians(25), azimuth, AWAY)
@@ -247,9 +256,7 @@ def _draw_belief(
 
 
 def _draw_values(axis: Axes, views: Sequence[View], sphere: Viewpoints, seen_from: float) -> None:
-    """The dome of candidate views from above, by what the policy valued each at; the eye of the
-    large picture below.
-    """
+    """Draw the dome of candidate views from above, coloured by their values."""
     view = views[-1]
     turned = sphere.azimuth - seen_from - np.pi / 2
     out = 90 - np.degrees(sphere.elevation)
@@ -305,8 +312,9 @@ def _draw_values(axis: Axes, views: Sequence[View], sphere: Viewpoints, seen_fro
 def _draw_cells(
     axis: Axes, sphere: ViewSphere, angles: NDArray[np.floating], colours: NDArray[np.floating]
 ) -> float:
-    """A cell around each view of a grid, by its angle around, degrees, and its colour; returns how
-    far out they reach, degrees from the zenith.
+    """Draw a coloured cell around each view of a grid.
+
+    It returns how far out the cells reach, degrees from the zenith.
     """
     out = 90 - np.degrees(sphere.elevation)
     rings = np.sort(90 - np.asarray(sphere.elevations, float))
@@ -342,9 +350,7 @@ def _draw_scale(axis: Axes) -> None:
 def _draw_path(
     axis: Axes, path: NDArray[np.float64], sphere: Viewpoints, light: SoftLight, seen_from: float
 ) -> None:
-    """The object, as far as it was seen, in the dome of candidate views, and the way over the
-    dome.
-    """
+    """Draw the visible part of the object, the candidate views, and the path."""
     figure = axis.figure
     assert isinstance(figure, Figure)
     wide = axis.get_position().width * figure.get_figwidth()
@@ -357,8 +363,9 @@ def _draw_path(
     axis.imshow(pixels, interpolation="antialiased", aspect="auto")
 
     def place(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pixels of points of the dome, and how plainly they are drawn there: behind the object
-        or at the back less.
+        """Return the pixels of points of the dome, and their opacity.
+
+        It is lower behind the object and at the back.
         """
         inside = (DOME * points - pose[:3, 3]) @ pose[:3, :3]
         flat = inside[:, :2] / inside[:, 2:] * focal + intrinsics[:2, 2]

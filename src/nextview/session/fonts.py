@@ -1,6 +1,4 @@
-"""Fonts for names in any script: a figure takes those of this machine that have the characters
-of its texts.
-"""
+"""Find fonts of this machine that contain the characters of a figure's texts."""
 
 import logging
 from collections.abc import Iterable

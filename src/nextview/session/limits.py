@@ -109,9 +109,7 @@ class Limits:
     def _occupied(
         self, places: Float, object: "ObservedObject", surroundings: Sequence[Surroundings]
     ) -> list[tuple[str, NDArray[np.bool_]]]:
-        """Reasons by what the frames show, each with the places that it holds for; the last one
-        counts most.
-        """
+        """Return reasons by what the frames show, with their places; the last one counts most."""
         clearance = self.clearance
         if clearance is None:
             clearance = CLEARANCE if object.support else 0.0

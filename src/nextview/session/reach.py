@@ -33,7 +33,15 @@ class Reach:
     cost: TravelCost | None = None
 
     def can_reach(self, views: NDArray[np.int64], poses: Poses) -> NDArray[np.bool_]:
-        """Which of some views have not failed and can be reached."""
+        """Return which views have not failed and can be reached.
+
+        Args:
+            views: indices of the views, (N,) int64.
+            poses: returns the poses of all views; called only if reachability is a callable.
+
+        Returns:
+            Whether each can be reached, (N,) bool.
+        """
         there = ~self.failed[views]
         if callable(self.reachable):
             at = poses()
@@ -46,8 +54,16 @@ class Reach:
     def constrain(
         self, state: EpisodeState, sphere: Viewpoints, here: Float, poses: Poses
     ) -> EpisodeState:
-        """The state of one episode with where the camera, which stands at ``here``, can go, and
-        what that costs.
+        """Add reachability and travel cost to the state of one episode.
+
+        Args:
+            state: the state.
+            sphere: the candidate views.
+            here: pose of the camera, (4, 4).
+            poses: returns the poses of all views.
+
+        Returns:
+            The state with these.
         """
         views = np.flatnonzero(state.free[0])
         views = views[self.can_reach(views, poses)]
@@ -95,7 +111,18 @@ def _truth(answer: Any) -> bool:
 
 
 def as_reachable(given: ArrayLike | Callable[[Float], bool] | None, views: int) -> Reachable | None:
-    """What a user hands in as reachable."""
+    """Check what a user passes as reachable.
+
+    Args:
+        given: mask of the views, (V,) bool, a callable on poses, or None.
+        views: number of views, V.
+
+    Returns:
+        The mask or the callable; None for all views.
+
+    Raises:
+        UsageError: it is none of these.
+    """
     if given is None or callable(given):
         return given
     mask = np.asarray(given)
@@ -110,7 +137,18 @@ def as_reachable(given: ArrayLike | Callable[[Float], bool] | None, views: int) 
 def as_travel_cost(
     given: ArrayLike | Callable[[Float, Float], float] | None, views: int
 ) -> TravelCost | None:
-    """What a user hands in as travel cost."""
+    """Check what a user passes as travel cost.
+
+    Args:
+        given: cost from view to view, (V, V), a callable on two poses, or None.
+        views: number of views, V.
+
+    Returns:
+        The matrix or the callable; None for the travel of the viewpoints.
+
+    Raises:
+        UsageError: it is none of these, or a cost is negative.
+    """
     if given is None or callable(given):
         return given
     costs = np.asarray(given)

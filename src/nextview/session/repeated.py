@@ -24,17 +24,32 @@ LEVEL = 1e-4
 
 
 def is_repeated(seen: Observation, earlier: Sequence[Observation]) -> bool:
-    """Whether an observation is the picture of an earlier one."""
+    """Return whether an observation shows the picture of an earlier one.
+
+    Args:
+        seen: the observation.
+        earlier: the earlier ones.
+
+    Returns:
+        True if it does.
+    """
     return any(
         np.array_equal(one.depth, seen.depth) and _is_one_picture(one, seen) for one in earlier
     )
 
 
 def after_repeated(state: "ObjectState", frame: Frame, first: int) -> "ObjectState | None":
-    """What is known of an object after a frame that is an earlier one, sightings from ``first`` on;
-    None if not.
+    """Return the state of an object after a frame that repeats an earlier one.
 
-    From where it was really taken is not known, so the earlier sighting stands for it.
+    Its true camera pose is not known, so the earlier sighting stands for it.
+
+    Args:
+        state: before the frame.
+        frame: the frame.
+        first: index of the first sighting to compare with.
+
+    Returns:
+        The state; None if the frame is no repetition.
     """
     for sighting, seen in list(zip(state.sightings, state.observations, strict=True))[first:]:
         if frame.pose is None or not np.array_equal(sighting.frame.depth, frame.depth):

@@ -75,16 +75,13 @@ class Recognition:
 
     @property
     def warnings(self) -> tuple[ViewWarning, ...]:
-        """What is likely to be wrong with the views: each kind once, as the last view with it says
-        it.
-        """
+        """Likely faults of the views, each kind once, as the last view reports it."""
         found = {warning.name: warning for view in self.views for warning in view.warnings}
         return tuple(found.values())
 
     @property
     def novelty(self) -> float | None:
-        """Share of known objects that are at least as novel (a p-value); None if the recogniser has
-        no score.
+        """p-value: share of known objects that are at least as novel; None without a score.
 
         It holds for objects seen as the known ones were; what is hidden of one is allowed for, see
         ``values_of``. Of things that are known by their geometry it says how badly the likeliest
@@ -99,9 +96,7 @@ class Recognition:
 
     @property
     def unknown(self) -> bool:
-        """Whether the object is called one of no known class: too novel, or of another size than
-        the class believed.
-        """
+        """Whether the object is of no known class, by its novelty or its size."""
         if not self.unknown_rate or not self.seen:
             return False
         if self.novelty is not None and self.novelty < self.unknown_rate:
@@ -111,8 +106,9 @@ class Recognition:
 
     @property
     def none_of_them(self) -> str:
-        """The answer for an unknown object: ``none of the 10 classes it knows (most like a
-        toilet)``.
+        """The answer for an unknown object.
+
+        It reads ``none of the 10 classes it knows (most like a toilet)``.
         """
         a = "an" if str(self.most_like)[:1].lower() in "aeiou" else "a"
         return f"none of the {len(self.classes)} classes it knows (most like {a} {self.most_like})"
@@ -155,15 +151,12 @@ class Recognition:
 
     @property
     def radius(self) -> float | None:
-        """The object radius, metres, as it is known by now; None if the camera does not know its
-        scale.
-        """
+        """Current estimate of the object radius, metres; None if the scale is not known."""
         return self.views[-1].observation.radius if self.views else None
 
     @property
     def pose(self) -> NDArray[np.float64] | None:
-        """Where the object is: from the frame of its scan file (origin and axes) into
-        ``pose_frame``, (4, 4), metres.
+        """Transform from the frame of the scan file to ``pose_frame``, (4, 4), metres.
 
         A point p of the scan, in metres, is at ``(pose @ [*p, 1])[:3]``. None where there is no
         answer, or its geometry is not known: see ``why_no_pose``.
@@ -173,17 +166,13 @@ class Recognition:
 
     @property
     def pose_of(self) -> str | None:
-        """Name of the thing whose scan ``pose`` is of: one of the things of the class that is
-        the answer.
-        """
+        """Name of the thing whose scan ``pose`` is of; one of the answer's class."""
         found = self._candidates_of_answer
         return found[0].thing if found else None
 
     @property
     def place(self) -> NDArray[np.float64] | None:
-        """Where the centroid of the thing's surface is, in ``pose_frame``, (3,), metres; None
-        without a pose.
-        """
+        """Centroid of the thing's surface in ``pose_frame``, (3,), metres; None without a pose."""
         found = self._candidates_of_answer
         return found[0].place if found else None
 
@@ -199,8 +188,7 @@ class Recognition:
 
     @property
     def pose_candidates(self) -> tuple[PoseCandidate, ...]:
-        """The poses that the object may have, the likeliest first, in ``pose_frame``; their
-        probabilities sum to 1.
+        """The plausible poses, most likely first, in ``pose_frame``; probabilities sum to 1.
 
         There are several where a thing looks alike from several sides, or two things look alike:
         each says of which thing it is. None are known where ``pose`` is None because the geometry
@@ -210,8 +198,7 @@ class Recognition:
 
     @property
     def pose_uncertainty(self) -> PoseUncertainty | None:
-        """How far off ``pose`` may be, degrees and millimetres: standard deviations; None where
-        there is none.
+        """Standard deviations of ``pose``, degrees and millimetres; None without a pose.
 
         It comes from how well the depth determines the pose, from how likely the other candidates
         of the same thing are, and in the world from how far off cameras usually are.
@@ -225,16 +212,13 @@ class Recognition:
 
     @property
     def symmetry(self) -> Any:
-        """Turns after which the thing that was named looks the same; None where they are not
-        known.
-        """
+        """Rotations that leave the named thing unchanged; None if they are not known."""
         found = self._candidates_of_answer
         return found[0].symmetry if found else None
 
     @property
     def posed_surface(self) -> Triangles | None:
-        """The scan of the thing that was named, where it was found; None without a pose or a
-        surface.
+        """The scan of the named thing in its pose; None without a pose or a surface.
 
         Vertices, (V, 3) float64, in the object frame and object radii as observations are, and
         faces, (F, 3).
@@ -250,9 +234,10 @@ class Recognition:
 
     @property
     def _displacements(self) -> NDArray[np.float64]:
-        """By how much each view shows ``posed_surface`` displaced, because its camera does not
-        stand where it is said to, (views, 3), object frame, object radii; 0 where that is not
-        known, as in a view that shows nothing.
+        """Displacement of ``posed_surface`` in each view, (views, 3), object radii.
+
+        It comes from the errors of the camera positions, in the object frame; 0 where it is not
+        known.
         """
         displaced = np.zeros((len(self.views), 3))
         radius = self.radius
@@ -280,17 +265,13 @@ class Recognition:
 
     @property
     def why_no_pose(self) -> str:
-        """Why there is no pose though all views were judged together, in words; "" if there is
-        one.
-        """
+        """Why there is no pose though all views were judged together; "" if there is one."""
         joint = self._joint
         return joint.why_no_pose if joint is not None and self.pose is None else ""
 
     @property
     def _joint(self) -> JointBelief | None:
-        """What all views say together; None where views are judged one by one, or nothing is
-        seen.
-        """
+        """What all views say together; None if views are judged one by one."""
         return self.views[-1].joint if self.views else None
 
     @property
@@ -301,17 +282,13 @@ class Recognition:
 
     @property
     def _explained(self) -> float | None:
-        """Share of known things that are explained as badly by their geometry; None where that
-        is not known.
-        """
+        """Share of known things that are explained as badly; None if it is not known."""
         joint = self._joint
         return None if joint is None else joint.p_value
 
     @property
     def _candidates_of_answer(self) -> list[PoseCandidate]:
-        """Poses of things of the class that is the answer, the likeliest first; none for an
-        unknown object.
-        """
+        """Poses of things of the answer's class, most likely first; none if unknown."""
         if self.answer is None:
             return []
         label = self.classes.index(self.answer)
@@ -346,22 +323,30 @@ class Recognition:
 
     @property
     def _place_in_words(self) -> str:
-        """``, at [0.412, -0.103, 0.050] m in the world, ± 1.2°, 0.8 mm``: the thing's centre; ""
-        without a pose.
+        """Place and uncertainty in words; "" without a pose.
+
+        It reads ``, at [0.412, -0.103, 0.050] m in the world, ± 1.2°, 0.8 mm``.
         """
         if self.place is None:
             return ""
         return f", at {place_in_words(self.place)} in {self.poses_in}, {self.pose_uncertainty}"
 
     def plot(self, path: str | Path | None = None, title: str = "") -> "Figure":
-        """Draw the episode: images, what the policy valued the views at, beliefs and the path on
-        the sphere.
+        """Draw the episode: images, values of the views, beliefs, and the path on the sphere.
 
-        The outline of the scan of the thing that was named, in its pose, is drawn over the images,
-        in each where its camera sees it: errors of the cameras' places are taken off.
-        With a path it is written to that file too, PNG, PDF or SVG, and replaces one of that name.
-        UsageError: it is another format. ResultsError: the path is a link or a folder, or cannot be
-        written.
+        The outline of the posed scan of the named thing is drawn over the images, corrected for the
+        errors of the camera positions.
+
+        Args:
+            path: file to write, PNG, PDF or SVG, which is replaced; None for no file.
+            title: text before the heading.
+
+        Returns:
+            The figure.
+
+        Raises:
+            UsageError: it is another format.
+            ResultsError: the path is a link or a folder, or cannot be written.
         """
         from nextview.session.episode_figure import draw_episode, save_figure
 

@@ -55,8 +55,7 @@ CONTRADICTABLE = 3
 
 @runtime_checkable
 class FrameCamera(Protocol):
-    """A camera in the world, with what it is to look at: it gives frames, and need not be where it
-    was asked to be.
+    """A camera in the world that delivers frames, with the object that it is to look at.
 
     Where it has an attribute ``knows_reach`` that is true, it decides alone where it can stand, and
     is asked for candidates too that ``Session.limits`` would leave out: views that were captured
@@ -69,8 +68,9 @@ class FrameCamera(Protocol):
         ...
 
     def observe(self, pose: Float) -> Frame:
-        """Look from a pose in the object frame, object radii, or from near it; or raise a
-        ``NoViewLeftError``.
+        """Look from a pose in the object frame, object radii, or from near it.
+
+        It raises ``NoViewLeftError`` if that is not possible.
         """
         ...
 
@@ -204,15 +204,12 @@ class Session:
 
     @property
     def pose(self) -> Float:
-        """Where to look now, as a camera-to-world pose (4, 4), OpenCV axes, object frame, object
-        radii.
-        """
+        """Next camera-to-world pose, (4, 4), OpenCV axes, object frame, object radii."""
         return self.sphere.poses[self.view]
 
     @property
     def poses(self) -> Float:
-        """Where the candidate views are in your world: camera-to-world, (V, 4, 4), OpenCV axes,
-        metres.
+        """Candidate poses in your world: camera-to-world, (V, 4, 4), OpenCV axes, metres.
 
         At ``distance`` from the object, looking at its centre, the horizon level. They move when a
         frame shows better where the object is. Without frames they are those of ``sphere``, in
@@ -304,8 +301,7 @@ class Session:
 
     @property
     def distance(self) -> float | None:
-        """How far from the object's centre the camera shall stand, metres; None for
-        ``sphere.distance`` object radii.
+        """Camera distance from the object's centre, metres; None for ``sphere.distance`` radii.
 
         What is set here counts from the next pose on.
         """
@@ -383,8 +379,7 @@ class Session:
 
     @property
     def travel_cost(self) -> TravelCost | None:
-        """What it costs to go from view to view, see ``session.reach.TravelCost``; None for the
-        travel in grid cells.
+        """Cost from view to view, see ``session.reach.TravelCost``; None for grid cells.
 
         Policies that weigh travel weigh this instead from the next choice on: seconds of your
         planner for instance. Its unit does not matter: its mean over the free views counts as much
@@ -399,8 +394,7 @@ class Session:
 
     @property
     def limits(self) -> Limits:
-        """To which candidates no camera is sent, by what the frames show, see
-        ``session.limits.Limits``.
+        """Limits by which candidates are left out, see ``session.limits.Limits``.
 
         What is set here counts from now on, as for ``reachable``. Sessions without frames know no
         place to keep off.
@@ -424,9 +418,7 @@ class Session:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Why each candidate is left out by ``limits`` or has failed, (V,); "" where neither is
-        so.
-        """
+        """Why each candidate is left out by ``limits`` or has failed, (V,); else ""."""
         with self._lock:
             reasons = self._reasons(self.object)
             return tuple(
@@ -446,8 +438,9 @@ class Session:
         return self._limits.reasons(self._poses_around(object), object, self._surroundings)
 
     def failed(self, view: int | None = None) -> None:
-        """The camera could not be brought to a view, by default the one that was asked for: it is
-        offered no more.
+        """Report that the camera could not reach a view, by default the requested one.
+
+        It is offered no more.
 
         Where no reachable view is left the session ends, not confident: ``Recognition.stranded``.
         """
@@ -508,8 +501,9 @@ class Session:
         object: ObservedObject | None,
         here: Float | None = None,
     ) -> EpisodeState:
-        """The state with where the camera can go from here, by default from where the last view
-        was taken.
+        """Return the state with the reachable views and the travel cost.
+
+        They are counted from the camera of the last view by default.
         """
         if here is None:
             here = (
@@ -524,8 +518,7 @@ class Session:
     # What is seen
 
     def update(self, seen: Observation | Frame) -> View:
-        """Take in what was seen, from ``pose``, from ``target`` or from anywhere else: its own pose
-        counts.
+        """Take in what was seen, from ``pose``, ``target`` or anywhere else.
 
         Where this raises, nothing is taken in: the session is as it was, and goes on with the next
         view.
@@ -747,9 +740,7 @@ class Session:
         )
 
     def _score(self, step: Step, observation: Observation) -> ViewScore | None:
-        """The novelty score of a view; None where nothing is seen, or the recogniser has no
-        score.
-        """
+        """Return the novelty score of a view; None without a score."""
         score = self.models.recogniser.novelty
         evidence = step.evidence
         if not observation.seen or (evidence.seen is not None and not evidence.seen[0]):
@@ -765,9 +756,7 @@ class Session:
         return None if evidence.novelty is None else evidence.novelty[0]
 
     def _contradicted(self, n_views: int) -> bool:
-        """Whether half of so many views or more contradict others: the object moved, or is
-        another one by now.
-        """
+        """Return whether half of the views or more contradict others."""
         return (
             2 * sum(any(w.name == "contradiction" for w in view.warnings) for view in self.views)
             >= n_views
@@ -775,9 +764,7 @@ class Session:
         )
 
     def _suspicious(self, steps: Sequence[Step], observations: Sequence[Observation]) -> bool:
-        """Whether an object is too novel for a confident answer by some steps, as their views
-        are seen by now.
-        """
+        """Return whether an object is too novel for a confident answer."""
         if not self.unknown:
             return False
         joint = steps[-1].joint[0] if steps[-1].joint else None
@@ -830,9 +817,7 @@ class Session:
         return values[0]
 
     def run(self, camera: Camera | FrameCamera) -> Recognition:
-        """Go on to the end with a camera that goes where it is told, or until it has no view
-        left to offer.
-        """
+        """Continue to the end with a camera, or until it has no view left."""
         while not self.done:
             try:
                 seen = camera.observe(self.pose)

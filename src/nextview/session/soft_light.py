@@ -78,8 +78,16 @@ class SoftLight:
     def picture(
         self, surfaces: Sequence[Triangles], pose: Float, intrinsics: Float, shape: tuple[int, int]
     ) -> tuple[NDArray[np.uint8], Float]:
-        """Surfaces on the ground from a pose, (H, W, 3), and how far each pixel's ray goes to
-        one, (H, W).
+        """Render surfaces on the ground.
+
+        Args:
+            surfaces: the surfaces.
+            pose: camera-to-world, (4, 4).
+            intrinsics: pinhole matrix, (3, 3), pixels.
+            shape: rows and columns of the picture.
+
+        Returns:
+            The picture, (H, W, 3) uint8, and the distance along each pixel's ray, (H, W).
         """
         rays = pixel_rays(np.asarray(intrinsics, np.float64), shape).reshape(-1, 3) @ pose[:3, :3].T
         origins = np.tile(pose[:3, 3], (len(rays), 1)).astype(np.float32)

@@ -53,9 +53,7 @@ STYLE = {
 
 
 class PlainFigure(Figure):
-    """A figure that shows names as they are: a dollar begins no formula, and every script has
-    its font.
-    """
+    """A figure that shows names literally, in a font that has their characters."""
 
     def draw(self, renderer: Any) -> None:
         """Draw, after all texts are known."""
@@ -67,7 +65,15 @@ class PlainFigure(Figure):
 
 
 def new_figure(width: float, height: float) -> tuple[Figure, Axes]:
-    """An empty figure with one pair of axes, inches; few ticks, at round numbers."""
+    """Create a figure with one pair of axes and few ticks at round numbers.
+
+    Args:
+        width: of the figure, inches.
+        height: of the figure, inches.
+
+    Returns:
+        The figure and its axes.
+    """
     with matplotlib.rc_context(STYLE):
         figure = PlainFigure((width, height))
         axes = figure.add_subplot()
@@ -82,7 +88,12 @@ def percent_axis(axis: Axis) -> None:
 
 
 def legend(axes: Axes, title: str | None = None) -> None:
-    """A legend in two columns below the axes."""
+    """Draw a legend in two columns below the axes.
+
+    Args:
+        axes: the axes.
+        title: of the legend; None for none.
+    """
     with matplotlib.rc_context(STYLE):
         axes.legend(
             loc="upper center",
@@ -120,6 +131,11 @@ def to_svg(figure: Figure) -> str:
 
 
 def to_png(figure: Figure, path: Path) -> None:
-    """A figure as a PNG file."""
+    """Write a figure to a PNG file.
+
+    Args:
+        figure: the figure.
+        path: of the file.
+    """
     with matplotlib.rc_context(STYLE):
         figure.savefig(path, dpi=160, facecolor="white", bbox_inches="tight", pad_inches=0.1)

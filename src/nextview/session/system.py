@@ -1,6 +1,4 @@
-"""The front door: a recogniser, maps, a policy, candidate viewpoints and a stopping rule that
-belong together.
-"""
+"""The front door: models, a policy, candidate viewpoints and a stopping rule."""
 
 import os
 import warnings
@@ -85,8 +83,7 @@ class System:
         any_orientation: bool = False,
         goal: Goal = "thing",
     ) -> Session:
-        """One object under way, for whoever moves the camera. Those for a robot need no more than a
-        distance.
+        """Create a session for one object; a robot needs to give only a distance.
 
         Candidate views that touch the table, or what else the frames show, are left out: the last
         three say more of it, see ``session.limits.Limits``.
@@ -132,7 +129,17 @@ class System:
         seed: int = 0,
         any_orientation: bool = False,
     ) -> Session:
-        """A session for a camera: where it gives frames, for its object."""
+        """Create a session for a camera; if it delivers frames, for its object.
+
+        Args:
+            camera: the camera.
+            start: index of the first view; None for a random one.
+            seed: of the draws.
+            any_orientation: whether the object is a taught thing in any orientation.
+
+        Returns:
+            The session.
+        """
         if not isinstance(camera, FrameCamera):
             return self.session(start, seed, any_orientation=any_orientation)
         session = self.session(start, seed, camera.object, any_orientation=any_orientation)
@@ -217,7 +224,16 @@ def _in_any_orientation(models: Models) -> Models:
 
 
 def simulated(mesh: Mesh, sensor: "str | Sensor | None" = None, seed: int = 0) -> Camera:
-    """A simulated camera before a mesh, with the errors of a sensor, if any, drawn by the seed."""
+    """Create a simulated camera in front of a mesh.
+
+    Args:
+        mesh: the mesh.
+        sensor: whose errors it has; None for clean renders.
+        seed: of the errors.
+
+    Returns:
+        The camera.
+    """
     if sensor is None:
         from nextview.simulation.simulated import SimulatedCamera
 
@@ -328,9 +344,7 @@ def _check_options(policy: Any, threads: int, risk: float | None, unknown: float
 
 
 def _names_of(models: Any) -> list[str]:
-    """Names or paths of collections, one or several; UsageError if they are none, or one is
-    there twice.
-    """
+    """Return the names of one or several collections; UsageError if they are invalid."""
     given = list(models) if isinstance(models, list | tuple) else [models]
     for name in given or [models]:
         if not isinstance(name, str | Path):
@@ -352,8 +366,9 @@ def _opened(collections: dict[str, Collection], threads: int) -> Recogniser:
 
 
 def _unknown_share(asked: float | None, recogniser: Recogniser, called: str) -> float:
-    """Share of known objects that may be called unknown; ModelError where the recogniser cannot
-    tell.
+    """Return the share of known objects that may be called unknown.
+
+    ModelError if the recogniser has no novelty score.
     """
     can_tell = tells_unknown(recogniser)
     if asked and not can_tell:
@@ -374,9 +389,7 @@ def _rule(given: Stopping | Rule | str | None, usual: Stopping, risk: float | No
 
 
 def _grid_of(network: MapNetwork, sphere: ViewSphere) -> ViewSphere:
-    """The grid whose local maps a network predicts: that of the views if it has as many rings,
-    else the 40 views.
-    """
+    """Return the grid of a network's maps: that of the views, or the 40 views."""
     for grid in (sphere, *LAYOUTS.values()):
         if network.rings in (None, grid.rings):
             return grid
@@ -404,9 +417,7 @@ def _camera_of(folder: Path, up: str | tuple[float, float, float] | None) -> "Ca
 def _default_policy(
     own: dict[str, Path], sphere: Viewpoints, recogniser: Recogniser
 ) -> tuple[str, Policy]:
-    """For taught things "discriminate"; "gain", where one fits, else "spread", which asks for
-    nothing.
-    """
+    """Return "discriminate" for taught things, "gain" if one fits, else "spread"."""
     if isinstance(recogniser, SeveralRecognisers):
         return DISCRIMINATE, DiscriminateGeometry(sphere)
     if (memory := own.get(DISCRIMINATE)) is not None:

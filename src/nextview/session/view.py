@@ -58,9 +58,7 @@ class View:
 
     @property
     def novelty(self) -> float | None:
-        """The novelty score of this view, made when it is first asked for; None if there is
-        none.
-        """
+        """Novelty score of this view, computed when it is first used; None without a score."""
         return None if self.score is None else values_of([self.score])[0]
 
     @property

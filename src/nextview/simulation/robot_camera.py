@@ -1,6 +1,4 @@
-"""A robot's camera in a scene: frames in metres, through a sensor, of a target that is named as
-a user would.
-"""
+"""A robot's camera in a scene, with frames in metres and a target named as a user would."""
 
 from dataclasses import replace
 from typing import Literal, get_args
@@ -31,8 +29,15 @@ SAME = 1e-6  # radians between directions that are the same
 def sensed_camera(
     scene: Scene, sensor: Sensor | SensorMix | str, rng: np.random.Generator
 ) -> SensedCamera:
-    """A ``SensedCamera`` before a scene's target, three radii away; what hides it is told from
-    it exactly.
+    """Create a camera three radii from a scene's target, which is segmented exactly.
+
+    Args:
+        scene: the scene.
+        sensor: whose errors it has.
+        rng: source of all random numbers.
+
+    Returns:
+        The camera.
     """
     drawn = sensor_named(sensor).draw(rng.spawn(1)[0])
     drawn = replace(drawn, radius=drawn.distance / DISTANCE, boxes=0.0)
@@ -78,15 +83,11 @@ class RobotCamera:
         self._taken = list[Float]()
 
     def reachable(self, pose: Float) -> bool:
-        """Whether the camera can be brought to a pose of the scene, (4, 4), metres: for
-        ``Session.reachable``.
-        """
+        """Return whether the camera can reach a pose of the scene, (4, 4), metres."""
         return bool(self.scene.reachable(self._truth.pose_in_object(pose)[None, :3, 3])[0])
 
     def observe(self, pose: Float) -> Frame:
-        """Look from a pose, (4, 4), in the object frame as it is believed to be; from near it
-        where that cannot be.
-        """
+        """Look from a pose, (4, 4), in the believed object frame, or from near it."""
         believed = (
             self.object.object_frame if self.object.sightings or self.object.known else self._truth
         )

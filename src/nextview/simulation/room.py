@@ -1,6 +1,4 @@
-"""A room as geometry: an object at the size that it has in life, floor, walls, furniture; and a
-camera in it.
-"""
+"""A room as geometry: a life-size object, floor, walls, furniture, and a camera in it."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -68,9 +66,7 @@ class Room:
         return RayCaster(self.things)
 
     def reachable(self, pose: Float) -> bool:
-        """Whether a mobile robot's camera can be brought to a pose, (4, 4): for
-        ``Session.reachable``.
-        """
+        """Return whether a mobile robot's camera can reach a pose, (4, 4)."""
         place = np.asarray(pose)[:3, 3]
         layout = self.layout
         half = np.array([layout.width, layout.depth]) / 2 - CLEARANCE
@@ -117,7 +113,20 @@ def build_room(layout: RoomLayout, meshes: str | Path, max_faces: int = MAX_FACE
 
 
 def stood(thing: Standing, meshes: Path, max_faces: int, name: str) -> Triangles:
-    """A mesh in its place: corners, (V, 3), metres, and faces, (F, 3)."""
+    """Load a mesh and put it in its place.
+
+    Args:
+        thing: the mesh and its place.
+        meshes: folder of the mesh files.
+        max_faces: largest number of triangles.
+        name: of the room, for messages.
+
+    Returns:
+        Vertices, (V, 3), metres, and faces, (F, 3).
+
+    Raises:
+        DatasetError: the file is not the one that the room was made with.
+    """
     path = meshes / thing.mesh
     if mesh_hash(path) != thing.sha256:
         raise DatasetError(f"{path}: is not the mesh that room {name} was made with")
@@ -126,7 +135,15 @@ def stood(thing: Standing, meshes: Path, max_faces: int, name: str) -> Triangles
 
 
 def at_rest(vertices: Float, thing: Standing) -> Float:
-    """The corners of a normalised mesh, (V, 3), where a thing of it stands, metres."""
+    """Move the vertices of a normalised mesh to the place of a thing.
+
+    Args:
+        vertices: (V, 3), object radii.
+        thing: the place.
+
+    Returns:
+        Vertices, (V, 3), metres.
+    """
     turn = rotation_z(thing.azimuth) @ np.reshape(thing.rotation, (3, 3))
     turned = thing.radius * vertices @ turn.T
     low = turned.min(0)

@@ -1,6 +1,4 @@
-"""A scene as geometry: upright things on a table, in the target's object frame, and where a
-camera can be.
-"""
+"""A scene as geometry: upright things on a table, and where a camera can be."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -34,9 +32,7 @@ _AROUND = EDGE * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 
 @dataclass(frozen=True)
 class Item:
-    """One thing beside the target, in its object frame: (V, 3), (F, 3) int32, and
-    counter-clockwise (K, 2).
-    """
+    """A thing beside the target: vertices, (V, 3), faces, (F, 3) int32, footprint, (K, 2)."""
 
     vertices: Float
     faces: NDArray[np.int32]
@@ -58,9 +54,7 @@ class Scene:
 
     @cached_property
     def around(self) -> Mesh | None:
-        """All items as one mesh, in the target's frame and radii, not normalised; None if there
-        is none.
-        """
+        """All items as one mesh in the target's frame, not normalised; None without items."""
         if not self.items:
             return None
         first = np.cumsum([0, *(len(item.vertices) for item in self.items)])
@@ -76,8 +70,9 @@ class Scene:
         return Mesh(*square(TABLE, self.floor), np.zeros(3), 1.0, "table")
 
     def clearance(self, positions: Float) -> Float:
-        """Distance of cameras, (V, 3), from the nearest item or the table, (V,); 0 inside,
-        negative below.
+        """Return the distance of cameras, (V, 3), from the nearest item or the table, (V,).
+
+        It is 0 inside, and negative below.
         """
         found = positions[:, 2] - self.floor
         for item in self.items:
@@ -86,8 +81,7 @@ class Scene:
         return found
 
     def reachable(self, positions: Float) -> NDArray[np.bool_]:
-        """Whether a camera can be brought to each position, (V, 3), object frame, object radii;
-        (V,) bool.
+        """Return whether a camera can be at each position, (V, 3), object radii; (V,) bool.
 
         Not nearer than CLEARANCE to an item or the table, nor to where a wall stands before the
         target from above.
@@ -100,10 +94,19 @@ class Scene:
 
 
 def build_scene(layout: SceneLayout, meshes: str | Path, max_faces: int = MAX_FACES) -> Scene:
-    """A scene as geometry, of the mesh files below a folder; MeshError if they have more faces
-    together.
+    """Build a scene from the mesh files of a folder.
 
-    DatasetError: a file is not the one that the scene was made with.
+    Args:
+        layout: of the scene.
+        meshes: the folder.
+        max_faces: largest number of triangles of all meshes together.
+
+    Returns:
+        The scene.
+
+    Raises:
+        MeshError: the meshes have more triangles.
+        DatasetError: a file is not the one that the scene was made with.
     """
     loaded: list[Mesh] = []
     for placed in (layout.target, *layout.objects):
@@ -121,14 +124,31 @@ def build_scene(layout: SceneLayout, meshes: str | Path, max_faces: int = MAX_FA
 
 
 def place(mesh: Mesh, at: Placement, floor: float) -> Item:
-    """A mesh, in its own frame and radii, rotated, scaled and stood on the table."""
+    """Rotate and scale a mesh and put it on the table.
+
+    Args:
+        mesh: the mesh.
+        at: its place.
+        floor: height of the table.
+
+    Returns:
+        The item.
+    """
     vertices = at.radius * mesh.vertices @ rotation_z(at.azimuth).T
     vertices += (at.x, at.y, floor - vertices[:, 2].min())
     return Item(vertices, mesh.faces, footprint(vertices))
 
 
 def block_item(block: Block, floor: float) -> Item:
-    """A box on the table."""
+    """Put a box on the table.
+
+    Args:
+        block: the box and its place.
+        floor: height of the table.
+
+    Returns:
+        The item.
+    """
     size = np.array([[block.width, block.depth, block.height]])
     middle = np.array([[block.x, block.y]])
     mesh = upright_boxes(size, np.array([block.azimuth]), middle, floor)
@@ -137,7 +157,15 @@ def block_item(block: Block, floor: float) -> Item:
 
 @lru_cache(maxsize=64)
 def cached_mesh(path: Path, max_faces: int = MAX_FACES) -> Mesh:
-    """A mesh, read once: the same ones stand in many scenes. See ``load_mesh``."""
+    """Load a mesh and keep it, as the same ones stand in many scenes; see ``load_mesh``.
+
+    Args:
+        path: of the file.
+        max_faces: largest number of triangles.
+
+    Returns:
+        The mesh.
+    """
     return load_mesh(path, max_faces=max_faces)
 
 
@@ -149,8 +177,15 @@ def mesh_hash(path: Path) -> str:
 
 
 def boxes_around(vertices: Float, count: int, rng: np.random.Generator) -> Mesh:
-    """So many upright boxes on the ground of an object, outside of its outline's circle; they
-    may overlap.
+    """Draw upright boxes on the ground around an object; they may overlap.
+
+    Args:
+        vertices: of the object, (V, 3).
+        count: number of boxes.
+        rng: source of all random numbers.
+
+    Returns:
+        The boxes as one mesh, outside of the object's circle.
     """
     floor = vertices[:, 2].min()
     reach = np.hypot(vertices[:, 0], vertices[:, 1]).max()
@@ -164,7 +199,15 @@ def boxes_around(vertices: Float, count: int, rng: np.random.Generator) -> Mesh:
 
 
 def square(half: float, height: float) -> tuple[Float, NDArray[np.int32]]:
-    """Vertices and faces of a level square, half its side and its height given."""
+    """Return a level square.
+
+    Args:
+        half: half of its side.
+        height: of the square.
+
+    Returns:
+        Vertices, (4, 3), and faces, (2, 3) int32.
+    """
     corners = np.array(
         [[-half, -half, height], [half, -half, height], [half, half, height], [-half, half, height]]
     )
@@ -172,8 +215,16 @@ def square(half: float, height: float) -> tuple[Float, NDArray[np.int32]]:
 
 
 def upright_boxes(size: Float, azimuth: Float, at: Float, floor: float) -> Mesh:
-    """Boxes of width, depth and height, (N, 3), on the ground at some height, as one mesh, not
-    normalised.
+    """Return boxes on the ground as one mesh, not normalised.
+
+    Args:
+        size: width, depth and height, (N, 3).
+        azimuth: about the vertical, radians, (N,).
+        at: centres on the ground, (N, 2).
+        floor: height of the ground.
+
+    Returns:
+        The mesh.
     """
     corners = _CORNERS * size[:, None]
     c = np.cos(azimuth)[:, None]
@@ -192,11 +243,16 @@ def footprint(vertices: Float) -> Float:
 
 
 def separation(a: Float, b: Float) -> float:
-    """How far apart two convex polygons are along the edge normal that parts them most; negative if
-    they overlap.
+    """Return the distance of two convex polygons along the edge normal that separates them most.
 
-    Corner to corner they are farther apart, never nearer. Counter-clockwise, (K, 2) and (L, 2); two
-    points are a line.
+    Corner to corner they are farther apart, never nearer. It is negative if they overlap.
+
+    Args:
+        a: corners, counter-clockwise, (K, 2); two points are a line.
+        b: corners, counter-clockwise, (L, 2).
+
+    Returns:
+        The distance.
     """
     return max(_gap(a, b), _gap(b, a))
 
@@ -211,8 +267,14 @@ def _gap(a: Float, b: Float) -> float:
 
 
 def distances(polygon: Float, points: Float) -> Float:
-    """Distance of points, (N, 2), from a convex polygon, counter-clockwise, (K, 2); 0 inside.
-    (N,) float64.
+    """Return the distance of points from a convex polygon.
+
+    Args:
+        polygon: corners, counter-clockwise, (K, 2).
+        points: (N, 2).
+
+    Returns:
+        Distances, (N,) float64; 0 inside.
     """
     edges = np.roll(polygon, -1, axis=0) - polygon
     towards = points[:, None] - polygon

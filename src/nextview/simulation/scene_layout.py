@@ -1,6 +1,4 @@
-"""What stands where on the table of a cluttered scene: one small JSON file, of which it is built
-to the bit.
-"""
+"""The layout of a cluttered scene: a JSON file from which it is rebuilt to the bit."""
 
 import re
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -36,8 +34,7 @@ def below_the_meshes(path: str) -> None:
 
 
 class Placement(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """An object that stands on the table: a mesh file below the folder of meshes, its hash, and
-    where it stands.
+    """An object on the table: mesh file, its hash, and its place.
 
     x and y are those of its bounding box's centre; lengths are in object radii of the target,
     angles in radians.
@@ -55,8 +52,9 @@ class Placement(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=T
 
 
 class Block(Struct, frozen=True, forbid_unknown_fields=True):
-    """An upright box on the table, target's radii and radians; beyond a ``wall`` the camera
-    cannot be brought.
+    """An upright box on the table; the camera cannot be beyond a ``wall``.
+
+    Lengths are in the target's radii, angles in radians.
     """
 
     x: Length
@@ -69,9 +67,7 @@ class Block(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SceneLayout(Struct, frozen=True, forbid_unknown_fields=True):
-    """A target at rest on a table as high as its lowest point, in its object frame, and what
-    stands around it.
-    """
+    """A target at rest on a table, in its object frame, and the things around it."""
 
     name: str  # unique in its folder, "chair_0890@medium-1"
     level: str  # one of LEVELS, or another word for scenes of one's own

@@ -1,6 +1,4 @@
-"""A simulated camera behind a sensor: true depth in metres, the sensor's errors, then the
-product's own way in.
-"""
+"""A simulated camera with a sensor: true depth, the sensor's errors, and the usual processing."""
 
 from dataclasses import replace
 
@@ -91,8 +89,9 @@ class SensedCamera:
         return SimulatedCamera(mesh, intrinsics=self.sensor.intrinsics, shape=self.sensor.shape)
 
     def observe(self, pose: Float) -> Observation:
-        """Look from the direction of a pose, (4, 4), at the sensor's own distance; too little
-        found is nothing seen.
+        """Look from the direction of a pose, (4, 4), at the sensor's own distance.
+
+        If too little is found, nothing is seen.
         """
         try:
             thing = ObservedObject(
@@ -116,8 +115,7 @@ class SensedCamera:
         )
 
     def frame(self, pose: Float) -> Frame | None:
-        """What the sensor gives, with the object's mask and the pose that the robot believes in;
-        None for too little.
+        """Return the sensor's frame with mask and believed pose; None if too little is seen.
 
         The world is the true object frame, in metres. The pose is as in ``observe``.
         """
@@ -190,8 +188,9 @@ class SensedCamera:
         return depth * np.float32(self.sensor.radius), whose
 
     def _table(self, pose: Float) -> tuple[Part, Float]:
-        """Depth of the table in a part of the picture that holds it, object radii; infinite
-        beside and from below.
+        """Return the depth of the table, object radii, in the part of the picture with it.
+
+        It is infinite beside the table and from below.
         """
         height = pose[2, 3] - self._floor
         setup = self.sensor
@@ -216,9 +215,7 @@ class SensedCamera:
             return part, np.where(across[0] ** 2 + across[1] ** 2 < self._reach**2, along, np.inf)
 
     def _cropped(self, depth: Depth, mask: NDArray[np.bool_], rng: np.random.Generator) -> Depth:
-        """The picture without what lies beyond a line across the object, parallel to one of its
-        borders.
-        """
+        """Return the picture without what is beyond a line across the object."""
         side = int(rng.integers(4))
         share = float(rng.uniform(0, self.sensor.crop))
         lines = np.flatnonzero(mask.any(axis=1 - side // 2))

@@ -131,9 +131,7 @@ class Sensor:
             )
 
     def scaled(self, strength: float) -> "Sensor":
-        """The same sensor with all errors so many times as strong; 0 for none, STRONGEST at
-        most.
-        """
+        """Return the sensor with all errors multiplied; 0 for none, STRONGEST at most."""
         number(strength, "the strength of a sensor", 0, STRONGEST)
         name = self.name if strength == 1 else f"{self.name}:{strength:g}"
         return replace(
@@ -180,16 +178,19 @@ class Sensor:
     def measure(
         self, depth: NDArray[np.float32], rng: np.random.Generator
     ) -> tuple[NDArray[np.float32], Index]:
-        """What the sensor makes of a true depth image, (height, width) float32, metres, 0 where
-        there is nothing.
+        """Return what the sensor measures of a true depth image.
 
         Errors of strength 0 change nothing, to the bit. Each error draws from a generator of its
         own.
 
+        Args:
+            depth: true depth, (height, width) float32, metres; 0 where there is nothing.
+            rng: source of all random numbers.
+
         Returns:
             Depth, (height, width) float32, 0 where none was measured. And whose surface each pixel
-            shows, its own or that of one nearby: row * width + column, int64, or -1 if it hangs in
-            the air.
+            shows, its own or that of a neighbour: row * width + column, int64, or -1 for a flying
+            pixel.
         """
         measured = depth.copy()
         sources = np.arange(depth.size).reshape(depth.shape)
@@ -385,8 +386,9 @@ def sensor_named(text: str | Sensor | SensorMix) -> Sensor | SensorMix:
 
 
 def slopes(q: Image) -> tuple[Image, Image]:
-    """Change per pixel along x and y, from the side where it is smaller: the same surface. 0 for
-    a pixel alone.
+    """Return the change per pixel along x and y, on the side where it is smaller.
+
+    It is 0 for a pixel alone.
     """
     return _slope(q), _slope(q.T).T
 
@@ -402,8 +404,18 @@ def _slope(q: Image) -> Image:
 
 
 def shifted(q: Image, slope: tuple[Image, Image], right: Index, down: Index) -> tuple[Image, Index]:
-    """Each pixel shows the surface of another one nearby where its own ray meets it: edges move
-    and planes stay. The other one is told, too, as row * width + column.
+    """Show in each pixel the surface of a neighbour, where the pixel's own ray meets it.
+
+    Edges move, and planes stay.
+
+    Args:
+        q: inverse depth, (H, W).
+        slope: its change per column and per row, (H, W) each.
+        right: columns to the neighbour, (H, W).
+        down: rows to the neighbour, (H, W).
+
+    Returns:
+        Inverse depth, (H, W), and the neighbour as row * width + column.
     """
     row = np.arange(len(q))[:, None]
     column = np.arange(q.shape[1])
@@ -418,8 +430,15 @@ def shifted(q: Image, slope: tuple[Image, Image], right: Index, down: Index) -> 
 
 
 def incidence(q: Image, slope: tuple[Image, Image], intrinsics: NDArray[np.float64]) -> Image:
-    """Angle between the surface's normal and the ray of each pixel, (H, W), radians, 0 where
-    there is nothing.
+    """Return the angle between each pixel's ray and the surface normal.
+
+    Args:
+        q: inverse depth, (H, W).
+        slope: its change per column and per row, (H, W) each.
+        intrinsics: pinhole matrix, (3, 3), pixels.
+
+    Returns:
+        Angles, (H, W), radians; 0 where there is nothing.
     """
     (fx, _, cx), (_, fy, cy) = intrinsics[:2]
     x = (np.arange(q.shape[1]) + 0.5 - cx) / fx
@@ -433,8 +452,14 @@ def incidence(q: Image, slope: tuple[Image, Image], intrinsics: NDArray[np.float
 
 
 def across_edges(q: Image, slope: tuple[Image, Image]) -> Image:
-    """Inverse depth of the neighbour, of the four, on the other side of the highest step; a
-    pixel's own if none.
+    """Return the inverse depth on the other side of the highest step to a neighbour.
+
+    Args:
+        q: inverse depth, (H, W).
+        slope: its change per column and per row, (H, W) each.
+
+    Returns:
+        Inverse depth, (H, W); a pixel's own if there is no step.
     """
     padded = np.pad(q, 1)
     other = q.copy()
@@ -449,11 +474,18 @@ def across_edges(q: Image, slope: tuple[Image, Image]) -> Image:
 
 
 def in_shadow(q: Image, focal: float, baseline: float) -> NDArray[np.bool_]:
-    """Which pixels lie in the shadow of something nearer, as seen from a projector ``baseline``
-    metres along x.
+    """Return the pixels that a projector does not reach because of something nearer.
 
     The pixel of column u is lit from the projector's column u - focal * baseline * q, which lights
     the nearest surface.
+
+    Args:
+        q: inverse depth, (H, W).
+        focal: focal length, pixels.
+        baseline: of the projector along x, metres.
+
+    Returns:
+        Whether each pixel is in shadow, (H, W) bool.
     """
     height, width = q.shape
     disparity = focal * baseline * q
@@ -484,11 +516,18 @@ def in_shadow(q: Image, focal: float, baseline: float) -> NDArray[np.bool_]:
 
 
 def kinect_axial(depth: NDArray[np.floating], angle: NDArray[np.floating]) -> Image:
-    """Standard deviation of the depth (metres) of a Kinect (v1) along its optical axis, metres.
+    """Return the standard deviation of the depth of a Kinect (v1), metres.
 
     0.0012 + 0.0019 (z - 0.4)^2 + 0.0001 / sqrt(z) (angle / (pi/2 - angle))^2, from Nguyen, Izadi
     and Lovell, "Modeling Kinect sensor noise for improved 3D reconstruction and tracking", 3DIMPVT
-    2012. The angle is that of incidence.
+    2012.
+
+    Args:
+        depth: along the optical axis, metres.
+        angle: of incidence, radians.
+
+    Returns:
+        Standard deviation along the optical axis, metres.
     """
     angle = np.minimum(angle, STEEPEST)
     return (
@@ -507,7 +546,17 @@ def kinect_lateral(angle: NDArray[np.floating]) -> Image:
 def normal_field(
     rng: np.random.Generator, shape: tuple[int, int], grain: float, part: Part | None = None
 ) -> Image:
-    """White noise under a Gaussian window of ``grain`` pixels, of variance 1; or a part of it."""
+    """Draw white noise of variance 1 under a Gaussian window.
+
+    Args:
+        rng: source of all random numbers.
+        shape: rows and columns of the whole field.
+        grain: width of the window, pixels.
+        part: rows and columns to return; None for all.
+
+    Returns:
+        The field, or its part.
+    """
     white = rng.standard_normal(shape)
     part = part or (slice(0, shape[0]), slice(0, shape[1]))
     if grain < NO_GRAIN:
@@ -536,7 +585,17 @@ def _power(grain: float) -> float:
 def uniform_field(
     rng: np.random.Generator, shape: tuple[int, int], grain: float, part: Part | None = None
 ) -> Image:
-    """Numbers between 0 and 1, each as likely; neighbours are alike as in ``normal_field``."""
+    """Draw numbers between 0 and 1 with correlated neighbours, as in ``normal_field``.
+
+    Args:
+        rng: source of all random numbers.
+        shape: rows and columns of the whole field.
+        grain: correlation length, pixels.
+        part: rows and columns to return; None for all.
+
+    Returns:
+        The field, or its part.
+    """
     if grain == 0:
         return rng.random(shape)[part or ...]
     return np.asarray(ndtr(normal_field(rng, shape, grain, part)))

@@ -1,6 +1,4 @@
-"""Cameras without errors, by ray casting with Embree: of a mesh alone, of a target in a scene,
-of a whole scene.
-"""
+"""Error-free cameras that cast rays with Embree, at a mesh, a target, or a scene."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -115,9 +113,7 @@ class SimulatedCamera:
     def _bound(
         self, rotation: NDArray[np.float32], origin: NDArray[np.float32]
     ) -> tuple[slice, slice]:
-        """Rows and columns that hold the projection of every vertex; the whole image if one is
-        behind the camera.
-        """
+        """Return rows and columns that hold all vertices; the whole image if one is behind."""
         x, y, z = rotation.T @ self._corners - (rotation.T @ origin)[:, None]
         height, width = self.shape
         if z.min() <= 1e-6:
@@ -132,9 +128,7 @@ class SimulatedCamera:
 
 
 class OccludedCamera:
-    """A ``SimulatedCamera`` before the target of a scene; what hides it is cut out, as if told
-    from it exactly.
-    """
+    """A camera in front of the target of a scene; what hides it is cut out."""
 
     def __init__(self, scene: "Scene", size: int = 224, distance: float = DISTANCE) -> None:
         self.scene = scene
@@ -156,9 +150,7 @@ class OccludedCamera:
         )
 
     def visible_share(self, pose: NDArray[np.float64]) -> float:
-        """Share of the target's picture from a pose, (4, 4), that nothing hides; 0 if it has
-        none.
-        """
+        """Return the visible share of the target's picture from a pose, (4, 4)."""
         seen = self._target.observe(pose)
         return 1 - np.count_nonzero(self._hidden(seen)) / seen.visible if seen.visible else 0.0
 
@@ -173,9 +165,7 @@ class OccludedCamera:
 
 
 class SceneCamera:
-    """Shows a whole scene, through a pinhole of any matrix, (3, 3), pixels, the first pixel's
-    centre at 0.5.
-    """
+    """Shows a whole scene through a pinhole, (3, 3), pixels, first pixel's centre at 0.5."""
 
     def __init__(
         self, scene: "Scene", intrinsics: NDArray[np.float64], shape: tuple[int, int]
@@ -186,8 +176,7 @@ class SceneCamera:
         self._owners = np.array([TARGET, TABLE_TOP, OTHER, NOTHING])
 
     def look(self, pose: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """What is there from a camera-to-world pose, (4, 4), OpenCV axes, object frame, object
-        radii.
+        """Render the scene from a camera-to-world pose, (4, 4), object frame and radii.
 
         Depth, (H, W) float32, object radii, 0 = nothing; and NOTHING, TARGET, OTHER or TABLE_TOP,
         (H, W) uint8.
@@ -204,8 +193,16 @@ class SceneCamera:
 def visible_shares(
     scene: "Scene", poses: NDArray[np.float64], size: int, distance: float
 ) -> NDArray[np.float64]:
-    """Share of the target's picture that nothing hides, from each of some poses, (V, 4, 4); (V,)
-    float64.
+    """Return the share of the target's picture that nothing hides, from each pose.
+
+    Args:
+        scene: the scene.
+        poses: camera-to-world, (V, 4, 4).
+        size: side of the pictures, pixels.
+        distance: of the cameras, object radii.
+
+    Returns:
+        Shares, (V,) float64.
     """
     camera = OccludedCamera(scene, size, distance)
     return np.array([camera.visible_share(pose) for pose in poses])

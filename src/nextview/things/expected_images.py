@@ -169,7 +169,18 @@ def rendered_images(
     scene: Surroundings,
     side: int,
 ) -> HypothesisImages:
-    """Cast the rays of all cameras at all hypotheses in one call."""
+    """Render all hypotheses from all cameras with few pixels.
+
+    Args:
+        caster: surfaces of the things.
+        hypotheses: things in poses.
+        cameras: camera-to-world, (V, 4, 4), metres, object frame.
+        scene: what hides the things.
+        side: rows and columns of each image.
+
+    Returns:
+        The images.
+    """
     things = hypotheses.things
     turns = hypotheses.poses[:, :3, :3].astype(np.float32)
     places = hypotheses.poses[:, :3, 3]

@@ -60,14 +60,19 @@ def _depth_variance(
 def gaps_after_alignment(
     images: HypothesisImages, sensor: ExpectedSensor, prior: RegistrationPrior
 ) -> Float32:
-    """Difference in depth of each pair that is left once one is aligned with the other.
+    """Return the depth difference of each pair of hypotheses that remains after alignment.
 
-    When the view is there, all hypotheses are aligned anew, and each camera may be displaced. What
-    a small motion takes away tells nothing. One Gauss-Newton step, held near zero by the prior, is
-    what registration would do.
+    When the view is there, all hypotheses are aligned anew, and each camera may be displaced, so
+    what a small motion removes is no information. One Gauss-Newton step, held near zero by the
+    prior, is what registration would do.
+
+    Args:
+        images: the hypotheses as each view would show them.
+        sensor: its expected noise.
+        prior: of the registration.
 
     Returns:
-        (V, pairs, P) float32, metres; 0 where not both show.
+        Differences, (V, pairs, P) float32, metres; 0 where not both are visible.
     """
     first, second = _pairs(images.depth.shape[1])
     depth_a = images.depth[:, first]
@@ -124,7 +129,14 @@ def divergences(
     pixels: PixelModel,
     prior: RegistrationPrior,
 ) -> tuple[Float, Float]:
-    """Expected difference of two hypotheses' mean log-likelihood, and of their pixels.
+    """Return the expected difference of two hypotheses' mean log-likelihood, and of their pixels.
+
+    Args:
+        images: the hypotheses as each view would show them.
+        gaps: see ``gaps_after_alignment``.
+        sensor: its expected noise.
+        pixels: model of the pixels.
+        prior: of the registration.
 
     Returns:
         Mean of both directions, (V, H, H), and the share of their pixels that differ, (V, H, H).
@@ -206,6 +218,17 @@ class _Judged:
         pixels: PixelModel,
         prior: RegistrationPrior,
     ) -> "_Judged":
+        """Prepare the judgement of the pixels of each view.
+
+        Args:
+            images: the hypotheses as each view would show them.
+            sensor: its expected noise.
+            pixels: model of the pixels.
+            prior: of the registration.
+
+        Returns:
+            The judgement.
+        """
         shows = np.isfinite(images.depth)
         size = images.step / sensor.pitch  # of a pixel here, pixels of the camera
         within, beside = _rings(shows, images.side)
@@ -230,7 +253,16 @@ class _Judged:
         )
 
     def ratio(self, true: Index, other: Index, gaps: Float32) -> Float:
-        """Expected mean log-likelihood of the true hypotheses less that of the others, (V, K)."""
+        """Return the expected mean log-likelihood of true hypotheses less that of others.
+
+        Args:
+            true: the true hypotheses, (K,) int64.
+            other: the others, (K,) int64.
+            gaps: depth differences of the pairs, (V, K, P), metres.
+
+        Returns:
+            Differences, (V, K) float64.
+        """
         shows = self.shows[:, true]
         rival = self.shows[:, other]
         lost = self.lost[:, true]
@@ -257,7 +289,16 @@ class _Judged:
         return -mean.astype(np.float64) * np.minimum(1, union * self.area / self.enough)
 
     def different(self, first: Index, second: Index, gaps: Float32) -> NDArray[np.bool_]:
-        """Pixels in which two hypotheses differ by more than the noise, (V, K, P)."""
+        """Return the pixels in which two hypotheses differ by more than the noise.
+
+        Args:
+            first: the one hypotheses, (K,) int64.
+            second: the other hypotheses, (K,) int64.
+            gaps: depth differences of the pairs, (V, K, P), metres.
+
+        Returns:
+            Pixels, (V, K, P) bool.
+        """
         shows = self.shows[:, first]
         rival = self.shows[:, second]
         off = np.abs(gaps) > 3 * self.deviation[:, second]

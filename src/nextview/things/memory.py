@@ -124,7 +124,15 @@ class Memory:
             raise ModelError("its held_out_views have elevations beyond 90 degrees")
 
     def save(self, path: Path, overwrite: bool = False) -> str:
-        """Write a .safetensors file, embeddings in half precision; returns its SHA-256."""
+        """Write the memory to a .safetensors file, with embeddings in half precision.
+
+        Args:
+            path: of the file.
+            overwrite: whether to replace an existing file.
+
+        Returns:
+            SHA-256 of the file.
+        """
         arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in _OF_VIEWS}
         arrays |= {name: getattr(self.surfaces, name) for name in _OF_SURFACES}
         arrays |= {name: arrays[name].astype(np.float16) for name in ("views", "held_out")}
@@ -140,11 +148,18 @@ _OF_VIEWS = tuple(f.name for f in fields(Memory) if f.name != "surfaces")
 
 @lru_cache(maxsize=2)
 def read_memory(path: Path, sha256: str) -> Memory:
-    """Read what ``Memory.save`` wrote.
+    """Read a file that ``Memory.save`` wrote.
+
+    Args:
+        path: of the file.
+        sha256: that its content must have.
+
+    Returns:
+        The memory.
 
     Raises:
-        ModelError: the file is missing, is not that of this hash, is of an earlier version that
-            knew no geometry, or one of its values makes no sense.
+        ModelError: the file is missing, has another hash, is of an earlier version without
+            geometry, or contains an invalid value.
     """
     content = checked_bytes(path, sha256, "a memory")
     where = f"{path}: not a memory"
@@ -203,10 +218,15 @@ def open_memory(model: str | Path) -> tuple[ModelCard, Memory]:
 
 
 def check_features(card: ModelCard, memory: Memory, size: int) -> None:
-    """See that a memory holds embeddings of as many numbers as the features have.
+    """Check that the embeddings of a memory have the size of the features.
+
+    Args:
+        card: of the memory, for messages.
+        memory: the memory.
+        size: numbers of an embedding.
 
     Raises:
-        ModelError: it holds others.
+        ModelError: they have another size.
     """
     if memory.views.shape[-1] != size:
         raise ModelError(
@@ -290,7 +310,15 @@ class TaughtRecogniser(NetworkRecogniser):
         return self.evidence(self._features(inputs), elevations)
 
     def evidence(self, embeddings: Float, elevations: Float) -> Evidence:
-        """Evidence of views by their embeddings, unit vectors, (B, F), and elevations, (B,)."""
+        """Return the evidence of views by their embeddings.
+
+        Args:
+            embeddings: unit vectors, (B, F).
+            elevations: of the cameras, radians, (B,).
+
+        Returns:
+            The evidence.
+        """
         assert self.card.memory is not None
         if self._nearest is None:
             alike = similarities(self._views, embeddings, elevations)
@@ -312,5 +340,13 @@ def by_ring(views: Float) -> NDArray[np.float32]:
 
 
 def joined(clean: Float, sensed: Float) -> NDArray[np.float32]:
-    """The mean of embeddings of views without and with a sensor's errors: what is remembered."""
+    """Return the mean of clean and sensed embeddings, which is what a memory holds.
+
+    Args:
+        clean: embeddings of views without sensor errors, (..., F).
+        sensed: embeddings of the same views with sensor errors, (..., F).
+
+    Returns:
+        Unit vectors, (..., F) float32.
+    """
     return unit(np.asarray(clean, np.float32) + np.asarray(sensed, np.float32))

@@ -158,7 +158,15 @@ class SeveralRecognisers:
         return self._placed(len(self.memories), joint)
 
     def outlook(self, observations: Sequence[Observation], joint: JointBelief) -> Any:
-        """What policies by geometry are shown: of the memory that answers; None of a class."""
+        """Return what can be foreseen by the memory that answers.
+
+        Args:
+            observations: the views.
+            joint: what they say together.
+
+        Returns:
+            The outlook; None if a class answers.
+        """
         if joint.found is None:
             return None
         member, own = joint.found

@@ -125,7 +125,15 @@ class Surface:
         return float(self._areas.sum())
 
     def triangles_by_area(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-        """Draw triangles, each with the chance of its share of the area, (count,) int64."""
+        """Draw triangles with probabilities in proportion to their areas.
+
+        Args:
+            count: number of triangles.
+            rng: source of all random numbers.
+
+        Returns:
+            Indices of the triangles, (count,) int64.
+        """
         return rng.choice(len(self._areas), count, p=self._areas / self._areas.sum())
 
     def sample(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -65,12 +65,20 @@ class ViewLikelihood:
 def likelihood(
     view: DepthView, rendered: Rendered, model: PixelModel = PixelModel()
 ) -> ViewLikelihood:
-    """Judge every pixel of a view, given what it would see of each hypothesis.
+    """Judge every pixel of a view, given what it would show under each hypothesis.
 
-    A depth on the thing is compared with the surface's under the noise of the sensor, which grows
-    where the surface is steep. The thing's pixels where no surface shows are outliers; so are
-    pixels where the surface should show, and what is behind it was measured. What stands before the
-    surface says nothing. Neither do pixels where neither shows.
+    The depth on the thing is compared with the surface under the noise of the sensor, which grows
+    where the surface is steep. Pixels of the thing without a surface are outliers; so are pixels
+    where the surface should be visible and what is behind it was measured. What stands in front of
+    the surface is neutral, as are pixels where neither shows.
+
+    Args:
+        view: the view.
+        rendered: the hypotheses as the view would show them.
+        model: of the pixels.
+
+    Returns:
+        How well each hypothesis explains the view.
     """
     shows = np.isfinite(rendered.depth)
     depth = np.where(shows, rendered.depth, 1)

@@ -239,7 +239,15 @@ def _picture(
 
 
 def mismatch(seen: Pictures, known: Pictures) -> Float32:
-    """How badly each of A pictures fits each of N others, (A, N)."""
+    """Return how badly pictures fit others.
+
+    Args:
+        seen: A pictures.
+        known: N pictures.
+
+    Returns:
+        Costs, (A, N) float32; 0 for a perfect fit.
+    """
     both = seen.outline @ known.outline.T
     one = seen.outline.sum(1)[:, None] + known.outline.sum(1) - both
     overlap = both / np.maximum(one, 1)
