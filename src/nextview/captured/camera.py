@@ -108,6 +108,7 @@ class CapturedCamera:
             found = self.object_frame
             costs = [_cost(frame, asked, found) for frame in self._left]
             captured = self._left.pop(int(np.argmin(costs)))
+
             try:
                 frame = captured.read(self._masked)
             except ObservationError as error:
@@ -118,6 +119,7 @@ class CapturedCamera:
             else:
                 self.taken.append(Taken(captured, _degrees_off(captured, asked, found)))
                 return frame
+
         why = f" ({min(self.left_out.values())})" if self.left_out else ""
         raise NoViewLeftError(f"{self.capture.folder}: no view is left that shows the object{why}")
 
@@ -173,12 +175,14 @@ class CapturedCamera:
             except (DatasetError, ObservationError) as error:
                 reason = reason or str(error)
                 continue
+
             found = thing.object_frame
             if point is None:
                 return found
             return ObjectFrame(
                 np.asarray(point, np.float64), found.radius, upright_axes(found.axes[2])
             )
+
         raise ObservationError(
             f"{self.capture.folder}: the object is found in none of the views ({reason})"
         )

@@ -104,6 +104,7 @@ def _read_some(
     spread = np.unique(np.linspace(0, count - 1, min(count, MOST_COMPARED)).astype(int))
     indices = []
     frames = []
+
     for i in spread:
         captured = capture.frames[i]
         try:
@@ -114,6 +115,7 @@ def _read_some(
             if frame is not None:
                 indices.append(i)
                 frames.append(frame)
+
     return np.array(indices, int), frames
 
 
@@ -286,6 +288,7 @@ def _break(agreement: Agreement) -> int:
         within = agreement.among(later[:, None] == later)
         if min(across.judged, within.judged) < FEWEST_JUDGED:
             continue
+
         wrong_across = 1 - across.share
         wrong_within = 1 - within.share
         if wrong_across > TIMES_USUAL * wrong_within and wrong_across - wrong_within > largest:

@@ -162,11 +162,13 @@ def _poses(folder: Path, names: list[str]) -> tuple[dict[str, Float], dict[str, 
             poses, unreadable = _pose_files(folder / inside, names)
             return poses, unreadable, f"poses of {inside}/"
     listed = folder / "poses.json"
+
     if listed.exists():
         return *_pose_list(listed, names), "poses of poses.json"
     log = folder / "trajectory.log"
     if log.exists():
         return *_in_order(log, _log(log), names), "poses of trajectory.log"
+
     if len(names) == 1:
         return {names[0]: np.eye(4)}, {}, "no pose: the camera is the world"
     raise DatasetError(

@@ -147,6 +147,7 @@ def _layout_of(path: Path) -> str:
             if path.exists()
             else f"{path}: there is no such folder"
         )
+
     found = _layouts_in(path)
     if len(found) > 1:
         raise DatasetError(
@@ -155,6 +156,7 @@ def _layout_of(path: Path) -> str:
         )
     if found:
         return found[0]
+
     if is_depth_folder(path):
         return DEPTH_FOLDER
     raise DatasetError(_no_capture(path))
@@ -352,11 +354,13 @@ def _read_tum(folder: Path, intrinsics: Float | None, _: Reading) -> Views:
             " pinhole matrix into camera-intrinsics.txt or give --intrinsics FX FY CX CY (TUM's"
             " recordings: 525 525 319.5 239.5)"
         )
+
     times, depths = _images(folder / "depth.txt")
     moments, poses, bad_lines = _trajectory(folder / "groundtruth.txt")
     colour_times, colours = (
         _images(folder / "rgb.txt") if (folder / "rgb.txt").exists() else (np.zeros(0), [])
     )
+
     frames = []
     for time, depth in zip(times, depths, strict=True):
         at = _nearest(time, moments)
@@ -369,9 +373,11 @@ def _read_tum(folder: Path, intrinsics: Float | None, _: Reading) -> Views:
                     depth.stem, DepthFile(depth), TUM_STEP, intrinsics, poses[at], *beside
                 )
             )
+
     if not frames:
         what = f"{folder}: no image of depth.txt has a pose in groundtruth.txt within {TOGETHER} s"
         raise DatasetError(f"{what}; are the times of one clock, in seconds?")
+
     notes = []
     if bad_lines:
         notes.append(f"{bad_lines} lines of groundtruth.txt hold no pose and are left out")

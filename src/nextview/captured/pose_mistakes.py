@@ -182,6 +182,7 @@ def _single_mistakes(to_world: bool, unit: float) -> list[PoseMistake]:
     other = "world-to-camera"
     if not to_world:
         stored, other = other, stored
+
     found = [
         PoseMistake(
             "inverse",
@@ -201,15 +202,18 @@ def _single_mistakes(to_world: bool, unit: float) -> list[PoseMistake]:
             _in_stored(_translation_inverted, to_world),
         ),
     ]
+
     for name, axes in (("OpenGL", AXES["opengl"]), ("a ROS body", AXES["ros"])):
         sentence = f"the camera's axes are those of {name}, and OpenCV's are expected (x right, "
         sentence += "y down, z forward)"
         found.append(PoseMistake("axes", sentence, _turned_by(axes)))
+
     for steps, wrong, right in ((1, "w, x, y, z", "x, y, z, w"), (-1, "x, y, z, w", "w, x, y, z")):
         sentence = f"the quaternions are in the order {wrong}, and were taken for {right}"
         for in_world in (True, False):
             corrected = _in_stored(_quaternion_rolled(steps), in_world)
             found.append(PoseMistake("quaternion", sentence, corrected))
+
     units = {round(other / unit, 6) for other in UNIT_NAMES if other != unit}
     return found + [_scaled(scale) for scale in sorted(units | set(DEPTH_SCALES))]
 
@@ -222,6 +226,7 @@ def _pairs(single: Sequence[PoseMistake]) -> list[PoseMistake]:
         for second in single[i + 1 :]:
             if first.kind == second.kind or {first.kind, second.kind} == {"mixed", "inverse"}:
                 continue
+
             found.append(
                 PoseMistake(
                     f"{first.kind} and {second.kind}",

@@ -113,6 +113,7 @@ def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
     axis = smallest_circle(np.concatenate([points[::7, :2] for points, _ in clouds]))[0]
     turns = [_turned(-way * i, n) for i in range(n)]
     apart = np.zeros(n)
+
     turned = [
         (p @ r.T, q @ r.T / np.linalg.norm(q, axis=1)[:, None])
         for (p, q), r in zip(clouds, turns, strict=True)
@@ -121,6 +122,7 @@ def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
     for _ in range(ROUNDS):
         rows = list[Float]()
         wanted = list[Float]()
+
         for i, j in pairs:
             (p, _), (q, normals), shift = turned[i], turned[j], (turns[i] - turns[j])[:, :2]
             distance, nearest = cKDTree(q).query(p - shift @ axis)
@@ -130,6 +132,7 @@ def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
             wanted.append((normals[near] * (p[close] - q[near])).sum(1))
             if j == (i + 1) % n:
                 apart[i] = np.median(np.abs(wanted[-1] - rows[-1] @ axis))
+
         before = axis
         axis = np.linalg.lstsq(np.concatenate(rows), np.concatenate(wanted), rcond=None)[0]
         if np.linalg.norm(axis - before) < 1e-6:

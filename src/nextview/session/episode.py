@@ -143,12 +143,14 @@ class Episodes:
         self.visibility = visibility
         self.together = together
         self.outlook = outlook
+
         self.running = np.arange(len(starts))
         self.current = np.array(starts, np.int64)
         if ((self.current < 0) | (self.current >= len(sphere))).any():
             raise UsageError(
                 f"a first view has to be one of the {len(sphere)} views, 0 to {len(sphere) - 1}"
             )
+
         self.steps: list[Step] = []
         self._last: Taken | None = None
         self._scenes: dict[int, tuple[list[SceneView], SeenScene]] = {}
@@ -273,12 +275,14 @@ class Episodes:
         total = step.total[going]
         weighed = np.maximum(step.seen, 1)[going]
         classes = step.belief.shape[1]
+
         if "azimuth_bins" in needs:
             azimuth_bins = self.calibration.azimuth_bins(
                 total, weighed, classes, taken.azimuth[going]
             )
         if "joint" in needs:
             joint = self.calibration.joint(total, weighed, classes, taken.azimuth[going])
+
         state = EpisodeState(
             step.views[going],
             taken.visited[going],
@@ -294,6 +298,7 @@ class Episodes:
             else None,
             outlook=self.outlooks(step, going) if "outlook" in needs else None,
         )
+
         return (
             replace(state, visibility=self._visibility(step, state))
             if "visibility" in needs
@@ -439,6 +444,7 @@ class Episodes:
             if evidence.observations is None:
                 who = "this recogniser" if counted else "this policy"
                 raise UsageError(f"{who} needs the depth that was seen, and only evidence is given")
+
             counts = np.ones(len(step.episodes), bool)
             if counted and evidence.seen is not None:
                 counts = evidence.seen
@@ -482,11 +488,13 @@ class Episodes:
         free = state.free
         rows = np.arange(len(state.current))
         chosen = self._ask(state)
+
         barred = ~free[rows, chosen] & ~state.visited[rows, chosen]
         if barred.any():
             some = state.select(barred)
             chosen = chosen.copy()
             chosen[barred] = self._ask(replace(some, visited=~some.free))
+
         wrong = ~free[rows, chosen]
         if wrong.any():
             view = int(chosen[wrong][0])
@@ -502,15 +510,18 @@ class Episodes:
             lambda said: PolicyError(f"policy {name} raised {said}", self._first_to_fail(state))
         ):
             chosen = np.asarray(self.policy.next_views(state, self.rng))
+
         if chosen.shape != state.current.shape or not np.issubdtype(chosen.dtype, np.integer):
             raise PolicyError(
                 f"policy {name} has to return {len(state.current)} integers, one for each episode"
             )
+
         if (off := (chosen < 0) | (chosen >= len(self.sphere))).any():
             where = int(state.episodes[off][0])
             raise PolicyError(
                 f"policy {name} chose view {chosen[off][0]}, which is not on the sphere", where
             )
+
         return chosen
 
     @property
@@ -540,12 +551,14 @@ class Episodes:
         answer = np.zeros(b, np.int64)
         n_views = np.zeros(b, np.int64)
         confidence = np.zeros(b)
+
         for k, step in enumerate(self.steps):
             views[step.episodes, k] = step.views
             answer[step.episodes] = step.belief.argmax(1)
             confidence[step.episodes] = step.belief.max(1)
             n_views[step.episodes] = k + 1
             confident[step.episodes] = step.enough
+
         moved = views[:, 1:] >= 0
         legs = (views[:, :-1], views[:, 1:])
         travel, arc = (

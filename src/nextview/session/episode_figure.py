@@ -169,6 +169,7 @@ def _draw_image(axis: Axes, view: View, step: int, light: SoftLight) -> None:
         if seen.image is not None and not seen.exact
         else max(1, round(400 / max(seen.depth.shape)))
     )
+
     height, width = seen.depth.shape
     larger = seen.intrinsics * [[times], [times], [1]]
     pixels, _ = light.picture(
@@ -178,6 +179,7 @@ def _draw_image(axis: Axes, view: View, step: int, light: SoftLight) -> None:
         taken = seen.image[..., None] / 255 * (255, 250, 240)
         pixels = np.where(seen.depth[..., None] > 0, taken, pixels).astype(np.uint8)
     axis.imshow(pixels, interpolation="antialiased")
+
     inside: dict[str, Any] = {"transform": axis.transAxes, "fontsize": 9}
     axis.text(
         0.05,
@@ -189,6 +191,7 @@ def _draw_image(axis: Axes, view: View, step: int, light: SoftLight) -> None:
     )
     where = f"view {view.index}: {round(elevation)}° up, {round(azimuth) % 360}° around"
     axis.text(0.13, 1.08, where, va="center_baseline", color=INK, **inside)
+
     said = [] if seen.seen else ["nothing is seen"]
     said += [warning.name for warning in view.warnings]
     axis.text(0.04, 0.03, "\n".join(said), va="bottom", color=ACCENT, **inside)
@@ -260,12 +263,14 @@ def _draw_values(axis: Axes, views: Sequence[View], sphere: Viewpoints, seen_fro
     view = views[-1]
     turned = sphere.azimuth - seen_from - np.pi / 2
     out = 90 - np.degrees(sphere.elevation)
+
     values = np.full(len(sphere), np.nan) if view.values is None else view.values
     known = np.isfinite(values)
     low, high = (values[known].min(), values[known].max()) if known.any() else (0.0, 1.0)
     colours = np.where(
         known[:, None], VALUES((values - low) / (high - low or 1)), to_rgba("#ece9e3")
     )
+
     flat = np.stack([out * np.cos(turned), out * np.sin(turned)], 1)
     limit = max(97.0, float(out.max()) + 10)
     if isinstance(sphere, ViewSphere):
@@ -279,15 +284,18 @@ def _draw_values(axis: Axes, views: Sequence[View], sphere: Viewpoints, seen_fro
             s=float(np.clip(7000 / len(sphere), 6, 130)),
             edgecolor=PAPER,
         )
+
     for step, past in enumerate(views, 1):
         axis.add_patch(
             Circle(flat[past.index], 8, facecolor=BLUE if past is view else GREY, edgecolor=PAPER)
         )
         axis.text(flat[past.index, 0], flat[past.index, 1], str(step), fontsize=8, **NUMBER)
+
     axis.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
     if view.next_view is None:
         axis.text(0, 1.05, "the last view", fontsize=10, color=GREY, transform=axis.transAxes)
         return
+
     here = flat[view.index]
     there = flat[view.next_view]
     axis.add_patch(Circle(there, 8, facecolor=PAPER, edgecolor=ACCENT, linewidth=2.2))

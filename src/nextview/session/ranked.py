@@ -54,10 +54,12 @@ def camera_poses(given: ArrayLike) -> Float:
         poses = np.asarray(given, np.float64)
     except (TypeError, ValueError):
         raise UsageError("poses to rank are camera-to-world matrices, (V, 4, 4)") from None
+
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
         raise UsageError(
             f"poses to rank are camera-to-world matrices, (V, 4, 4), not {poses.shape}"
         )
+
     for number, pose in enumerate(poses):
         turned = np.eye(4)
         turned[:3, :3] = pose[:3, :3]

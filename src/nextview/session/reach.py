@@ -73,6 +73,7 @@ class Reach:
                 cost = np.array(costs, np.float64)
             else:
                 cost = self.cost[state.current[0], views]
+
             views = views[cost < np.inf]
             cost = cost[cost < np.inf]
             mean = cost.mean() if len(cost) else 0.0
@@ -80,6 +81,7 @@ class Reach:
             cells = np.full(len(sphere), np.nan)
             cells[views] = unit * cost
             state = replace(state, travel=cells[None])
+
         reachable = np.zeros(len(sphere), bool)
         reachable[views] = True
         if reachable[state.free[0]].all() and self.cost is None:

@@ -305,15 +305,18 @@ class Recognition:
             f"{len(self.views)} view{'s' * (len(self.views) != 1)}, {self.travel:.2f} cells of"
             " travel"
         )
+
         if not self.seen:
             return f"nothing is seen ({views})"
         if self.unknown:
             return f"{self.none_of_them}: {self.why_unknown} ({views})"
+
         sure = "confident" if self.confident else "not confident"
         if self.stranded:
             sure += ", no other view in reach"
             if self.why_stranded:
                 sure += f": {self.why_stranded}"
+
         names = [warning.name for warning in self.warnings]
         warnings = f", warnings: {', '.join(names)}" if names else ""
         return (

@@ -148,6 +148,7 @@ class Session:
             raise UsageError(f"{wanted}, not {one_line(repr(object))}")
         if number(unknown, "the share of known objects called unknown", 0) >= 1:
             raise UsageError(f"the share of known objects called unknown is below 1, not {unknown}")
+
         self.models = models
         self.policy = policy
         self.sphere = sphere
@@ -161,6 +162,7 @@ class Session:
         """Called, in order, after each view that was taken in, and when another next view was
         chosen.
         """
+
         self._before = 0 if object is None else len(object.sightings)
         self._chooser = anywhere(policy, sphere)
         self._rng = rng or np.random.default_rng(0)
@@ -339,6 +341,7 @@ class Session:
             raise UsageError(
                 f"the goal is {' or '.join(get_args(Goal))}, not {one_line(str(given))}"
             )
+
         with self._lock:
             if given == self._goal:
                 return
@@ -349,6 +352,7 @@ class Session:
                     "this policy looks for no pose; discriminate does, for taught things of known"
                     " geometry"
                 )
+
             self.policy = self.policy.seeking(given)
             self._goal = given
             self._chooser = anywhere(self.policy, self.sphere)
@@ -572,6 +576,7 @@ class Session:
             raise SessionError(
                 "frames were added to this object outside of the session; begin another one"
             )
+
         before = object.state
         try:
             if (repeated := after_repeated(before, frame, self._before)) is not None:
@@ -579,6 +584,7 @@ class Session:
             else:
                 object.add(frame)
                 self._reconsider(object)
+
             self._refuse_disagreement(object)
             self._check_distance(object)
             return self._take(
@@ -631,6 +637,7 @@ class Session:
         radius = object.object_frame.radius
         if self.distance is None or radius < self.distance <= FARTHEST_TARGET * radius:
             return
+
         if self.distance > radius:
             why = f"within {FARTHEST_TARGET:g} radii: is it in millimetres?"
         else:
@@ -640,6 +647,7 @@ class Session:
             )
             if object.sightings[-1].frame.counted:
                 why += "; or the steps of the uint16 depth are no millimetres"
+
         raise UsageError(
             f"the distance of {self.distance:g} m from the centre of an object of {radius:.2g} m"
             f" radius has to be {why}"
@@ -722,6 +730,7 @@ class Session:
         classes = len(self.models.classes)
         evidence = step.evidence
         bins = calibration.azimuth_bins(step.total, np.maximum(step.seen, 1), classes, azimuth)
+
         return View(
             int(step.views[0]),
             observation,
@@ -789,6 +798,7 @@ class Session:
             np.array_equal(d, sphere.directions[view])
             for view, d in zip(views, directions, strict=True)
         ]
+
         for a, b in pairwise(range(len(views))):
             if at[a] and at[b]:
                 leg = sphere.travel[views[a], views[b]], sphere.arc[views[a], views[b]]
@@ -826,6 +836,7 @@ class Session:
                     raise
                 self.reachable = np.zeros(len(self.sphere), bool)
                 break
+
             try:
                 self.update(seen)
             except ObservationError as error:
@@ -853,6 +864,7 @@ class Session:
                 impossible=self._impossible(),
                 poses_in=PoseFrame.of(self.object),
             )
+
             return replace(result, confident=enough and not result.unknown)
 
     def _why_stranded(self) -> str:
@@ -912,14 +924,17 @@ def _check_needs(policy: Policy, models: Models) -> None:
         raise UsageError(
             f"a policy has needs and next_views, see nextview.Policy, not {one_line(repr(policy))}"
         )
+
     if "azimuth_bins" in policy.needs and not models.recogniser.azimuth_bins:
         raise SessionError(
             "this policy needs the azimuth bin that is seen, and the recogniser was not taught it"
         )
+
     if "outlook" in policy.needs and not isinstance(models.recogniser, LooksAhead):
         raise SessionError(
             "this policy needs things of known geometry: a memory that was taught from scans"
         )
+
     missing = [name for name in maps_among(policy.needs) if name not in models.map_names]
     if missing:
         raise SessionError(f"this policy needs the map {missing[0]!r}; load it with the models")

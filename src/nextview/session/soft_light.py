@@ -94,12 +94,14 @@ class SoftLight:
         hits = embree_scene(surfaces).run(origins, rays.astype(np.float32), output=1)
         hit = hits["primID"] >= 0
         colours = np.tile(np.array(rgb(GROUND), float), (len(rays), 1))
+
         with np.errstate(divide="ignore", invalid="ignore"):
             down = (self.floor - pose[2, 3]) / rays[:, 2]
         below = np.where((down > 0) & np.isfinite(down), down, 0)[:, None] * rays + origins
         at = (below[:, 1::-1] / REACH + 1) * (GRID - 1) / 2
         light = map_coordinates(self._ground, at.T, order=1, cval=1.0)
         colours *= 1 - np.outer((down > 0) * np.clip(0.97 - light, 0, 1), SHADE)
+
         normals = hits["Ng"][hit] / np.maximum(
             np.linalg.norm(hits["Ng"][hit], axis=1, keepdims=True), 1e-12
         )
@@ -108,5 +110,6 @@ class SoftLight:
         points = origins[hit] + hits["tfar"][hit, None] * rays[hit]
         bright = (0.35 + 0.65 * self._sky(points, normals, SKY[:24])) * (0.5 + 0.62 * facing)
         colours[hit] = np.array(rgb(WOOD)) * bright[:, None]
+
         far = np.where(hit, hits["tfar"], np.inf).reshape(shape)
         return np.clip(colours, 0, 255).astype(np.uint8).reshape(*shape, 3), far

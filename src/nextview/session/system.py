@@ -187,6 +187,7 @@ class System:
             raise UsageError(
                 "what is looked at has an empty name; give a mesh file or a folder of views"
             )
+
         if isinstance(what, str | Path):
             if is_frames(what):
                 what = _camera_of(Path(what), up)
@@ -196,10 +197,12 @@ class System:
                     warnings.warn(f"{what.name}: {sentence}", stacklevel=2)
             else:
                 raise MeshError(f"{what}: the up axis of a mesh file is y or z, not {up}")
+
         if isinstance(what, Mesh):
             what = simulated(what, sensor, seed)
         elif sensor is not None:
             raise UsageError("a sensor is for meshes: a camera has its own errors")
+
         if not hasattr(what, "observe"):
             wanted = "a mesh file, a Mesh, a folder of views, or a camera with observe(pose)"
             raise UsageError(f"what is looked at is {wanted}, not {one_line(repr(what))}")

@@ -95,12 +95,14 @@ class RobotCamera:
         order = np.argsort(
             angle_between(np.broadcast_to(asked, self._directions.shape), self._directions)
         )
+
         for direction in (asked, *self._directions[order]):
             there = level_pose(direction)
             tried = self._refused if direction is asked else [*self._refused, *self._taken]
             used = any(angle_between(direction, other) < SAME for other in tried)
             if used or not self.scene.reachable(there[None, :3, 3])[0]:
                 continue
+
             if (frame := self._camera.frame(there)) is not None:
                 self._taken.append(direction)
                 return (

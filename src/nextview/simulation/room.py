@@ -71,10 +71,12 @@ class Room:
         layout = self.layout
         half = np.array([layout.width, layout.depth]) / 2 - CLEARANCE
         ground = layout.target.z if layout.kind == "table" else 0.0
+
         if (np.abs(place[:2]) > half).any() or place[2] > HIGHEST_CAMERA:
             return False
         if place[2] < ground + LOWEST_CAMERA:
             return False
+
         in_slab = any(_inside(slab, place, CLEARANCE) for slab in layout.slabs)
         furniture = self.things[1 : 1 + len(layout.objects)]
         return not in_slab and not any(

@@ -120,6 +120,7 @@ class Sensor:
                 whole(value, what, 1, SIDE)
             else:
                 number(value, what, 0, GRAIN if name == "grain" else LARGEST)
+
         if not min(self.focal, self.baseline, self.farthest, self.radius) > 0:
             raise UsageError(
                 f"sensor {self.name}: focal length, baseline, range and radius are positive"
@@ -342,6 +343,7 @@ class SensorMix:
             sensor = replace(RENDER, **_some(rng, errors))
         else:
             sensor = SENSORS[str(kind)].scaled(float(rng.uniform(0, 2)))
+
         setup = {
             "tilt": (0.5, 12.0),
             "centre": (0.5, 0.1),
