@@ -533,7 +533,8 @@ def test_what_the_noise_of_a_real_camera_explains_is_no_stranger():
     assert known.of_real_camera(explained + 0.1, 0, 1) == pytest.approx(0.01)
     # a banana does not explain a ring, though it lies on a part of it
     assert known.of_real_camera(explained, 0, 1, explained=0.5) == pytest.approx(0.01)
-    # a camera that is more exact than the scan errs little by its noise
+    # a camera that is more exact than the scan does not err by its noise
+    assert known.of_real_camera(0.4 * explained, 0, 1, noise_share=0.4) == pytest.approx(0.01)
     assert known.of_real_camera(explained, 0, 1, noise_share=0.9) == pytest.approx(0.01)
     assert known.of_real_camera(0.9 * explained, 0, 1, noise_share=0.9) >= 0.5
     # better explained things have larger p-values still

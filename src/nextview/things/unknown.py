@@ -12,6 +12,7 @@ SHRINKAGE = 2.0
 LEAST_RESIDUAL = 0.02  # below which residuals do not differ
 NOISE_RESIDUAL = 0.5  # of pixels that are off by just the noise: half a squared standard normal
 NOISE_SHARE = 0.8  # of a thing's pixels that the surface explains, if only the noise is in the way
+MOSTLY_NOISE = 0.5  # part of the noise in the variance of a depth, from which it is in the way
 NOISE_KNOWN = 1.5  # by what factor the noise of a real camera may be larger than it is measured
 
 
@@ -122,8 +123,8 @@ class KnownResiduals:
         Cameras have errors that no model of their noise holds. Known things are then explained
         worse than in the simulation that this was fitted to. So a residual that the noise alone
         explains, if it is larger than it was measured by ``NOISE_KNOWN``, is no reason to call a
-        thing unknown; provided that the surface explains most of the pixels at all. A camera that
-        is more exact than the scans explains little by its noise.
+        thing unknown; provided that the surface explains most of the pixels at all, and that the
+        noise is larger than the errors of the scans.
 
         Args:
             residual: of the likeliest hypothesis.
@@ -138,7 +139,7 @@ class KnownResiduals:
         """
         p_value = self.p_value(residual, thing, views)
         noise_explains = residual <= NOISE_RESIDUAL * NOISE_KNOWN**2 * noise_share
-        if noise_explains and explained >= NOISE_SHARE:
+        if noise_share >= MOSTLY_NOISE and noise_explains and explained >= NOISE_SHARE:
             return 0.5 + p_value / 2
         return p_value
 
