@@ -1,12 +1,13 @@
 """What whole episodes say of simple shapes that nobody taught: ball, box, rod, can, cone, capsule,
 ring, slab.
 
-    python benchmarks/simple_shapes.py                                         # 3, 6, 12 cm; the
-    YCB models python benchmarks/simple_shapes.py --models modelnet10 --radii 0.3 0.6     # the size
-    of furniture
+    python benchmarks/simple_shapes.py                         # 3, 6, 12 cm; the YCB objects
+    python benchmarks/simple_shapes.py --shapes ball box rod can --radii 0.025 0.05 0.1 0.15
+    python benchmarks/simple_shapes.py --models modelnet10 --radii 0.3 0.6    # furniture sizes
 
 Each shape stands upright, turned at random, and is looked at through a sensor with all defaults,
-its size known.
+its size known. A shape is marked (*) if the smallest box around it is, within a tenth along each
+axis, the size of that around a taught thing of known geometry: it may be taken for that thing.
 """
 
 import tempfile
@@ -15,10 +16,17 @@ from pathlib import Path
 import numpy as np
 import trimesh
 import tyro
+from numpy.typing import NDArray
+from trimesh.bounds import oriented_bounds
 
 import nextview
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
+from nextview.errors import UsageError
+from nextview.things.recogniser import VerifiedRecogniser
+
+Key = tuple[str, float]  # name and radius of a shape
+Sizes = NDArray[np.float64]
 
 SHAPES = {
     "ball": lambda: trimesh.creation.icosphere(4),
@@ -42,8 +50,26 @@ def write_shape(path: Path, name: str, radius: float, turn: float) -> Path:
     return path
 
 
+def boxes_of_taught(system: nextview.System) -> list[Sizes]:
+    """Sizes of the smallest boxes around the taught things of known geometry, metres, ascending."""
+    recogniser = system.models.recogniser
+    if not isinstance(recogniser, VerifiedRecogniser):
+        return []
+    surfaces = recogniser.things.verifier.caster.surfaces
+    return [np.sort(oriented_bounds(surface.vertices)[1]) for surface in surfaces]
+
+
+def is_like_taught(name: str, radius: float, taught: list[Sizes]) -> bool:
+    """Whether the box around a shape is, within a tenth along each axis, that of a taught thing."""
+    shape = SHAPES[name]()
+    scale = radius / np.linalg.norm(shape.vertices - shape.bounds.mean(0), axis=1).max()
+    sizes = scale * np.sort(oriented_bounds(shape.vertices)[1])
+    return any(np.abs(np.log(sizes / own)).max() < np.log(1.1) for own in taught)
+
+
 def main(
     models: str = "ycb",
+    shapes: tuple[str, ...] = tuple(SHAPES),
     radii: tuple[float, ...] = (0.03, 0.06, 0.12),
     draws: int = 1,
     sensor: str = "wrist",
@@ -53,15 +79,20 @@ def main(
 
     Args:
         models: which know none of the shapes by name.
+        shapes: names of the shapes that are shown.
         radii: of the spheres that hold the shapes, metres.
         draws: of the azimuth, the first view and the sensor's errors, for each shape of each size.
         sensor: through which they are looked at.
         seed: of all draws.
     """
+    strange = sorted(set(shapes) - set(SHAPES))
+    if strange:
+        raise UsageError(f"no shape is called {strange[0]}; there are {', '.join(SHAPES)}")
     system = nextview.load(models=models, threads=1)
+    taught = boxes_of_taught(system)
     rng = np.random.default_rng(seed)
-    asked = [(name, radius) for name in SHAPES for radius in radii for _ in range(draws)]
-    found: dict[tuple[str, float], list[nextview.Recognition]] = {}
+    asked = [(name, radius) for name in shapes for radius in radii for _ in range(draws)]
+    found: dict[Key, list[nextview.Recognition]] = {}
 
     def work():
         with tempfile.TemporaryDirectory() as folder:
@@ -75,31 +106,44 @@ def main(
                 yield done
 
     track(work(), len(asked), f"shapes before {models}")
-    print(table(found, radii))
+    like = {key for key in found if is_like_taught(*key, taught)}
+    print(table(found, radii, like))
 
 
 def table(
-    found: dict[tuple[str, float], list[nextview.Recognition]], radii: tuple[float, ...]
+    found: dict[Key, list[nextview.Recognition]], radii: tuple[float, ...], like: set[Key]
 ) -> str:
-    """What was said, as text: names of confident answers in bold."""
+    """What was said, as text: names of confident answers in bold; ``like`` marks some shapes."""
     lines = [
         f"| shape | {' | '.join(f'{100 * radius:g} cm' for radius in radii)} |",
         "|---" * (1 + len(radii)) + "|",
     ]
-    for name in SHAPES:
-        cells = [", ".join(said(result) for result in found[name, radius]) for radius in radii]
+    for name in dict.fromkeys(name for name, _ in found):
+        cells = []
+        for radius in radii:
+            answers = ", ".join(said(result) for result in found[name, radius])
+            cells.append(f"{answers} (*)" if (name, radius) in like else answers)
         lines.append(f"| {name} | {' | '.join(cells)} |")
 
+    lines += [
+        "",
+        counts({key: found[key] for key in found if key not in like}, "of no taught size"),
+    ]
+    if like:
+        lines.append(counts({key: found[key] for key in like}, "of the size of a taught thing (*)"))
+    return "\n".join(lines)
+
+
+def counts(found: dict[Key, list[nextview.Recognition]], what: str) -> str:
+    """How many episodes with some shapes end with a name, in words."""
     results = [result for each in found.values() for result in each]
     named = sum(result.answer is not None for result in results)
     sure = sum(result.confident for result in results)
     some = sum(any(result.answer is not None for result in each) for each in found.values())
-    lines += [
-        "",
-        f"{len(results)} episodes: {named} end with a name, {sure} of them confident. "
-        f"{some} of {len(found)} shapes get a name at least once.",
-    ]
-    return "\n".join(lines)
+    return (
+        f"{len(results)} episodes with shapes {what}: {named} end with a name, {sure} of them"
+        f" confident. {some} of {len(found)} shapes get a name at least once."
+    )
 
 
 def said(result: nextview.Recognition) -> str:
