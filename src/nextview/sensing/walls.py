@@ -47,7 +47,11 @@ NEAREST_TO_PLACE = 0.02  # metres that the place of an object lies before a wall
 
 
 def find_walls(
-    samples: Samples, plane: Plane, rng: Generator, place: Float | None = None
+    samples: Samples,
+    plane: Plane,
+    rng: Generator,
+    place: Float | None = None,
+    narrowest: float = WIDE,
 ) -> list[Plane]:
     """Find the walls in a frame, as planes whose normals point into the room.
 
@@ -56,6 +60,7 @@ def find_walls(
         plane: the support plane.
         rng: draws the lines that are tried.
         place: where the object is known to be, (3,), world, metres: it lies before every wall.
+        narrowest: width of a wall that reaches one side of the picture, metres.
 
     Returns:
         The walls, the one with most samples first. Empty where there are none.
@@ -76,7 +81,7 @@ def find_walls(
         on = np.abs(upright.height(samples.points[left])) < samples.tolerance[left]
         if on.sum() < wanted:
             break
-        if _is_wall(samples, upright, left[on], up, walls, place) and not _hides_much(
+        if _is_wall(samples, upright, left[on], up, walls, place, narrowest) and not _hides_much(
             samples, upright, walls, on.sum()
         ):
             walls.append(upright)
@@ -160,6 +165,7 @@ def _is_wall(
     up: Float,
     walls: Sequence[Plane],
     place: Float | None,
+    narrowest: float,
 ) -> bool:
     """Whether an upright plane with some samples on it is as wide as a wall and goes on to the
     picture's edge.
@@ -186,7 +192,7 @@ def _is_wall(
     in_corner = to_the_top and any(
         (np.abs(wall.height(samples.points[on])) < gap).any() for wall in walls
     )
-    wide = width > WIDE or in_corner
+    wide = width > narrowest or in_corner
     return bool(width > WIDEST or (wide and (at_left or at_right)) or from_side_to_side)
 
 

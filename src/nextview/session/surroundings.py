@@ -11,7 +11,8 @@ from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.observed_object import Sighting
-from nextview.sensing.segmentation import Plane
+from nextview.sensing.segmentation import Plane, sample
+from nextview.sensing.walls import find_walls
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -24,12 +25,7 @@ NEAR_PLANE = 0.02
 AROUND = 1.1  # object radii around the centre within which a surface counts as the object's own
 FEWEST_POINTS = 3  # that are measured near a place before it counts as occupied
 WINDOW = 2  # pixels to each side that tell what lies on the line of sight to a place
-
-MOST_WALLS = 4
-TRIALS = 100  # lines that are tried for each wall
-LEAST_OF_FRAME = 0.05  # share of a frame's points that lie on a wall
-WALL_WIDTH = 0.5  # metres that a frame shows of a wall, at least
-WALL_HEIGHT = 0.1  # metres; a camera that looks down on a table sees a strip of the wall behind it
+NARROWEST_WALL = 0.5  # metres that a frame shows of a wall, at least
 WALL_TOLERANCE = 0.02  # metres, beside the noise
 BEHIND = 0.15  # metres behind a wall from which on a point does not belong to it
 # share of a frame's points that may lie behind a wall: reflections, a door that stands open
@@ -70,8 +66,7 @@ class Surroundings:
         points = frame.positions(rows, columns)
         depth = frame.depth[rows, columns].astype(np.float64)
         tolerance = _tolerance(sighting.noise, depth)
-        high = _height(points, sighting.plane) > NEAR_PLANE + tolerance
-        walls = _find_walls(points, tolerance, high, frame.camera_to_world[:3, 3], around)
+        walls = _walls(sighting, around)
         return cls(frame, sighting.noise, sighting.plane, points, tolerance, walls)
 
     def is_near(self, places: Float, around: ObjectFrame, clearance: float) -> Mask:
@@ -191,77 +186,20 @@ def _smooth_pixels(frame: Frame) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return rows[smooth], columns[smooth]
 
 
-def _find_walls(
-    points: Float, tolerance: Float, high: Mask, camera: Float, around: ObjectFrame
-) -> tuple[Plane, ...]:
-    """Upright planes that end the room, as lines in the view from above, by RANSAC.
-
-    Args:
-        points: what a frame shows, world, (N, 3).
-        tolerance: how far each may be off, (N,).
-        high: which ones are above the support plane, (N,) bool.
-        camera: where it stands, world, (3,).
-        around: the object, whose own surface is no wall.
-    """
-    upright = (points - camera) @ around.axes.T
-    others = high & (np.linalg.norm(points - around.centre, axis=1) > AROUND * around.radius)
-    slack = WALL_TOLERANCE + tolerance
+def _walls(sighting: Sighting, around: ObjectFrame) -> tuple[Plane, ...]:
+    """The walls of the room that a sighting shows, beside the object and before none of it."""
+    frame = sighting.frame
+    samples = sample(frame, frame.depth > 0, sighting.noise)
+    away = np.linalg.norm(samples.points - around.centre, axis=1)
+    others = samples.some(away > AROUND * around.radius)
+    plane = sighting.plane
+    if plane is None:  # all that is seen is above
+        up = around.axes[2]
+        plane = Plane(up, -float((samples.points @ up).min(initial=0.0)) + 1.0)
     rng = np.random.default_rng(0)
-    walls: list[Plane] = []
-    for _ in range(MOST_WALLS):
-        if others.sum() < max(10, LEAST_OF_FRAME * len(points)):
-            break
-        line = _best_line(upright[others, :2], slack[others], rng)
-        if line is None:
-            break
-        normal, offset = line
-        # the camera is at 0, on the side where this is positive
-        away = upright[:, :2] @ normal + offset
-        on = others & (np.abs(away) < slack)
-        behind = _share_behind(away, tolerance)
-        if on.mean() >= LEAST_OF_FRAME and behind <= MOST_BEHIND and _is_large(upright[on], normal):
-            world = normal @ around.axes[:2]
-            wall = Plane(world, float(offset - world @ camera))
-            if wall.height(around.centre) > 0:
-                walls.append(wall)
-        others = others & ~on
-    return tuple(walls)
-
-
-def _best_line(ground: Float, slack: Float, rng: np.random.Generator) -> tuple[Float, float] | None:
-    """The line near most points, (N, 2): a normal that points to the origin, and an offset; or
-    None.
-    """
-    first, second = ground[rng.integers(len(ground), size=(2, TRIALS))]
-    along = second - first
-    length = np.linalg.norm(along, axis=1)
-    far_apart = length > WALL_WIDTH / 4
-    if not far_apart.any():
-        return None
-    along = along[far_apart] / length[far_apart, None]
-    normals = np.stack([-along[:, 1], along[:, 0]], 1)
-    offsets = -(normals * first[far_apart]).sum(1)
-    count = (np.abs(ground @ normals.T + offsets) < slack[:, None]).sum(0)
-    best = int(count.argmax())
-
-    normal = normals[best]
-    offset = float(offsets[best])
-    on = np.abs(ground @ normal + offset) < slack
-    middle = ground[on].mean(0)
-    spread = ground[on] - middle
-    normal = np.linalg.eigh(spread.T @ spread)[1][:, 0]
-    offset = float(-normal @ middle)
-    return (normal, offset) if offset >= 0 else (-normal, -offset)
+    return tuple(find_walls(others, plane, rng, around.centre, NARROWEST_WALL))
 
 
 def _share_behind(away: Float, tolerance: Float) -> float:
     """Share of points, at distances before a wall, (N,), and off by so much, that lie behind it."""
     return float((away < -(BEHIND + WALL_TOLERANCE + tolerance)).mean()) if len(away) else 0.0
-
-
-def _is_large(upright: Float, normal: Float) -> bool:
-    """Whether points on an upright plane, (N, 3), z up, spread as wide and as high as a wall."""
-    along = upright[:, :2] @ np.array([-normal[1], normal[0]])
-    low, high = np.quantile(along, [0.02, 0.98])
-    bottom, top = np.quantile(upright[:, 2], [0.02, 0.98])
-    return bool(high - low > WALL_WIDTH and top - bottom > WALL_HEIGHT)
