@@ -33,7 +33,8 @@ OVERLAP = 0.25
 TOUCH = 0.45
 # share of the smaller of two clusters that a piece which joins them has at least: no leg joins two
 BRIDGE = 0.25
-FEWEST = 0.15  # share of the pixels of a level cell that a piece shows over it, at least
+FEWEST = 0.15  # of the area of a cell, as the camera sees it, that a piece shows over it, at least
+FEWEST_PIXELS = 2  # that show it
 # share of the cells of a piece that lie over, or beside, one of another frame, from which they are
 # one
 LIES_OVER = 0.5
@@ -128,9 +129,9 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Fl
     key = many * (np.cumsum(shown) - 1)[place] + label
     count = np.bincount(key, minlength=many * len(used))
     focal = frame.intrinsics[0, 0] * frame.intrinsics[1, 1]
-    level = (cell / np.median(z)) ** 2 * focal if len(z) else 0.0
-    pairs = np.flatnonzero(count > FEWEST * level)
-    area = np.bincount(key, z * z, len(count))[pairs] / focal
+    area = np.bincount(key, z * z, len(count)) / focal
+    pairs = np.flatnonzero((area > FEWEST * cell**2) & (count >= FEWEST_PIXELS))
+    area = area[pairs]
     at, piece = np.divmod(pairs, many)
     cells = np.stack(np.divmod(used[at], side), 1) + low
     pixels = count[pairs]

@@ -39,6 +39,8 @@ LARGEST_SHARE = 0.25  # area, seen from above, of what stands on a plane, as a p
 WELL_INSIDE = 0.85
 # samples of a part of a level surface, of those of its largest part: smaller ones are scraps
 LARGE_PART = 0.2
+# extent of a thing, as a part of that of the plane, below which it may stand at the plane's edge
+NARROW = 0.35
 LOWEST_THING = 0.015  # height of what stands on a plane, as a part of its distance, at least
 GROUND_STEP = 0.25  # the same of a level surface: at a grazing angle its samples lie far apart
 # tolerance of samples that tell a plane from the next one, as a part of the height between them
@@ -63,6 +65,7 @@ def level_planes(samples: Samples, first: Plane) -> list[Plane]:
     """
     height = first.height(samples.points)
     left = ~steep(samples, first.normal) & (np.abs(height) > samples.tolerance)
+    left &= height < first.height(samples.camera)  # ceilings carry nothing
     wanted = max(LEAST_SHARE * len(height), 2)
 
     planes = [first]
@@ -171,9 +174,8 @@ def _carries(samples: Samples, plane: Plane, level: Mask, free: Mask, target: Ta
     surface = _surfaces(samples, on, GROUND_STEP)
     size = np.bincount(surface, on)
     large = on & (size[surface] > LARGE_PART * size.max())
-    ground = _in_plane(
-        samples.points[surface == surface[np.where(large, off, np.inf).argmin()]], plane
-    )
+    its_own = surface == surface[np.where(large, off, np.inf).argmin()]
+    ground = _in_plane(samples.points[its_own], plane)
     try:
         outline = ConvexHull(ground)
     except (QhullError, ValueError):  # too few points, or all in a line
@@ -190,10 +192,20 @@ def _carries(samples: Samples, plane: Plane, level: Mask, free: Mask, target: Ta
     above = (plane.height(samples.points) > samples.tolerance) & free
     thing = _thing_there(samples, above, off)
     if thing is None or plane.height(samples.points[thing]).max() < LOWEST_THING * away:
-        return wide
+        return wide and _leaves_picture(samples, its_own)
     return _stands_within(samples, plane, thing, outline) and not _goes_on_below(
         samples, plane, thing
     )
+
+
+def _leaves_picture(samples: Samples, chosen: Mask) -> bool:
+    """Whether a surface, some of the samples, goes on beyond the picture: what ends in it is a
+    thing of its own.
+    """
+    for index in (samples.rows, samples.columns):
+        if index[chosen].min() <= index.min() or index[chosen].max() >= index.max():
+            return True
+    return False
 
 
 def _thing_there(samples: Samples, above: Mask, off: Float) -> Index | None:
@@ -240,10 +252,12 @@ def _components(count: int, links: Index, nodes: Index) -> Index:
 
 
 def _stands_within(samples: Samples, plane: Plane, thing: Index, outline: ConvexHull) -> bool:
-    """Whether a thing covers a smaller part of the plane, away from its outline: no back of a
-    sofa on its seat.
+    """Whether a thing covers a smaller part of the plane, away from its outline, or is narrow:
+    no back of a sofa on its seat.
     """
     shown = _in_plane(samples.points[thing], plane)
+    extent = np.linalg.norm(np.ptp(outline.points[outline.vertices], axis=0))
+    narrow = bool(np.linalg.norm(np.ptp(shown, axis=0)) < NARROW * extent)
     middle = outline.points[outline.vertices].mean(0)
     centre = middle + (np.median(shown, 0) - middle) / WELL_INSIDE
     inside = bool((outline.equations[:, :2] @ centre + outline.equations[:, 2] <= 0).all())
@@ -251,7 +265,7 @@ def _stands_within(samples: Samples, plane: Plane, thing: Index, outline: Convex
         area = float(ConvexHull(shown).volume) if len(shown) > 2 else 0.0
     except QhullError:
         area = 0.0
-    return inside and area < LARGEST_SHARE * float(outline.volume)
+    return (inside or narrow) and area < LARGEST_SHARE * float(outline.volume)
 
 
 def _goes_on_below(samples: Samples, plane: Plane, thing: Index) -> bool:

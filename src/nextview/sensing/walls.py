@@ -1,4 +1,4 @@
-"""Walls of a room: upright planes that end the scene and are no part of any object.
+"""Walls and ceiling of a room: planes that end the scene and are no part of any object.
 
 A wall is found among what rises above the support plane. Seen from above an upright plane is a
 line, so the search is a RANSAC for lines (Fischler and Bolles 1981). An object has upright sides,
@@ -32,6 +32,8 @@ WIDE_SHARE = 0.8
 SIDE_CELLS = 1  # columns of the grid of samples that count as the side of the picture
 # samples behind a wall, as a part of those on it, at most: flying pixels and doors ajar
 MOST_BEHIND = 0.1
+OVER_CAMERA = 0.3  # metres of a ceiling over the camera, at least
+CEILINGS_TRIED = 50  # heights
 PARALLEL = np.cos(np.radians(25.0))  # cosine of the angle up to which two walls are parallel
 COARSE_WIDTH = 320  # columns of the picture in which pixels are compared with walls
 # pixels of that picture across the square over which the distance from a wall is averaged
@@ -63,14 +65,18 @@ def find_walls(
         narrowest: width of a wall that reaches one side of the picture, metres.
 
     Returns:
-        The walls, the one with most samples first. Empty where there are none.
+        The ceiling, if it is seen, and the walls, the one with most samples first. Empty where
+        there are none.
     """
     up = plane.normal
     above = plane.height(samples.points) > samples.tolerance
     left = np.flatnonzero(above & steep(samples, up))
     wanted = max(FEWEST_SAMPLES * len(samples.points), 2)
 
-    walls: list[Plane] = []
+    ceiling = _ceiling(samples, plane, place)
+    walls = [] if ceiling is None else [ceiling]
+    if ceiling is not None:
+        left = left[ceiling.height(samples.points[left]) > samples.tolerance[left]]
     for _ in range(MOST_LINES):
         if len(left) < wanted:
             break
@@ -87,6 +93,29 @@ def find_walls(
             walls.append(upright)
         left = left[~on]
     return walls
+
+
+def _ceiling(samples: Samples, plane: Plane, place: Float | None) -> Plane | None:
+    """The level plane over the camera that reaches the top of the picture and ends the scene."""
+    height = plane.height(samples.points)
+    over = height - plane.height(samples.camera)
+    level = np.flatnonzero((over > OVER_CAMERA) & ~steep(samples, plane.normal))
+    wanted = max(FEWEST_SAMPLES * len(height), 2)
+    if len(level) < wanted:
+        return None
+
+    tried = height[level][:: max(1, len(level) // CEILINGS_TRIED)]
+    near = np.abs(height[level, None] - tried) < samples.tolerance[level, None]
+    best = int(near.sum(0).argmax())
+    on = level[near[:, best]]
+    weight = 1 / samples.tolerance[on] ** 2
+    ceiling = Plane(-plane.normal, float(weight @ height[on] / weight.sum()) - plane.offset)
+    if len(on) < wanted or (place is not None and ceiling.height(place) < NEAREST_TO_PLACE):
+        return None
+    if samples.rows[on].min() > samples.rows.min() + SIDE_CELLS:
+        return None
+    beyond = ceiling.height(samples.points) < -2 * samples.tolerance
+    return None if beyond.sum() > MOST_BEHIND * len(on) else ceiling
 
 
 def before_walls(frame: Frame, walls: Sequence[Plane], noise: Noise) -> Mask:
