@@ -15,6 +15,8 @@ import trimesh
 
 from nextview.data.room_drawing import LIFE_SIZES, draw_rooms
 from nextview.errors import DatasetError, UsageError
+from nextview.geometry.viewsphere import level_pose
+from nextview.sensing import ObservedObject
 from nextview.simulation.room import UNEVEN, Room, RoomCamera, build_room
 from nextview.simulation.room_layout import RoomLayout, Slab, Standing
 from nextview.simulation.scene import footprint, mesh_hash, separation
@@ -239,3 +241,57 @@ def test_the_benchmark_goes_on_and_draws_its_mistakes(rooms, furniture, tmp_path
     refused = run(rooms / "chair", furniture, out, *options, "--seed", "1")
     assert refused.returncode == 2
     assert "holds episodes of other models or another seed" in refused.stderr
+
+
+# What is found in rooms
+
+
+def looked_at(folder: Path, mesh: trimesh.Trimesh, distance: float, height: float) -> Room:
+    """A thing that stands in the middle of a room, and a camera aimed at its centre."""
+    path = pipeline.write_off(folder / "thing.off", mesh)
+    size = float(np.linalg.norm(mesh.vertices - mesh.bounds.mean(0), axis=1).max())
+    thing = Standing(path.name, mesh_hash(path), round(size, 5))
+    centre = np.array([0, 0, np.ptp(mesh.vertices[:, 2]) / 2])
+    aside = np.array([-distance, 0.3, height - centre[2]])
+    pose = level_pose(aside / np.linalg.norm(aside), float(np.linalg.norm(aside)))
+    pose[:3, 3] += centre
+    given = {"name": "thing@room-0", "kind": "floor", "seed": 0, "label": "thing"}
+    given |= {"width": 8.0, "depth": 4.0, "height": 2.4, "pose": tuple(pose.ravel().tolist())}
+    return build_room(RoomLayout(target=thing, **given), folder)
+
+
+def found_in(room: Room, **asked) -> tuple[float, float, float]:
+    """Share of the thing that is taken for it, share of that which is the thing's, and the radius
+    as a part of the true one.
+    """
+    frame, shown = RoomCamera(room, SENSORS["stereo"]).look(room.pose)
+    thing = ObservedObject(**asked)
+    thing.add(frame)
+    found = thing.sightings[0].mask
+    both = (found & shown).sum()
+    return both / shown.sum(), both / found.sum(), thing.object_frame.radius / room.radius
+
+
+@pytest.mark.parametrize("named", ["pose", "point"])
+def test_a_ceiling_is_no_part_of_what_stands_under_it(tmp_path, named):
+    room = looked_at(tmp_path, trimesh.creation.box((0.5, 0.4, 0.9)), 3.5, 1.2)
+    frame, shown = RoomCamera(room, SENSORS["stereo"]).look(room.pose)
+    rows, columns = np.nonzero(~shown & (frame.depth > 0))
+    assert (np.abs(frame.positions(rows, columns)[:, 2] - 2.4) < 0.1).sum() > 10_000  # it is seen
+    asked = {"point": room.centre} if named == "point" else {}
+    taken, own, size = found_in(room, **asked)
+    assert taken > 0.8
+    assert own > 0.9
+    assert size == pytest.approx(1, abs=0.15)
+
+
+@pytest.mark.parametrize("named", ["pose", "point"])
+def test_a_wide_table_that_ends_in_the_picture_is_a_thing_and_no_support(tmp_path, named):
+    legs = [pipeline.box((0.06, 0.06, 0.7), (x, y, 0.35)) for x in (-0.6, 0.6) for y in (-0.6, 0.6)]
+    table = trimesh.util.concatenate([pipeline.box((1.5, 1.5, 0.05), (0, 0, 0.725)), *legs])
+    room = looked_at(tmp_path, table, 1.6, 1.25)
+    asked = {"point": room.centre} if named == "point" else {}
+    taken, own, size = found_in(room, **asked)
+    assert taken > 0.6  # of the far legs little more than noise shows
+    assert own > 0.9
+    assert size == pytest.approx(1, abs=0.15)

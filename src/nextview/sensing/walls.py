@@ -34,7 +34,7 @@ SIDE_CELLS = 1  # columns of the grid of samples that count as the side of the p
 MOST_BEHIND = 0.1
 OVER_CAMERA = 0.3  # metres of a ceiling over the camera, at least
 CEILINGS_TRIED = 50  # heights
-PARALLEL = np.cos(np.radians(25.0))  # cosine of the angle up to which two walls are parallel
+PARALLEL = np.cos(np.radians(25.0))  # cosine of the angle up to which two planes are parallel
 COARSE_WIDTH = 320  # columns of the picture in which pixels are compared with walls
 # pixels of that picture across the square over which the distance from a wall is averaged
 MEAN_SIDE = 3
@@ -216,13 +216,18 @@ def _is_wall(
     from_side_to_side = (
         at_left and at_right and len(np.unique(columns)) >= WIDE_SHARE * (last - first)
     )
-    to_the_top = samples.rows[on].min() <= samples.rows.min() + SIDE_CELLS
     gap = CORNER_GAP * away + float(np.median(samples.tolerance[on]))
-    in_corner = to_the_top and any(
-        (np.abs(wall.height(samples.points[on])) < gap).any() for wall in walls
+    met = [wall for wall in walls if (np.abs(wall.height(samples.points[on])) < gap).any()]
+    corners = sum(abs(wall.normal @ up) < PARALLEL for wall in met)
+    to_the_top = (
+        len(met) > corners  # as high as the ceiling
+        or samples.rows[on].min() <= samples.rows.min() + SIDE_CELLS
     )
+    in_corner = to_the_top and corners > 0
+    between_walls = to_the_top and corners > 1
     wide = width > narrowest or in_corner
-    return bool(width > WIDEST or (wide and (at_left or at_right)) or from_side_to_side)
+    at_side = wide and (at_left or at_right)
+    return bool(width > WIDEST or at_side or from_side_to_side or between_walls)
 
 
 def _hides_much(samples: Samples, upright: Plane, walls: Sequence[Plane], many: int) -> bool:
