@@ -1,13 +1,19 @@
 # Two commands do everything on a machine with Python 3.11+, pip and make: `make demo` and `make test`.
 PYTHON ?= python3
 
-.PHONY: demo test lint docs reproduce reproduce-small clean
+.PHONY: demo test test-ros lint docs reproduce reproduce-small clean
 
 demo: .venv/installed  ## look at a sample object, with the base installation (no torch)
 	.venv/bin/nextview demo
 
 test: .venv-test/installed  ## run the tests; NEXTVIEW_TESTS=all: also those that take minutes each
 	OMP_NUM_THREADS=1 .venv-test/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder  # one file is run by one process, of one thread
+
+# Folders of interfaces without wheels: tf2_msgs and vision_msgs, if they are to be tested too.
+INTERFACES ?=
+
+test-ros: .venv-ros/installed  ## run the ROS 2 node; Python 3.11, CMake and a C++ compiler, no ROS installation
+	AMENT_PREFIX_PATH=$(abspath .venv-ros) OMP_NUM_THREADS=1 .venv-ros/bin/python -m pytest -n 0 tests/test_ros_node.py
 
 lint: .venv-test/installed  ## style and types
 	.venv-test/bin/ruff check .
@@ -38,5 +44,9 @@ reproduce-small: .venv-test/installed  ## the same on three meshes a class, or o
 	.venv-test/bin/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[train,bags,benchmark,cluster,explore,large,record,dev,workflow,docs,envs]' -e 'research[arm,rl]'
 	touch $@
 
+.venv-ros/installed: ros2/environment.py pyproject.toml constraints.txt $(wildcard ros2/nextview_msgs/action/*)
+	$(PYTHON) ros2/environment.py .venv-ros $(INTERFACES)
+	touch $@
+
 clean:
-	rm -rf .venv .venv-test nextview_demo.png
+	rm -rf .venv .venv-test .venv-ros nextview_demo.png

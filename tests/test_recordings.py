@@ -33,6 +33,7 @@ from nextview.captured import bag as bag_reader
 from nextview.captured.camera_file import read_camera_file
 from nextview.captured.check import check_capture
 from nextview.captured.folders import is_capture, read_capture
+from nextview.captured.messages import parts_of
 from nextview.captured.transforms import TransformTree
 from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError, UsageError
@@ -197,11 +198,13 @@ def test_no_pose_is_made_up_in_a_gap_of_tf():
     tree = TransformTree()
     for time in (0.0, 0.1, 2.0):
         link = transform_message(tool_at(time), "tool", time, "base_link")
-        tree.add("tool", "base_link", time, link.transform, fixed=False)
+        tree.add("tool", "base_link", time, *parts_of(link.transform))
     tree.sort()
     np.testing.assert_allclose(tree.pose("tool", "base_link", 0.05), tool_at(0.05), atol=1e-9)
     with pytest.raises(DatasetError, match="tf has nothing of 'tool' in 'base_link'"):
         tree.pose("tool", "base_link", 1.0)
+    # but where there is one
+    np.testing.assert_allclose(tree.pose("tool", "base_link", 2.0), tool_at(2.0), atol=1e-9)
 
 
 def two_parents():

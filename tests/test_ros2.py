@@ -42,22 +42,22 @@ from nextview_ros import conversion
 ROS_MODULES = (
     "geometry_msgs",
     "geometry_msgs.msg",
-    "message_filters",
     "nextview_msgs",
     "nextview_msgs.action",
     "rclpy",
     "rclpy.action",
     "rclpy.callback_groups",
-    "rclpy.duration",
     "rclpy.executors",
     "rclpy.node",
     "rclpy.qos",
-    "rclpy.time",
     "sensor_msgs",
     "sensor_msgs.msg",
     "std_srvs",
     "std_srvs.srv",
-    "tf2_ros",
+    "std_msgs",
+    "std_msgs.msg",
+    "vision_msgs",
+    "vision_msgs.msg",
 )
 """What the node imports from ROS."""
 
@@ -200,12 +200,10 @@ def node(monkeypatch):
     for name in ROS_MODULES:
         monkeypatch.setitem(sys.modules, name, MagicMock())
     monkeypatch.setattr(sys.modules["rclpy.node"], "Node", object)
-    monkeypatch.setattr(
-        sys.modules["tf2_ros"], "TransformException", type("TransformException", (Exception,), {})
-    )
     monkeypatch.delitem(sys.modules, "nextview_ros.node", raising=False)
     made = object.__new__(importlib.import_module("nextview_ros.node").RecogniseNode)
     made.session = nextview.load().session(object=ObservedObject(life_size=False), distance=0.5)
+    made.taken, made.begun = False, threading.Event()
     made.busy, made.ended, made.goal = threading.Lock(), threading.Event(), MagicMock()
     made.next_pose, made.value, made.get_clock = (
         MagicMock(),
@@ -240,7 +238,9 @@ def test_the_pose_of_the_thing_goes_into_a_message(node, monkeypatch):
         parts = {"pose": SimpleNamespace(position=SimpleNamespace(), orientation=SimpleNamespace())}
         return SimpleNamespace(header=SimpleNamespace(frame_id=""), **parts)
 
-    monkeypatch.setattr(sys.modules[type(node).__module__], "PoseStamped", empty)
+    module = sys.modules[type(node).__module__]
+    monkeypatch.setattr(module, "PoseStamped", empty)
+    monkeypatch.setattr(module, "Header", SimpleNamespace)
     pose = pose_at(20, 70, 0.5, (0.1, 0.2, 0.3))
     message = node.pose_of(SimpleNamespace(pose=pose))
     assert message.header.frame_id == "base"

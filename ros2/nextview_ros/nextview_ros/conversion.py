@@ -43,27 +43,37 @@ def frame_of(
     Raises:
         ObservationError: the messages do not belong together, or one of them cannot be used.
     """
+    if image.header.frame_id != transform.child_frame_id:
+        raise ObservationError(
+            f"frames differ: {image.header.frame_id!r} of the image, {transform.child_frame_id!r}"
+            " of the transform"
+        )
+    stamp = seconds(transform.header.stamp)
+    late = abs(stamp - seconds(image.header.stamp))
+    # one of zero is of a transform that never changes
+    if stamp != 0 and late > SIMULTANEOUS:
+        raise ObservationError(f"image and transform are {late:.3f} s apart")
+    return frame_at(image, info, pose_of(transform), rectified, axes)
+
+
+def frame_at(
+    image: Any, info: Any, pose: Float, rectified: bool = False, axes: str = "opencv"
+) -> Frame:
+    """The same, with the pose of the image's frame in the world as a matrix, (4, 4), metres."""
     if (image.width, image.height) != (info.width, info.height):
         raise ObservationError(
             f"the image has {image.width} x {image.height} pixels, its camera_info {info.width} x"
             f" {info.height}"
         )
-    if (
-        image.header.frame_id != info.header.frame_id
-        or image.header.frame_id != transform.child_frame_id
-    ):
+    if image.header.frame_id != info.header.frame_id:
         raise ObservationError(
             f"frames differ: {image.header.frame_id!r} of the image, {info.header.frame_id!r} of"
-            f" camera_info, {transform.child_frame_id!r} of the transform"
+            " camera_info"
         )
-    times = [seconds(message.header.stamp) for message in (image, info, transform)]
-    if times[2] == 0:  # of a transform that never changes
-        times.pop()
-    if max(times) - min(times) > SIMULTANEOUS:
-        raise ObservationError(
-            f"image, camera_info and transform are {max(times) - min(times):.3f} s apart"
-        )
-    return Frame(depth_of(image), intrinsics_of(info, rectified), pose_of(transform), axes=axes)
+    late = abs(seconds(image.header.stamp) - seconds(info.header.stamp))
+    if late > SIMULTANEOUS:
+        raise ObservationError(f"image and camera_info are {late:.3f} s apart")
+    return Frame(depth_of(image), intrinsics_of(info, rectified), pose, axes=axes)
 
 
 def fill_pose(message: Any, pose: Float, axes: str = "opencv") -> Any:

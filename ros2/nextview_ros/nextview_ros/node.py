@@ -1,34 +1,37 @@
-"""The node: one action, two services, one topic.
+"""The node: one action, two services, and topics of what is found and of where to look next.
 
-What is computed is in ``conversion`` and in nextview's session.
+What is computed is in nextview's session; messages are read in ``inputs`` and ``conversion``, and
+written in ``outputs``.
 """
 
 from __future__ import annotations
 
 import math
+import sys
 import threading
 from dataclasses import replace
+from functools import partial
 
-import message_filters
 import rclpy
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseArray, PoseStamped
 from nextview_msgs.action import Recognise
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
-from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
-from tf2_ros import Buffer, TransformException, TransformListener
 
 import nextview
+from nextview.captured.messages import seconds
 from nextview.recognition.belief import Stopping
 from nextview.recognition.protocol import JudgesTogether
 from nextview.sensing import ObservedObject
-from nextview_ros.conversion import fill_pose, frame_of, seconds
+from nextview_ros.conversion import fill_pose, frame_at
+from nextview_ros.inputs import CameraPoses, Pairs
+from nextview_ros.outputs import Detection3DArray, detections, pose_array, ranked_poses
 
 PARAMETERS = {
     "models": "modelnet10",
@@ -36,6 +39,7 @@ PARAMETERS = {
     "threshold": 0.97,
     "max_views": 5,
     "world_frame": "base_link",
+    "poses": "tf",  # where the camera's poses come from; see ``inputs.CameraPoses``
     "rectified": True,
     "axes": "opencv",
     "life_size": False,
@@ -45,14 +49,21 @@ PARAMETERS = {
     "patience": 2.0,  # seconds to wait for an image that was taken after a look was asked for
 }
 
+# The action and a look each wait in one, while messages are taken in: rclpy's default, one for each
+# core, is too few on two cores.
+THREADS = 8
+
 
 class RecogniseNode(Node):
     """Offers the action recognise, and the services look and failed for whoever moves the
     camera.
+
+    Args:
+        options: of rclpy's ``Node``, such as ``parameter_overrides``.
     """
 
-    def __init__(self) -> None:
-        super().__init__("nextview")
+    def __init__(self, **options) -> None:
+        super().__init__("nextview", **options)
         for name, value in PARAMETERS.items():
             self.declare_parameter(name, value)
         self.system = nextview.load(
@@ -67,20 +78,24 @@ class RecogniseNode(Node):
             threading.Event(),
             threading.Condition(),
         )
+        self.begun = threading.Event()  # set while no accepted goal waits for its session
         self.latest = None
         group = ReentrantCallbackGroup()
-        self.tf = Buffer()
-        self.listener = TransformListener(self.tf, self)
-        subscribe = [
-            message_filters.Subscriber(
-                self, kind, topic, qos_profile=qos_profile_sensor_data, callback_group=group
+        self.poses = CameraPoses(self, self.value("poses"), self.value("world_frame"), group)
+        self.pairs = Pairs(self.keep)
+        for kind, topic, name in ((Image, "depth", "image"), (CameraInfo, "camera_info", "info")):
+            take = partial(self.pairs.take, name)
+            self.create_subscription(
+                kind, topic, take, qos_profile_sensor_data, callback_group=group
             )
-            for kind, topic in ((Image, "depth"), (CameraInfo, "camera_info"))
-        ]
-        self.pairs = message_filters.TimeSynchronizer(subscribe, 10)
-        self.pairs.registerCallback(self.keep)
+
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.next_pose = self.create_publisher(PoseStamped, "next_pose", latched)
+        self.next_poses = self.create_publisher(PoseArray, "next_poses", latched)
+        self.detections = None
+        if Detection3DArray is not None:
+            self.detections = self.create_publisher(Detection3DArray, "detections", latched)
+
         self.create_service(Trigger, "look", self.look, callback_group=group)
         self.create_service(Trigger, "failed", self.failed, callback_group=group)
         self.server = ActionServer(
@@ -113,24 +128,22 @@ class RecogniseNode(Node):
     def frame(self):
         """A frame that was taken from now on. Earlier ones may have been taken on the way."""
         now = seconds(self.get_clock().now().to_msg())
+        patience = self.value("patience")
         with self.arrived:
             fresh = self.arrived.wait_for(
                 lambda: self.latest is not None and seconds(self.latest[0].header.stamp) >= now,
-                self.value("patience"),
+                patience,
             )
-            if not fresh:
-                raise nextview.ObservationError(
-                    f"no depth image came within {self.value('patience')} s"
-                )
-            image, info = self.latest
+            latest = self.latest
+        if not fresh:
+            why = self.pairs.missing() if latest is None else "the images are older than the look"
+            raise nextview.ObservationError(
+                f"no depth image with its camera_info came within {patience} s: {why}"
+            )
+        image, info = latest
         header = image.header
-        transform = self.tf.lookup_transform(
-            self.value("world_frame"),
-            header.frame_id,
-            Time.from_msg(header.stamp),
-            Duration(seconds=1.0),
-        )
-        return frame_of(image, info, transform, self.value("rectified"), self.value("axes"))
+        pose = self.poses.at(header.frame_id, seconds(header.stamp), patience)
+        return frame_at(image, info, pose, self.value("rectified"), self.value("axes"))
 
     # The action
 
@@ -139,6 +152,7 @@ class RecogniseNode(Node):
         if self.taken:
             return GoalResponse.REJECT
         self.taken = True
+        self.begun.clear()
         return GoalResponse.ACCEPT
 
     def execute(self, goal) -> Recognise.Result:
@@ -148,20 +162,24 @@ class RecogniseNode(Node):
             session = self.begin(goal.request)
             with self.busy:
                 self.session, self.goal = session, goal
+            self.begun.set()
             while not self.ended.wait(0.1) and not goal.is_cancel_requested and rclpy.ok():
                 pass
         except nextview.NextviewError as error:
             self.get_logger().error(str(error))
             goal.abort()
-            return Recognise.Result()
+            return without_answer(str(error))
         finally:
             with self.busy:
                 self.session, self.goal, self.taken = None, None, False
+            self.begun.set()
         if not session.done:
             goal.canceled() if goal.is_cancel_requested else goal.abort()
-            return Recognise.Result()
+            return without_answer(f"ended after {len(session.views)} views, before it was sure")
         goal.succeed()
         found = session.result
+        if self.detections is not None:
+            self.detections.publish(detections(found, self.header()))
         return Recognise.Result(
             answer=found.answer or "",
             confidence=found.confidence,
@@ -176,14 +194,18 @@ class RecogniseNode(Node):
             pose_millimetres=0.0
             if found.pose_uncertainty is None
             else found.pose_uncertainty.millimetres,
+            message=str(found),
         )
+
+    def header(self) -> Header:
+        """That of a message in the world's frame, of now."""
+        return Header(frame_id=self.value("world_frame"), stamp=self.get_clock().now().to_msg())
 
     def pose_of(self, found: nextview.Recognition) -> PoseStamped:
         """Where the thing is that was named; an empty message where that is not known."""
         message = PoseStamped()
         if found.pose is not None:
-            message.header.frame_id = self.value("world_frame")
-            message.header.stamp = self.get_clock().now().to_msg()
+            message.header = self.header()
             fill_pose(message.pose, found.pose)
         return message
 
@@ -221,6 +243,9 @@ class RecogniseNode(Node):
 
     def answer(self, response: Trigger.Response, act) -> Trigger.Response:
         """Do something with the session, and tell what follows."""
+        # Whoever sends a goal may call before its session has begun.
+        if self.taken:
+            self.begun.wait(self.value("patience"))
         with self.busy:
             if self.session is None or self.session.done:
                 response.success, response.message = False, "no goal is active"
@@ -228,7 +253,7 @@ class RecogniseNode(Node):
             try:
                 act(self.session)
                 response.success, response.message = True, self.tell()
-            except (nextview.NextviewError, TransformException) as error:
+            except nextview.NextviewError as error:
                 response.success, response.message = False, str(error)
         return response
 
@@ -241,15 +266,23 @@ class RecogniseNode(Node):
             feedback.warnings = [warning.message for warning in session.views[-1].warnings]
         if not session.done:
             target = feedback.next_pose
-            target.header.frame_id = self.value("world_frame")
-            target.header.stamp = self.get_clock().now().to_msg()
+            target.header = self.header()
             fill_pose(target.pose, session.target, self.value("axes"))
             self.next_pose.publish(target)
+        ranked = pose_array(ranked_poses(session), self.header(), self.value("axes"))
+        self.next_poses.publish(ranked)
         self.goal.publish_feedback(feedback)
         if session.done:
             self.ended.set()
             return str(session.result)
         return f"view {len(session.views)} is taken in"
+
+
+def without_answer(why: str) -> Recognise.Result:
+    """The result of a goal that was given up, and why."""
+    result = Recognise.Result()
+    result.message = why
+    return result
 
 
 def give_up(session: nextview.Session) -> None:
@@ -266,9 +299,14 @@ def give_up(session: nextview.Session) -> None:
 def main() -> None:
     """Run the node."""
     rclpy.init()
-    node = RecogniseNode()
     try:
-        rclpy.spin(node, MultiThreadedExecutor())
+        node = RecogniseNode()
+    except nextview.NextviewError as error:
+        print(f"nextview: {error}", file=sys.stderr)
+        rclpy.try_shutdown()
+        raise SystemExit(2) from None
+    try:
+        rclpy.spin(node, MultiThreadedExecutor(THREADS))
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:

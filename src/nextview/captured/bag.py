@@ -24,6 +24,7 @@ from nextview.captured.messages import (
     depth_of,
     depth_of_compressed,
     intrinsics_of,
+    parts_of,
     seconds,
 )
 from nextview.captured.transforms import NoTransformError, TransformError, TransformTree
@@ -372,7 +373,8 @@ def _transforms(bag: Bag) -> TransformTree:
         for fixed, each in said:
             child = each.child_frame_id.lstrip("/")
             parent = each.header.frame_id.lstrip("/")
-            tree.add(child, parent, seconds(each.header.stamp), each.transform, fixed)
+            position, quaternion = parts_of(each.transform)
+            tree.add(child, parent, seconds(each.header.stamp), position, quaternion, fixed)
         tree.sort()
     except TransformError as error:
         raise DatasetError(f"{bag.path}: {error}") from None

@@ -145,8 +145,15 @@ def pose_of(transform: Any) -> Float:
     Raises:
         ObservationError: the quaternion is none of a rotation.
     """
-    t, q = transform.transform.translation, transform.transform.rotation
-    return matrix_of((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
+    return matrix_of(*parts_of(transform.transform))
+
+
+def parts_of(transform: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Position, (3,), and quaternion (x, y, z, w) of a ``geometry_msgs/Transform`` or ``Pose``."""
+    is_pose = hasattr(transform, "position")
+    t = transform.position if is_pose else transform.translation
+    q = transform.orientation if is_pose else transform.rotation
+    return (t.x, t.y, t.z), (q.x, q.y, q.z, q.w)
 
 
 def matrix_of(position: tuple[float, ...], quaternion: tuple[float, ...]) -> Float:

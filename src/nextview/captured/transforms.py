@@ -59,16 +59,15 @@ class _Link:
         if self.fixed:
             return matrix_of(self.positions[-1], self.quaternions[-1])
         after = int(np.searchsorted(self.stamps, time))
-        if after in (0, len(self.stamps)):
-            nearest = min(after, len(self.stamps) - 1)
+        before = after - 1
+        inside = 0 < after < len(self.stamps)
+        if not inside or self.stamps[after] - self.stamps[before] > LONGEST_GAP:
+            nearest = int(np.abs(np.array(self.stamps) - time).argmin())
             if abs(self.stamps[nearest] - time) > BEYOND:
                 return None
             return matrix_of(self.positions[nearest], self.quaternions[nearest])
 
-        before = after - 1
         gap = self.stamps[after] - self.stamps[before]
-        if gap > LONGEST_GAP:
-            return None
         share = (time - self.stamps[before]) / gap
         ends = [matrix_of(self.positions[i], self.quaternions[i]) for i in (before, after)]
         pose = np.eye(4)
@@ -79,19 +78,34 @@ class _Link:
 
 
 class TransformTree:
-    """Which frame hangs on which, and how they move."""
+    """Which frame hangs on which, and how they move.
 
-    def __init__(self) -> None:
+    Args:
+        kept: how many transforms of each frame are remembered at least, the last ones; all of them
+            if it is None.
+    """
+
+    def __init__(self, kept: int | None = None) -> None:
+        self._kept = kept
         self._links: dict[str, _Link] = {}
 
-    def add(self, child: str, parent: str, stamp: float, transform: object, fixed: bool) -> None:
+    def add(
+        self,
+        child: str,
+        parent: str,
+        stamp: float,
+        position: tuple[float, ...],
+        quaternion: tuple[float, ...],
+        fixed: bool = False,
+    ) -> None:
         """Take in where a frame was in another.
 
         Args:
             child: the frame.
             parent: the frame that it hangs on.
             stamp: seconds.
-            transform: ``geometry_msgs/Transform``: from the child's frame into the parent's.
+            position: of its origin in the parent's frame, (3,), metres.
+            quaternion: of its axes there, x, y, z, w.
             fixed: it never changes.
 
         Raises:
@@ -102,10 +116,12 @@ class TransformTree:
             raise TransformError(
                 f"tf frame {child!r} has two parents, {link.parent!r} and {parent!r}"
             )
-        t, q = transform.translation, transform.rotation  # type: ignore[attr-defined]
         link.stamps.append(stamp)
-        link.positions.append((t.x, t.y, t.z))
-        link.quaternions.append((q.x, q.y, q.z, q.w))
+        link.positions.append(position)
+        link.quaternions.append(quaternion)
+        if self._kept is not None and len(link.stamps) > 2 * self._kept:
+            for values in (link.stamps, link.positions, link.quaternions):
+                del values[: -self._kept]
 
     def sort(self) -> None:
         """Put what was taken in into the order of time, once all of it was.
