@@ -204,19 +204,28 @@ class Running:
         given = [Parameter(name, value=value) for name, value in all_parameters.items()]
         self.node = RecogniseNode(parameter_overrides=given)
         self.robot = Robot(poses)
+        self.robots = [self.robot]
         self.executor = MultiThreadedExecutor(8)
         self.executor.add_node(self.node)
         self.executor.add_node(self.robot)
         self.thread = threading.Thread(target=self.executor.spin, daemon=True)
         self.thread.start()
 
+    def another_robot(self, **options):
+        """One more, for another node; it is destroyed at the end, as the executor uses it."""
+        robot = Robot("topic", **options)
+        self.robots.append(robot)
+        self.executor.add_node(robot)
+        return robot
+
     def close(self):
         self.executor.shutdown(5.0)
         self.thread.join(10.0)
         self.node.server.destroy()
         self.node.destroy_node()
-        self.robot.action.destroy()
-        self.robot.destroy_node()
+        for robot in self.robots:
+            robot.action.destroy()
+            robot.destroy_node()
         rclpy.try_shutdown()
 
 
@@ -409,8 +418,7 @@ def started(*options):
 
 
 def test_a_node_that_is_killed_and_started_again_takes_goals_again(running):
-    second = Robot("topic", namespace="/second")
-    running.executor.add_node(second)
+    second = running.another_robot(namespace="/second")
     process = started()
     try:
         second.goal(distance=0.7)
@@ -425,9 +433,6 @@ def test_a_node_that_is_killed_and_started_again_takes_goals_again(running):
     finally:
         process.kill()
         process.wait()
-        running.executor.remove_node(second)
-        second.action.destroy()
-        second.destroy_node()
 
 
 def test_parameters_that_make_no_sense_end_the_node_with_a_sentence():
