@@ -303,6 +303,8 @@ MISTAKES = {
     "five times too small": (lambda p: p, {"step": 5}, "the depth is 5 times too small"),
     "late": (lambda p: np.concatenate([p[:1], p[:-1]]), {}, "one frame late"),
     "early": (lambda p: np.concatenate([p[1:], p[-1:]]), {}, "one frame early"),
+    "two late": (lambda p: np.concatenate([p[:2], p[:-2]]), {}, "the poses are 2 frames late"),
+    "two early": (lambda p: np.concatenate([p[2:], p[-2:]]), {}, "the poses are 2 frames early"),
     "axes": (lambda p: p @ OPENGL, {}, "those of OpenGL"),
     "inverse, and axes": (lambda p: np.linalg.inv(p @ OPENGL), {}, "are inverse"),
 }

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from nextview.captured.shifted_poses import relative_change
 from nextview.sensing.agreement import Agreement, SurfaceView, compare
 from nextview.sensing.frame import AXES
 
@@ -15,8 +16,6 @@ Index = NDArray[np.int64]
 
 FEWEST_JUDGED = 100  # points that two frames or more have to share before anything is said
 CERTAIN_SHARE = 0.99  # share of confirmed points from which no mistake is searched for
-# the same, from which only shifted poses are: they leave most pairs of frames right
-GOOD_SHARE = 0.9
 FEWER_CONTRADICTIONS = 0.5  # a mistake is named if without it at most this part of them is left
 LEAST_CONTRADICTED = 0.08  # ... of at least this share of the points that it concerns
 LEAST_OVERLAP = 0.5  # and if at least this part of the points can still be judged without it
@@ -24,8 +23,6 @@ LEAST_OVERLAP = 0.5  # and if at least this part of the points can still be judg
 NO_OVERLAP = 0.25
 WELL_EXPLAINED = 0.85  # share of the points that are confirmed without the mistake
 ONE_PLACE = 0.1  # cameras within this part of the depth stand in one place: no capture of an object
-SAME_POSE = 1e-3  # metres, and parts of a rotation, up to which two poses are the same
-FRAME_SHIFTS = (1, -1, 2, -2)  # by how many frames poses may be late
 UNIT_NAMES = {
     1.0: "metres",
     0.01: "centimetres",
@@ -46,18 +43,16 @@ class PoseMistake:
     """One mistake that captured poses may have.
 
     Attributes:
-        kind: "inverse", "quaternion", "axes", "scale", "shift" or "mixed".
+        kind: "inverse", "quaternion", "axes", "scale" or "mixed".
         sentence: what it looks like, the end of a sentence; empty for a scale, which may be that
             of the translations or of the depth.
         corrected: makes the right poses of the wrong ones, both camera-to-world, (N, 4, 4).
-        shift: by how many frames the poses are late.
         scale: by which the translations are multiplied.
     """
 
     kind: str
     sentence: str
     corrected: Callable[[Float], Float]
-    shift: int = 0
     scale: float = 1.0
 
 
@@ -99,11 +94,8 @@ def find_mistake(posed: Posed, as_read: Agreement) -> PoseMistake | None:
     overlap = as_read.judged / max(_judgeable(posed.views), 1)
     if overlap > NO_OVERLAP and as_read.share > CERTAIN_SHARE:
         return None
-    shifts = [_shifted(frames) for frames in FRAME_SHIFTS]
-    if overlap > NO_OVERLAP and as_read.share > GOOD_SHARE:
-        return _best(posed, as_read, shifts)
     single = _single_mistakes(posed.to_world, posed.unit)
-    return _best(posed, as_read, single + shifts) or _best(posed, as_read, _pairs(single))
+    return _best(posed, as_read, single) or _best(posed, as_read, _pairs(single))
 
 
 def _best(posed: Posed, as_read: Agreement, mistakes: Sequence[PoseMistake]) -> PoseMistake | None:
@@ -123,19 +115,13 @@ def _explained(posed: Posed, as_read: Agreement, mistake: PoseMistake) -> float:
 
     Only the pairs of frames count whose poses relative to each other the mistake changes.
     """
-    late = posed.indices + mistake.shift
-    kept = (late >= 0) & (late < len(posed.poses))
-    if kept.sum() < 2:
-        return 0.0
-    views = [view for view, keep in zip(posed.views, kept, strict=True) if keep]
-    poses = mistake.corrected(posed.poses[late[kept]])
+    views = posed.views
+    poses = mistake.corrected(posed.as_read())
     if _in_one_place(views, poses):
         return 0.0
 
-    changed = _relative_change(poses, posed.as_read()[kept])
-    with_it = Agreement(
-        as_read.confirmed[np.ix_(kept, kept)], as_read.contradicted[np.ix_(kept, kept)]
-    ).among(changed)
+    changed = relative_change(poses, posed.as_read())
+    with_it = as_read.among(changed)
     without = compare(views, poses).among(changed)
     if without.judged < FEWEST_JUDGED or without.share < WELL_EXPLAINED:
         return 0.0
@@ -165,15 +151,7 @@ def _in_one_place(views: Sequence[SurfaceView], poses: Float) -> bool:
     return not depths or bool(np.quantile(apart, 0.9) < ONE_PLACE * np.median(depths))
 
 
-def _relative_change(poses: Float, others: Float) -> NDArray[np.bool_]:
-    """Of which two cameras the pose relative to each other differs, (N, N)."""
-    relative, other_relative = (
-        np.linalg.inv(each)[:, None] @ each[None] for each in (poses, others)
-    )
-    return np.abs(relative - other_relative).max((2, 3)) > SAME_POSE
-
-
-# The mistakes
+# The mistakes; poses that are late or early are found in ``shifted_poses``
 
 
 def _single_mistakes(to_world: bool, unit: float) -> list[PoseMistake]:
@@ -242,14 +220,6 @@ def _one_after_the_other(
     first: Callable[[Float], Float], second: Callable[[Float], Float]
 ) -> Callable[[Float], Float]:
     return lambda poses: second(first(poses))
-
-
-def _shifted(frames: int) -> PoseMistake:
-    many = "one frame" if abs(frames) == 1 else f"{abs(frames)} frames"
-    where = "late: each frame has the pose of an earlier one"
-    if frames < 0:
-        where = "early: each frame has the pose of a later one"
-    return PoseMistake("shift", f"the poses are {many} {where}", np.copy, shift=frames)
 
 
 def _scaled(scale: float) -> PoseMistake:

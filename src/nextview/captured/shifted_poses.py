@@ -229,7 +229,7 @@ def _explained(shifted: Shifted, late: Index, later: Index) -> float:
 def _is_explained(shifted: Shifted, as_read: Index, late: Index) -> bool:
     """Return whether frames contradict each other much less with later poses."""
     usable = shifted.has_pose(late)
-    changed = _relative_change(shifted.poses_of(as_read), shifted.poses_of(late))
+    changed = relative_change(shifted.poses_of(as_read), shifted.poses_of(late))
     changed &= usable[:, None] & usable
     before = shifted.agreement(as_read, as_read).among(changed)
     after = shifted.agreement(late, late).among(changed)
@@ -242,7 +242,7 @@ def _is_explained(shifted: Shifted, as_read: Index, late: Index) -> bool:
     )
 
 
-def _relative_change(poses: Float, others: Float) -> NDArray[np.bool_]:
+def relative_change(poses: Float, others: Float) -> NDArray[np.bool_]:
     """Of which two cameras the pose relative to each other differs, (N, N)."""
     relative = np.linalg.inv(poses)[:, None] @ poses[None]
     other_relative = np.linalg.inv(others)[:, None] @ others[None]
