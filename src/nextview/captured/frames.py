@@ -173,9 +173,8 @@ class Capture:
     scale_given: bool = False
 
     def __repr__(self) -> str:
-        return f"{self.folder}: {self.layout} layout, {len(self.frames)} frames; " + "; ".join(
-            self.notes
-        )
+        count = "1 frame" if len(self.frames) == 1 else f"{len(self.frames)} frames"
+        return "; ".join([f"{self.folder}: {self.layout} layout, {count}", *self.notes])
 
 
 def pinhole_of(fx: float, fy: float, cx: float, cy: float) -> Float:
