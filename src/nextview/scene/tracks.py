@@ -13,7 +13,8 @@ from scipy import ndimage
 
 from nextview.recognition.poses import PoseCandidate
 from nextview.sensing.frame import Part, spans
-from nextview.sensing.observed_object import ObservedObject, Sighting
+from nextview.sensing.observed_object import ObservedObject
+from nextview.sensing.sighting import Sighting
 from nextview.sensing.tabletop import TableTop
 from nextview.session.result import Recognition
 from nextview.things.surface import Surface, SurfaceCaster

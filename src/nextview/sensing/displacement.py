@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from nextview.sensing.facets import Facets
 
 if TYPE_CHECKING:
-    from nextview.sensing.observed_object import Sighting
+    from nextview.sensing.sighting import Sighting
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from copy import copy, deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
@@ -22,7 +22,6 @@ from nextview.sensing.convex_pieces import STANDS, cut
 from nextview.sensing.displacement import Displacement, displacement
 from nextview.sensing.facets import (
     ROWS,
-    Facets,
     Index,
     Noise,
     estimate_noise,
@@ -37,6 +36,7 @@ from nextview.sensing.object_frame import Box, ObjectFrame, enclose, three, upri
 from nextview.sensing.outliers import without_outliers
 from nextview.sensing.plausibility import ViewWarning, check_frame, check_observation, check_views
 from nextview.sensing.segmentation import Plane, Samples, find_plane, sample
+from nextview.sensing.sighting import Sighting
 from nextview.sensing.walls import before_walls, find_walls
 
 Float = NDArray[np.float64]
@@ -77,49 +77,6 @@ MAY_BE_TWO = ViewWarning(
     "outline",
     "the object may be two things that touch: name it by a mask or a box, or move them apart",
 )
-
-
-@dataclass(frozen=True)
-class Sighting:
-    """What one frame, with the noise of it all, shows of the object.
-
-    Attributes:
-        frame: its pose is shifted so that the object stands where earlier frames show it.
-        noise: of the frame.
-        facets: the object's surface, camera frame.
-        mask: its pixels, (H, W) bool.
-        hull: corners of its convex hull, world, (K, 3), metres.
-        plane: the support plane, if it is seen.
-        footprint: of all that is above the plane, where the object was found so.
-        chosen: which cells of the footprint are the object's, (cells,) bool.
-        shift: by which the pose was shifted, (3,), metres.
-    """
-
-    frame: Frame
-    noise: Noise
-    facets: Facets
-    mask: Mask
-    hull: Float
-    plane: Plane | None
-    footprint: Footprint | None = None
-    chosen: Mask | None = None
-    shift: Float = field(default_factory=lambda: np.zeros(3))
-
-    @property
-    def told(self) -> Frame:
-        """The frame with the pose that it was handed in with."""
-        return self.frame.shifted(-self.shift) if self.shift.any() else self.frame
-
-    def shifted(self, shift: Float) -> Sighting:
-        """The same from a place that is shifted in the world, (3,), metres."""
-        plane = self.plane
-        return replace(
-            self,
-            frame=self.frame.shifted(shift),
-            hull=self.hull + shift,
-            plane=plane and replace(plane, offset=plane.offset - float(plane.normal @ shift)),
-            shift=self.shift + shift,
-        )
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import ObjectFrame
-from nextview.sensing.observed_object import Sighting
 from nextview.sensing.segmentation import Plane, sample
+from nextview.sensing.sighting import Sighting
 from nextview.sensing.walls import find_walls
 
 Float = NDArray[np.float64]

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.sensing.observed_object import Sighting
+from nextview.sensing.sighting import Sighting
 from nextview.things.surface import Surface
 
 Float = NDArray[np.float64]
