@@ -23,7 +23,7 @@ Mask = NDArray[np.bool_]
 
 ACROSS = 3  # pictures in a row
 WIDTH = 4.2  # inches of one
-HEIGHT = 3.4
+HEIGHT = 3.6
 SHAPE = 0.7  # height of a picture, as a part of its width
 DOTS = 110  # an inch
 AROUND = 1.6  # the picture shows so many times the extent of the object and of what was taken
@@ -98,7 +98,7 @@ def _draw(pictures: Sequence[Picture], path: Path) -> None:
         for axis, picture in zip(axes, pictures, strict=False):
             _panel(axis, picture)
         figure.tight_layout(pad=0.8)
-        figure.savefig(path, dpi=DOTS, facecolor=PAPER)
+        figure.savefig(path, dpi=DOTS, facecolor=PAPER, bbox_inches="tight", pad_inches=0.15)
 
 
 def _panel(axis: Axes, picture: Picture) -> None:
