@@ -140,7 +140,7 @@ def test_every_bundled_policy_runs_live(chair, capsys):
         (["chair.off", "--risk", "0.000001"], "cannot promise"),
         (["chair.off", "--policy", "gian"], "did you mean 'gain'?"),
         (["chair.off", "--policy", "discriminate"], "is for taught things"),
-        (["chair.off", "--policy", "true-depth_entropy"], "takes part in nextview benchmark alone"),
+        (["chair.off", "--policy", "true-depth_entropy"], "runs only in nextview benchmark"),
         (["chair.off", "--figure", "chair"], "ends in .png or .pdf or .svg"),
         (["."], "is a folder of meshes, not of captured views; recognise one of them"),
     ],
