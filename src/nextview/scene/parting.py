@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -19,7 +19,7 @@ from scipy import ndimage
 
 from nextview.errors import ObservationError
 from nextview.scene.tracks import Rendered, Track, render_track
-from nextview.sensing.observed_object import ObservedObject
+from nextview.sensing.observed_object import FEWEST, ObservedObject, Sighting
 from nextview.sensing.tabletop import NEAR_PLANE, TableTop
 
 Mask = NDArray[np.bool_]
@@ -29,7 +29,11 @@ LEAST_GAIN = 0.03  # by which another parting explains more of the pixels, at le
 MOST_TRIMMED = 0.25  # share of an object's pixels that may be the plane's
 LEAST_TRIMMED = 0.02
 SHARED = 0.5  # share of a segment that another object's scan explains, from which they may be one
+NEAR_GAP = 0.02  # metres between segments in the picture that are tried as one object, at most
+NEAR_STEP = 0.03  # metres between their depths there, at most
 MOST_GROUP = 5  # segments that touch and are tried as one object
+MOST_TRIES = 2  # frames in which an object's pixels are parted otherwise in vain
+LEAST_TAKEN = 0.15  # share of an object's pixels that another one's scan takes over
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +90,77 @@ def part(tracks: Sequence[Track], bench: Bench) -> list[Track]:
     tracks = _trimmed(tracks, bench)
     tracks = _joined(tracks, bench)
     tracks = _cut(tracks, bench)
-    return _without_rests(tracks, bench)
+    tracks = _without_rests(tracks, bench)
+    return [
+        track if bench.is_good(track) else replace(track, tries=track.tries + 1)
+        for track in tracks
+    ]
+
+
+def taken_over(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]:
+    """Give pixels of earlier frames to the objects whose scans explain them.
+
+    Two things that one frame shows as one are told apart once another frame shows them apart.
+
+    Args:
+        tracks: all objects, judged.
+        benches: all frames, in order.
+
+    Returns:
+        The objects; those whose pixels changed are judged anew.
+    """
+    found = list(tracks)
+    changed: set[int] = set()
+    for bench in benches:
+        doubtful = [
+            row
+            for row, track in enumerate(found)
+            if track.mask_in(bench.number) is not None and not bench.is_good(track)
+        ]
+        for row in doubtful:
+            for other, taker in enumerate(found):
+                if other == row or taker.posed is None:
+                    continue
+                pair = _taken(found[row], taker, bench)
+                if pair is not None:
+                    found[row], found[other] = pair
+                    changed |= {row, other}
+
+    rows = [row for row in sorted(changed) if found[row].frames]
+    judged = bench_judged([found[row] for row in rows], benches)
+    for row, track in zip(rows, judged, strict=True):
+        found[row] = track
+    return [track for row, track in enumerate(found) if row not in changed or track.frames]
+
+
+def bench_judged(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]:
+    """Judge objects, if there is any frame."""
+    return benches[-1].judge(tracks) if tracks else []
+
+
+def _taken(loser: Track, taker: Track, bench: Bench) -> tuple[Track, Track] | None:
+    """Two objects after one has taken over what its scan explains; None where that is little."""
+    mask = loser.mask_in(bench.number)
+    rendered = bench.render(taker)
+    if mask is None or rendered is None:
+        return None
+    own = mask & rendered.explained(mask.shape)
+    count = int(np.count_nonzero(own))
+    if count < FEWEST or count < LEAST_TAKEN * np.count_nonzero(mask):
+        return None
+    rest = mask & ~rendered.around(mask.shape)
+    before = taker.mask_in(bench.number)
+    own = own if before is None else own | before
+    try:
+        grown = taker.with_mask(bench.number, own, bench.top)
+        if bench.top.is_thing(rest):
+            smaller = loser.with_mask(bench.number, rest, bench.top)
+            return replace(smaller, result=loser.result), replace(grown, result=taker.result)
+        left = loser.without(bench.number, bench.top.up)
+    except ObservationError:
+        return None
+    gone = replace(loser, frames=()) if left is None else replace(left, result=loser.result)
+    return gone, replace(grown, result=taker.result)
 
 
 def _trimmed(tracks: Sequence[Track], bench: Bench) -> list[Track]:
@@ -145,7 +219,7 @@ def _groups(tracks: Sequence[Track], bench: Bench) -> list[tuple[int, ...]]:
         if first is None or second is None or (good[one] and good[other]):
             continue
         linked[one, other] = linked[other, one] = (
-            bench.top.touching(first, second)
+            bench.top.touching(first, second, NEAR_GAP, NEAR_STEP)
             or _shares(tracks[one], second, bench)
             or _shares(tracks[other], first, bench)
         )
@@ -176,11 +250,26 @@ def _shares(track: Track, mask: Mask, bench: Bench) -> bool:
 
 
 def _union(tracks: Sequence[Track], bench: Bench) -> Track:
-    """Some objects as one: the first of them, with the pixels of all in this frame."""
+    """Some objects as one, with the pixels of all of them in every frame.
+
+    Raises:
+        ObservationError: too little is seen of it.
+    """
     first = min(tracks, key=lambda track: track.number if track.number >= 0 else np.inf)
-    masks = [track.mask_in(bench.number) for track in tracks]
-    every = np.any([mask for mask in masks if mask is not None], axis=0)
-    return first.with_mask(bench.number, every, bench.top)
+    seen: dict[int, list[Sighting]] = {}
+    for track in tracks:
+        for number, sighting in zip(track.frames, track.thing.sightings, strict=True):
+            seen.setdefault(number, []).append(sighting)
+
+    frames = sorted(seen)
+    sightings = []
+    for number in frames:
+        one = seen[number][0]
+        if len(seen[number]) > 1:
+            every = np.any([other.mask for other in seen[number]], axis=0)
+            one = first.thing.sighting_of(one.frame, every, one.plane, one.noise)
+        sightings.append(one)
+    return first.seen_as(sightings, frames, bench.top.up)
 
 
 def _cut(tracks: Sequence[Track], bench: Bench) -> list[Track]:
@@ -188,7 +277,7 @@ def _cut(tracks: Sequence[Track], bench: Bench) -> list[Track]:
     tries: dict[int, list[Track]] = {}
     for row, track in enumerate(tracks):
         mask = track.mask_in(bench.number)
-        if mask is None or bench.is_good(track):
+        if mask is None or track.tries >= MOST_TRIES or bench.is_good(track):
             continue
         parts = bench.top.segments(mask, "never")
         if 1 < len(parts) <= MOST_GROUP:
@@ -203,7 +292,7 @@ def _without_rests(tracks: Sequence[Track], bench: Bench) -> list[Track]:
     for row, track in enumerate(tracks):
         mask = track.mask_in(bench.number)
         rendered = bench.render_likeliest(track)
-        if mask is None or rendered is None or bench.is_good(track):
+        if mask is None or rendered is None or track.tries >= MOST_TRIES or bench.is_good(track):
             continue
         around = ndimage.binary_dilation(rendered.around(mask.shape), iterations=2)
         rests = bench.top.segments(mask & ~around)

@@ -4,7 +4,7 @@ look next.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -14,13 +14,21 @@ from threading import RLock
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nextview.checks import one_line
+from nextview.checks import number, one_line
 from nextview.errors import ObservationError
 from nextview.scene.following import Agreement, agreement, assign, contradicted
 from nextview.scene.judging import Judge
+from nextview.scene.next_view import (
+    FEWEST_HIDDEN,
+    Ground,
+    best,
+    candidates,
+    is_sure,
+    values,
+)
 from nextview.scene.objects import SceneObject
-from nextview.scene.parting import Bench, new_track, part
-from nextview.scene.tracks import Track
+from nextview.scene.parting import GOOD_FIT, Bench, new_track, part, taken_over
+from nextview.scene.tracks import Track, render_track
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box, upright_axes
 from nextview.sensing.plausibility import ViewWarning, check_frame
@@ -28,7 +36,9 @@ from nextview.sensing.tabletop import TableTop
 from nextview.session.system import System, load
 
 Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
+ENOUGH_FRAMES = 2  # of an object that is sure, after which it is not judged anew
 CORES = 2  # objects that are judged at the same time
 WRONG_POSE = (
     "this frame does not fit the others and is left out: most objects are not where they were, so"
@@ -71,6 +81,9 @@ class Scene:
         up: direction against gravity in the world, (3,); z by default. None: the normal of the
             support plane, as always for frames without a pose.
         region: upright box in the world; what is outside is left out.
+        distance: of the camera from the middle of the scene in ``target``, metres; by default that
+            of the last frame.
+        reachable: says of a camera-to-world pose, (4, 4), whether the camera can be brought there.
     """
 
     def __init__(
@@ -78,13 +91,18 @@ class Scene:
         models: System | str | Path | Sequence[str | Path] = "ycb",
         up: ArrayLike | None = (0.0, 0.0, 1.0),
         region: Box | None = None,
+        distance: float | None = None,
+        reachable: Callable[[Float], bool] | None = None,
     ) -> None:
+        self.distance = None if distance is None else number(distance, "the distance", above=0)
+        self.reachable = reachable
         self.system = models if isinstance(models, System) else load(models)
         self.up = None if up is None else upright_axes(up)[2]
         self.region = region
         self._judge = Judge(self.system, CORES)
         self._tops: list[TableTop] = []
         self._tracks: list[Track] = []
+        self._target: Float | None = None
         self._touching: set[tuple[int, int]] = set()
         self._next_number = 1
         self._lock = RLock()
@@ -99,6 +117,40 @@ class Scene:
     def frames(self) -> tuple[Frame, ...]:
         """The frames that were taken in."""
         return tuple(top.frame for top in self._tops)
+
+    @property
+    def done(self) -> bool:
+        """Whether more views would tell little, or as many were taken as the system may take."""
+        with self._lock:
+            if len(self._tops) >= self.system.stopping.max_views:
+                return True
+            if not self._tops or not all(is_sure(track) for track in self._tracks):
+                return False
+            if not self._tracks:
+                return True
+            hidden = Ground.of(self._tops, self._tracks).hidden
+            return bool(np.count_nonzero(hidden) < FEWEST_HIDDEN)
+
+    @property
+    def target(self) -> Float | None:
+        """Where to look next so that all objects are sure soonest, camera-to-world, (4, 4).
+
+        The sum of what a view is expected to tell of each object that is not sure, and of the part
+        of the table that no frame has shown, less a little for the way. None before the first
+        frame, where nothing was found, or no view is left.
+        """
+        with self._lock:
+            if not self._tracks:
+                return None
+            if self._target is None:
+                views = candidates(self.system, self._tops, self._tracks, self.distance)
+                if self.reachable is not None:
+                    can = [bool(self.reachable(pose)) for pose in views.poses]
+                    views = replace(views, free=views.free & np.array(can))
+                worth = values(self.system, self._tops, self._tracks, views)
+                row = best(views, worth, self._tops[-1].frame.camera_to_world[:3, 3])
+                self._target = None if row is None else views.poses[row]
+            return self._target
 
     def update(self, frame: Frame) -> Look:
         """Take in what the camera sees.
@@ -152,21 +204,23 @@ class Scene:
                 hidden.append(track)
                 continue
             try:
-                shown.append(track.with_mask(number, own[row], top))
+                shown.append(self._seen_again(track, own[row], top, number))
             except ObservationError:  # too little of it shows to say anything
                 hidden.append(track)
         for mask in new:
             with suppress(ObservationError):
                 shown.append(new_track(mask, bench))
 
-        shown = part(self._judged(shown), bench)
+        shown = part(self._judged_if_new(shown), bench)
         self._tops.append(top)
-        return self._numbered(shown, hidden, lost, top, number)
+        self._target = None
+        benches = [Bench(one, k, self._judged) for k, one in enumerate(self._tops)]
+        every = taken_over([*hidden, *shown], benches)
+        return self._numbered(every, lost, top, number)
 
     def _numbered(
         self,
-        shown: Sequence[Track],
-        hidden: Sequence[Track],
+        tracks: Sequence[Track],
         lost: Sequence[Track],
         top: TableTop,
         number: int,
@@ -175,8 +229,8 @@ class Scene:
         away = {track.result.answer: track for track in lost if track.result is not None}
         appeared = []
         moved = []
-        kept = list(hidden)
-        for track in shown:
+        kept = []
+        for track in tracks:
             if track.number < 0:
                 assert track.result is not None
                 old = away.pop(track.result.answer, None) if track.result.answer else None
@@ -204,6 +258,27 @@ class Scene:
         for (one, first), (other, second) in combinations(here, 2):
             if first is not None and second is not None and top.touching(first, second):
                 self._touching.add((min(one, other), max(one, other)))
+
+    def _seen_again(self, track: Track, mask: Mask, top: TableTop, number: int) -> Track:
+        """An object with its pixels in another frame.
+
+        What is sure by some frames already, and is seen where it should be, is not judged anew.
+
+        Raises:
+            ObservationError: too little is seen of it.
+        """
+        if is_sure(track) and len(track.frames) >= ENOUGH_FRAMES:
+            rendered = render_track(track, top, number, track.posed)
+            if rendered is not None:
+                explained, every = rendered.fit(mask)
+                if explained >= GOOD_FIT * every:
+                    return replace(track, again=(*track.again, (number, mask)))
+        return track.with_mask(number, mask, top)
+
+    def _judged_if_new(self, tracks: Sequence[Track]) -> list[Track]:
+        """The same objects with what each is; those of which that is known stay as they are."""
+        asked = iter(self._judged([track for track in tracks if track.result is None]))
+        return [next(asked) if track.result is None else track for track in tracks]
 
     def _judged(self, tracks: Sequence[Track]) -> list[Track]:
         """The same objects with what each is."""

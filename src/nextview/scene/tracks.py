@@ -41,14 +41,17 @@ class Track:
         thing: the object as the frames show it.
         frames: number of the frame of each of its sightings.
         result: what it is.
-        settled: whether its pixels in the last frame are known to belong together.
+        tries: in how many frames its pixels were parted otherwise in vain.
+        again: frames that show it where it was known to be, with its pixels in each: they were not
+            taken in as sightings.
     """
 
     number: int
     thing: ObservedObject
     frames: tuple[int, ...]
     result: Recognition | None = None
-    settled: bool = False
+    tries: int = 0
+    again: tuple[tuple[int, Mask], ...] = ()
 
     @property
     def posed(self) -> PoseCandidate | None:
@@ -68,12 +71,17 @@ class Track:
         return result.pose_candidates[0]
 
     @property
-    def mask(self) -> Mask:
-        """Its pixels in the frame that showed it last, (H, W) bool."""
-        return self.thing.sightings[-1].mask
+    def pixels(self) -> dict[int, Mask]:
+        """Its pixels in all frames that show it, (H, W) bool, by the number of the frame."""
+        taken = zip(self.frames, self.thing.sightings, strict=True)
+        every = {number: sighting.mask for number, sighting in taken} | dict(self.again)
+        return dict(sorted(every.items()))
 
     def mask_in(self, number: int) -> Mask | None:
         """Its pixels in a frame, (H, W) bool; None where the frame does not show it."""
+        for frame, mask in self.again:
+            if frame == number:
+                return mask
         if number not in self.frames:
             return None
         return self.thing.sightings[self.frames.index(number)].mask
@@ -91,7 +99,19 @@ class Track:
         """
         thing = copy(self.thing)
         thing.take_sightings(sightings, up)
-        return replace(self, thing=thing, frames=tuple(frames), result=None, settled=False)
+        return replace(self, thing=thing, frames=tuple(frames), result=None)
+
+    def without(self, number: int, up: Float) -> Track | None:
+        """The same object without what a frame shows of it; None if no other frame shows it.
+
+        Raises:
+            ObservationError: what is seen of the object has no size.
+        """
+        pairs = zip(self.frames, self.thing.sightings, strict=True)
+        kept = [(frame, one) for frame, one in pairs if frame != number]
+        if not kept:
+            return None
+        return self.seen_as([one for _, one in kept], [frame for frame, _ in kept], up)
 
     def with_mask(self, number: int, mask: Mask, top: TableTop) -> Track:
         """The same object with other pixels in a frame, which it may be new in.
@@ -111,7 +131,9 @@ class Track:
             if frame != number
         ]
         kept.append((number, sighting))
-        return self.seen_as([one for _, one in kept], [frame for frame, _ in kept], top.up)
+        kept.sort(key=lambda pair: pair[0])
+        track = replace(self, again=tuple(pair for pair in self.again if pair[0] != number))
+        return track.seen_as([one for _, one in kept], [frame for frame, _ in kept], top.up)
 
 
 @dataclass(frozen=True, eq=False)

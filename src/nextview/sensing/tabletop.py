@@ -31,8 +31,8 @@ THINNEST = 0.006  # metres across a thing at its thickest, at least: scraps of e
 NEAR_PLANE = 0.015  # metres from the plane within which what is seen is likely to be the plane's
 UNEVEN = 3.0  # deviations of the plane's own pixels above which something stands on it
 MEDIAN_DEVIATION = 1.4826  # of a Gaussian, by the median of what it deviates
-TOUCHING = 4  # pixels between two things in the picture, at most, if they may be one
-TOUCHING_STEP = 0.015  # metres between their depths there, at most
+TOUCHING_GAP = 0.006  # metres between two things that touch, at most
+TOUCHING_STEP = 0.015  # metres between their depths where they are nearest, at most
 BESIDE_POINTS = 200  # pixels at a border that are compared
 
 
@@ -152,13 +152,28 @@ class TableTop:
         filled = ndimage.binary_closing(np.pad(mask[part], 1))
         return bool(ndimage.binary_erosion(filled, np.ones((3, 3), bool), max(half, 1)).any())
 
-    def touching(self, one: Mask, other: Mask) -> bool:
-        """Whether two things, (H, W) bool each, meet in the picture and in depth."""
-        near = within(one, TOUCHING + 1)
+    def touching(
+        self, one: Mask, other: Mask, gap: float = TOUCHING_GAP, step: float = TOUCHING_STEP
+    ) -> bool:
+        """Whether two things meet in the picture and in depth.
+
+        Args:
+            one: the pixels of one of them, (H, W) bool.
+            other: those of the other.
+            gap: metres between them in the picture, at most.
+            step: metres between their depths where they are nearest, at most.
+        """
+        part = within(one)
+        away_from_camera = self.frame.depth[part][one[part]]
+        if not away_from_camera.any():
+            return False
+        focal = float(self.frame.intrinsics[[0, 1], [0, 1]].mean())
+        reach = max(2.0, gap * focal / float(np.median(away_from_camera[away_from_camera > 0])))
+        near = within(one, int(reach) + 1)
         if not other[near].any():
             return False
         away, nearest = ndimage.distance_transform_edt(~one[near], return_indices=True)
-        beside = np.nonzero(other[near] & (away <= TOUCHING))
+        beside = np.nonzero(other[near] & (away <= reach))
         if not len(beside[0]):
             return False
         few = slice(None, None, max(1, len(beside[0]) // BESIDE_POINTS))
@@ -167,8 +182,8 @@ class TableTop:
         own = depth[nearest[0][rows, columns], nearest[1][rows, columns]]
         its = depth[rows, columns]
         known = (own > 0) & (its > 0)
-        step = np.abs(own - its)[known]
-        return bool(len(step)) and float(np.median(step)) < TOUCHING_STEP
+        apart = np.abs(own - its)[known]
+        return bool(len(apart)) and float(np.median(apart)) < step
 
 
 def _unevenness(frame: Frame, height: NDArray[np.float32]) -> float:

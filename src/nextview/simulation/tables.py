@@ -7,7 +7,7 @@ the depth, of the camera's pose, and of the robot's vertical. Everything is in m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,7 +70,11 @@ class SimulatedTable:
 
     @classmethod
     def draw(
-        cls, meshes: Sequence[Mesh], rng: np.random.Generator, gap: float = WIDEST_GAP
+        cls,
+        meshes: Sequence[Mesh],
+        rng: np.random.Generator,
+        gap: float = WIDEST_GAP,
+        resting: Callable[[Mesh], Float] = resting_poses,
     ) -> SimulatedTable:
         """Put meshes on a table, each in one of its resting poses and turned at random.
 
@@ -81,6 +85,7 @@ class SimulatedTable:
             meshes: of known unit.
             rng: draws poses, places and gaps.
             gap: metres between neighbours, at most; down to 0.
+            resting: rotations into the poses that a mesh can rest in, (P, 3, 3).
 
         Raises:
             UsageError: the unit of a mesh is not known, or the things do not fit on the table.
@@ -91,7 +96,7 @@ class SimulatedTable:
             if mesh.unit is None:
                 raise UsageError(f"{mesh.name}: the unit of length is not known")
             metres = (mesh.vertices * mesh.radius + mesh.centre) * UNITS[mesh.unit]
-            poses = resting_poses(mesh)
+            poses = resting(mesh)
             turn = rotation_z(rng.uniform(0, 2 * np.pi)) @ poses[rng.integers(len(poses))]
             turned = metres @ turn.T
             middle = (turned.min(0) + turned.max(0)) / 2
@@ -138,6 +143,8 @@ class TableCamera:
         lean: from the frame of the table into the robot's world, (4, 4) float64.
         shown: how many pixels of the last frame show each thing, (things,) int64.
         owner: thing that each pixel of the last frame shows, -1 for none, (H, W) int64.
+        true_pose: where the camera of the last frame really stood, in the frame of the table,
+            (4, 4) float64.
     """
 
     def __init__(self, table: SimulatedTable, sensor: Sensor, rng: np.random.Generator) -> None:
@@ -188,6 +195,7 @@ class TableCamera:
         true[:3, :3] = true[:3, :3] @ Rotation.from_rotvec(turn, degrees=True).as_matrix()
         true[:3, 3] += rng.normal(0, self.sensor.moved, 3)
 
+        self.true_pose = true
         depth, owner = self._caster.cast(true[:3, 3], self._rays @ true[:3, :3].T)
         seen = np.isfinite(depth)
         if not seen.any():

@@ -1,0 +1,260 @@
+"""Where a view tells most of all objects of a scene that are not sure yet, and of what is hidden.
+
+The information that a view is expected to give is summed over the objects: each is rendered from
+each candidate in its likeliest hypotheses, behind what is known to stand before it, see
+``things.expected_views``. Behind objects there may be others. So the part of the table that no
+frame has shown counts too, by how densely things stand on the part that was seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.geometry.viewsphere import angle_between
+from nextview.recognition.protocol import LooksAhead
+from nextview.scene.tracks import Track
+from nextview.sensing.frame import Frame
+from nextview.sensing.object_frame import ObjectFrame, upright_axes
+from nextview.sensing.tabletop import TableTop
+from nextview.session.system import System
+
+Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+CELL = 0.02  # metres, side of a cell of the table
+MARGIN = 0.08  # metres around the objects within which the table is looked at
+HIDDEN_STEP = 0.015  # metres by which something stands before a cell that it hides
+RAY_STEPS = 48  # places along a ray at which something may stand in its way
+FEWEST_HIDDEN = 12  # cells that nobody saw, below which nothing can hide there
+NEAR_TIE = 0.05  # of the best value: among views of nearly the same value the nearer one is taken
+LOWEST_CAMERA = 0.10  # metres above the plane
+VISITED = np.radians(15.0)  # between two views that show the same
+UNKNOWN_WORTH = 1.0  # nats that a second view of an unknown object is worth, from behind
+ENOUGH_VIEWS = 2  # of an object that fits none of the known things
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """The table seen from above, in cells.
+
+    Attributes:
+        points: middle of each cell on the plane, (C, 3), world, metres.
+        top: how high above the plane anything was seen over each, (C,), metres; 0 for nothing.
+        hidden: cells that no frame has shown, (C,) bool.
+        shape: rows and columns of cells; C is their product.
+        low: of the first cell, along the axes, (2,), metres.
+        axes: upright, rows x, y and z in the world, (3, 3).
+        floor: height of the plane along z, metres.
+    """
+
+    points: Float
+    top: Float
+    hidden: Mask
+    shape: tuple[int, int]
+    low: Float
+    axes: Float
+    floor: float
+
+    @classmethod
+    def of(cls, tops: Sequence[TableTop], tracks: Sequence[Track]) -> Ground:
+        """Lay a grid over all that was seen on the plane.
+
+        Args:
+            tops: what the frames show, at least one.
+            tracks: the objects, at least one.
+        """
+        axes = upright_axes(tops[0].up)
+        corners = np.concatenate(
+            [sighting.hull for track in tracks for sighting in track.thing.sightings]
+        )
+        flat = corners @ axes.T
+        plane = tops[0].plane
+        floor = float(np.median(flat[:, 2] - plane.height(corners)))
+        low = flat[:, :2].min(0) - MARGIN
+        count = np.ceil((flat[:, :2].max(0) + MARGIN - low) / CELL).astype(int) + 1
+        shape = (int(count[0]), int(count[1]))
+        at = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 2)
+        middle = np.column_stack([low + (at + 0.5) * CELL, np.full(len(at), floor)])
+        points = middle @ axes
+
+        top = np.zeros(len(points))
+        shown = np.zeros(len(points), bool)
+        for one in tops:
+            _raise_over(top, one, low, shape, axes)
+            shown |= _shows(one.frame, points)
+        return cls(points, top, ~shown & (top == 0), shape, low, axes, floor)
+
+    def visible(self, camera: Float) -> Mask:
+        """Which cells a camera would see past all that is known, (C,) bool.
+
+        Args:
+            camera: where it stands, (3,), world.
+        """
+        start = self.axes @ camera
+        ends = np.column_stack([(self.points @ self.axes.T)[:, :2], np.full(len(self.points), 0.0)])
+        ends[:, 2] = self.floor
+        # Nothing stands higher than the highest, so only the last part of each ray is looked at.
+        highest = float(self.top.max()) if len(self.top) else 0.0
+        rise = max(start[2] - self.floor, 1e-6)
+        last = min(1.0, (highest + CELL) / rise)
+        shares = np.linspace(0, last, RAY_STEPS, endpoint=False)[1:]
+        along = ends[:, None] + shares[:, None] * (start - ends)[:, None]
+        cell = np.floor((along[..., :2] - self.low) / CELL).astype(np.int64)
+        inside = ((cell >= 0) & (cell < self.shape)).all(-1)
+        index = np.where(inside, cell[..., 0] * self.shape[1] + cell[..., 1], 0)
+        own = index == np.arange(len(ends))[:, None]
+        blocked = inside & ~own & (self.top[index] > along[..., 2] - self.floor)
+        return np.asarray(~blocked.any(1))
+
+
+def _raise_over(
+    top: Float, one: TableTop, low: Float, shape: tuple[int, int], axes: Float
+) -> None:
+    """Note how high what a frame shows above the plane reaches over each cell."""
+    rows, columns = np.nonzero(one.above)
+    few = slice(None, None, max(1, len(rows) // 20_000))
+    points = one.frame.positions(rows[few], columns[few])
+    cell = np.floor((points @ axes[:2].T - low) / CELL).astype(np.int64)
+    inside = ((cell >= 0) & (cell < shape)).all(1)
+    index = cell[inside, 0] * shape[1] + cell[inside, 1]
+    np.maximum.at(top, index, one.height[rows[few], columns[few]][inside].astype(np.float64))
+
+
+def _shows(frame: Frame, points: Float) -> Mask:
+    """Which points, (C, 3), a frame shows, or something beyond them, (C,) bool."""
+    pose = frame.camera_to_world
+    in_camera = (points - pose[:3, 3]) @ pose[:3, :3]
+    ahead = in_camera[:, 2] > 0.01
+    away = np.where(ahead, in_camera[:, 2], 1.0)
+    at = in_camera[:, :2] / away[:, None] * frame.intrinsics[[0, 1], [0, 1]]
+    at = np.clip(at + frame.intrinsics[:2, 2], -1e6, 1e6)
+    column, row = np.floor(at).astype(np.int64).T
+    inside = ahead & (row >= 0) & (row < frame.shape[0])
+    inside &= (column >= 0) & (column < frame.shape[1])
+    depth = np.where(inside, frame.depth[np.where(inside, row, 0), np.where(inside, column, 0)], 0)
+    return np.asarray(inside & (depth > away - HIDDEN_STEP))
+
+
+def is_sure(track: Track) -> bool:
+    """Whether another view would change little of what an object is taken for."""
+    result = track.result
+    if result is None:
+        return False
+    if result.confident:
+        return True
+    return bool(result.unknown and len(track.frames) >= ENOUGH_VIEWS)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Candidate views of a whole scene.
+
+    Attributes:
+        poses: camera-to-world, (V, 4, 4), OpenCV axes, metres.
+        directions: from the middle of the scene to each, (V, 3), upright axes.
+        free: which may be taken, (V,) bool.
+    """
+
+    poses: Float
+    directions: Float
+    free: Mask
+
+
+def candidates(
+    system: System, tops: Sequence[TableTop], tracks: Sequence[Track], distance: float | None
+) -> Candidates:
+    """Views from around a scene, all at one distance from its middle.
+
+    Args:
+        system: with the directions of the candidates.
+        tops: what the frames show.
+        tracks: the objects.
+        distance: of the cameras from the middle, metres; None: that of the last camera.
+    """
+    axes = upright_axes(tops[0].up)
+    hulls = np.concatenate([one.hull for track in tracks for one in track.thing.sightings])
+    middle = (hulls.min(0) + hulls.max(0)) / 2
+    places = np.stack([top.frame.camera_to_world[:3, 3] for top in tops])
+    away = float(np.linalg.norm(places[-1] - middle)) if distance is None else distance
+    poses = ObjectFrame(middle, away / 3, axes).pose_in_world(system.sphere.poses, away)
+
+    directions = (poses[:, :3, 3] - middle) @ axes.T / away
+    free = tops[0].plane.height(poses[:, :3, 3]) > LOWEST_CAMERA
+    for place in places:
+        towards = (place - middle) @ axes.T
+        towards = towards / np.linalg.norm(towards)
+        free &= np.array([angle_between(one, towards) > VISITED for one in directions])
+    return Candidates(poses, directions, free)
+
+
+def values(
+    system: System, tops: Sequence[TableTop], tracks: Sequence[Track], views: Candidates
+) -> Float:
+    """What each candidate view is expected to tell of the whole scene, nats, (V,).
+
+    Args:
+        system: that knows the things.
+        tops: what the frames show, at least one.
+        tracks: the objects, at least one, judged.
+        views: the candidates.
+    """
+    worth = np.zeros(len(views.poses))
+    for track in tracks:
+        if not is_sure(track):
+            worth += _of_object(system, track, views)
+
+    ground = Ground.of(tops, tracks)
+    count = int(np.count_nonzero(ground.hidden))
+    if count >= FEWEST_HIDDEN:
+        each = len(tracks) * np.log(max(len(system.classes), 2)) / max(len(ground.hidden), 1)
+        for row in np.flatnonzero(views.free):
+            seen = ground.visible(views.poses[row, :3, 3]) & ground.hidden
+            worth[row] += each * np.count_nonzero(seen)
+    return worth
+
+
+def _of_object(system: System, track: Track, views: Candidates) -> Float:
+    """What each view is expected to tell of one object, nats, (V,)."""
+    recogniser = system.models.recogniser
+    result = track.result
+    assert result is not None
+    joint = result.views[-1].joint
+    frame = track.thing.object_frame
+    inside = frame.pose_in_object(views.poses)
+    if isinstance(recogniser, LooksAhead) and joint is not None and not result.unknown:
+        seen = [one for one in track.thing.observations if one.seen]
+        outlook = recogniser.outlook(seen, joint)
+        if outlook is not None:
+            inside[:, :3, 3] *= frame.radius
+            return np.asarray(outlook.expect(inside).information("thing"))
+
+    # What nothing explains is looked at from another side.
+    towards = inside[:, :3, 3] / np.linalg.norm(inside[:, :3, 3], axis=1, keepdims=True)
+    turned = np.full(len(towards), np.pi)
+    for one in track.thing.sightings:
+        before = frame.pose_in_object(one.frame.camera_to_world)[:3, 3]
+        before = before / np.linalg.norm(before)
+        turned = np.minimum(turned, np.arccos(np.clip(towards @ before, -1, 1)))
+    return UNKNOWN_WORTH * turned / np.pi
+
+
+def best(views: Candidates, worth: Float, here: Float) -> int | None:
+    """Choose the free view that tells most, the nearer one of two that tell nearly the same.
+
+    Args:
+        views: the candidates.
+        worth: what each tells, (V,), nats.
+        here: where the camera stands, (3,), world, metres.
+
+    Returns:
+        Its row; None without a free view.
+    """
+    if not views.free.any():
+        return None
+    way = np.linalg.norm(views.poses[:, :3, 3] - here, axis=1)
+    value = worth - NEAR_TIE * float(worth[views.free].max()) * way / max(way.max(), 1e-9)
+    return int(np.where(views.free, value, -np.inf).argmax())
