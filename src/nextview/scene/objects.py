@@ -31,6 +31,7 @@ class SceneObject:
             camera's frame.
         size: extents of what was seen of it, (3,), metres: two sides and the height.
         pixels: its pixels in each frame that shows it, (H, W) bool, by the number of the frame.
+        seen_points: corners of the hull of what each frame shows of it, (N, 3), metres.
         touches: numbers of the objects that it touches in the picture and in depth.
         result: all that is known of it.
     """
@@ -42,6 +43,7 @@ class SceneObject:
     place: Float
     size: Float
     pixels: dict[int, NDArray[np.bool_]] = field(repr=False)
+    seen_points: Float = field(repr=False)
     touches: tuple[int, ...]
     result: Recognition = field(repr=False)
 
@@ -57,7 +59,7 @@ class SceneObject:
         assert result is not None
         frame = track.thing.object_frame
         sightings = track.thing.sightings
-        seen = np.concatenate([one.hull for one in sightings]) @ frame.axes.T
+        seen = np.concatenate([one.hull for one in sightings])
         pair = [other for other in touching if track.number in other]
         others = sorted({number for both in pair for number in both} - {track.number})
         return cls(
@@ -66,8 +68,9 @@ class SceneObject:
             confidence=result.confidence,
             confident=result.confident,
             place=frame.centre if result.place is None else result.place,
-            size=np.ptp(seen, axis=0),
+            size=np.ptp(seen @ frame.axes.T, axis=0),
             pixels={number: one.mask for number, one in zip(track.frames, sightings, strict=True)},
+            seen_points=seen,
             touches=tuple(others),
             result=result,
         )

@@ -10,12 +10,13 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from threading import RLock
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nextview.checks import number, one_line
-from nextview.errors import ObservationError
+from nextview.errors import ObservationError, SessionError
 from nextview.scene.following import Agreement, agreement, assign, contradicted
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import (
@@ -34,6 +35,9 @@ from nextview.sensing.object_frame import Box, upright_axes
 from nextview.sensing.plausibility import ViewWarning, check_frame
 from nextview.sensing.tabletop import TableTop
 from nextview.session.system import System, load
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -114,6 +118,11 @@ class Scene:
         return tuple(SceneObject.of(track, self._touching) for track in tracks)
 
     @property
+    def tops(self) -> tuple[TableTop, ...]:
+        """What each frame that was taken in shows on the plane."""
+        return tuple(self._tops)
+
+    @property
     def frames(self) -> tuple[Frame, ...]:
         """The frames that were taken in."""
         return tuple(top.frame for top in self._tops)
@@ -176,6 +185,28 @@ class Scene:
             if contradicted(found):
                 return Look(False, warnings=(ViewWarning("pose", WRONG_POSE),))
             return self._take(top, found)
+
+    def plot(self, path: str | Path | None = None, title: str = "") -> Figure:
+        """Draw the last frame with outlines, names and axes of the poses, and all from above.
+
+        Args:
+            path: file that it is written to, PNG, PDF or SVG; one of that name is replaced.
+            title: of what is shown.
+
+        Raises:
+            SessionError: no frame was taken in yet.
+            UsageError: the file is of another format.
+            ResultsError: the path is a link or a folder, or cannot be written.
+        """
+        from nextview.scene.figure import draw_scene
+        from nextview.session.episode_figure import save_figure
+
+        if not self._tops:
+            raise SessionError("there is nothing to draw before the first frame: update with one")
+        figure = draw_scene(self, title)
+        if path is not None:
+            save_figure(figure, Path(path))
+        return figure
 
     def _refuse(self, frame: Frame) -> None:
         if not isinstance(frame, Frame):

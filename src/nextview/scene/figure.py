@@ -1,0 +1,350 @@
+"""The picture of a scene: the last frame with what was found in it, and the table from above."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch, Polygon
+from matplotlib.patheffects import withStroke
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
+
+from nextview.geometry.ray_caster import RayCaster
+from nextview.scene.objects import UNKNOWN, SceneObject
+from nextview.sensing.frame import Frame, within
+from nextview.sensing.object_frame import upright_axes
+from nextview.session.style import ACCENT, BLUE, FAINT, GREY, INK, PAPER, STYLE, PlainFigure
+
+if TYPE_CHECKING:
+    from nextview.scene.scene import Scene
+
+Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+HEIGHT = 5.2  # inches, of both pictures
+MARGIN = 0.25  # inches
+TOP = 0.75  # inches, for the heading
+COLOURS = (
+    "#0b6e99",
+    "#c4532d",
+    "#4b8b3b",
+    "#7a5195",
+    "#b8860b",
+    "#008b8b",
+    "#a8326b",
+    "#5c6b1f",
+    "#3c5fbf",
+    "#8c4a2f",
+)
+AXIS_COLOURS = ("#d1495b", "#3f9b4f", "#2f6fd0")  # x, y and z, as is usual
+AXIS_LENGTH = 0.7  # of the radius of a thing
+NEAREST_SHADE, FARTHEST_SHADE = 0.25, 0.95  # of grey, where there is no picture
+AROUND = 0.08  # metres around all that is drawn from above
+LINE_SHARE = 0.026  # of the picture's height, of a line of text
+NAME_LINES = 4.0  # lines that a name is wide, about
+CONTEXT = 0.15  # of the picture's height and width around what was found
+CELL = 0.002  # metres, of what is drawn from above
+SHORT_CAMERA = 0.06  # length of the arrow of a camera, of the picture's width
+
+
+def draw_scene(scene: Scene, title: str = "") -> Figure:
+    """Draw the last frame with outlines, names and axes of poses, and the table from above.
+
+    Args:
+        scene: with one frame at least.
+        title: of what is shown.
+    """
+    top = scene.tops[-1]
+    objects = scene.objects
+    number = len(scene.tops) - 1
+    colours = {
+        thing.number: GREY if thing.name == UNKNOWN else COLOURS[k % len(COLOURS)]
+        for k, thing in enumerate(objects)
+    }
+    rc = STYLE | {"axes.grid": False, "figure.facecolor": PAPER, "axes.facecolor": PAPER}
+    with matplotlib.rc_context(rc):
+        rows, columns = _part(top.frame, [thing.pixels.get(number) for thing in objects])
+        aspect = (columns.stop - columns.start) / (rows.stop - rows.start)
+        width = HEIGHT * (aspect + 1) + 3 * MARGIN
+        height = HEIGHT + TOP + MARGIN
+        figure = PlainFigure(figsize=(width, height))
+        _heading(figure, scene, objects, title, width, height)
+
+        high = HEIGHT / height
+        left = figure.add_axes((MARGIN / width, MARGIN / height, HEIGHT * aspect / width, high))
+        _draw_frame(left, top.frame, number, objects, colours, (rows, columns))
+        start = (2 * MARGIN + HEIGHT * aspect) / width
+        right = figure.add_axes((start, MARGIN / height, HEIGHT / width, high))
+        _draw_from_above(right, scene, objects, colours)
+        return figure
+
+
+def _heading(
+    figure: Figure,
+    scene: Scene,
+    objects: Sequence[SceneObject],
+    title: str,
+    width: float,
+    height: float,
+) -> None:
+    """Say how many objects were found, and in how many frames."""
+    named = sum(thing.name != UNKNOWN for thing in objects)
+    frames = len(scene.tops)
+    said = f"{named} known things"
+    if named < len(objects):
+        said += f", {len(objects) - named} unknown"
+    if not objects:
+        said = "nothing on the plane"
+    more = f"{title}: " if title else ""
+    more += f"{frames} frame{'s' * (frames > 1)}; names in italics are not confident"
+    x = MARGIN / width
+    figure.text(x, 1 - 0.16 / height, said, fontsize=15, weight="bold", color=BLUE, va="top")
+    figure.text(x, 1 - 0.5 / height, more, fontsize=9.5, color=GREY, va="top")
+
+
+def _part(frame: Frame, masks: Sequence[Mask | None]) -> tuple[slice, slice]:
+    """Rows and columns that hold all that was found, and some of what is around it."""
+    shown = [mask for mask in masks if mask is not None]
+    if not shown:
+        return slice(0, frame.shape[0]), slice(0, frame.shape[1])
+    margin = int(CONTEXT * max(frame.shape))
+    return within(np.any(shown, axis=0), margin)
+
+
+def _draw_frame(
+    axes: Axes,
+    frame: Frame,
+    number: int,
+    objects: Sequence[SceneObject],
+    colours: dict[int, str],
+    part: tuple[slice, slice],
+) -> None:
+    """The frame with outlines, names, and axes of the poses."""
+    axes.imshow(_picture(frame), cmap="gray", vmin=0, vmax=1, interpolation="bilinear")
+    axes.set_xlim(part[1].start - 0.5, part[1].stop - 0.5)
+    axes.set_ylim(part[0].stop - 0.5, part[0].start - 0.5)
+    axes.axis("off")
+    for thing in objects:
+        mask = thing.pixels.get(number)
+        if mask is None:
+            continue
+        colour = colours[thing.number]
+        shape = ndimage.gaussian_filter(ndimage.binary_closing(mask).astype(float), 1.0)
+        style = ":" if thing.name == UNKNOWN else "-"
+        axes.contour(shape, [0.5], colors=[colour], linewidths=1.8, linestyles=style)
+        tint = np.zeros((*mask.shape, 4))
+        tint[mask] = (*matplotlib.colors.to_rgb(colour), 0.22)
+        axes.imshow(tint, interpolation="nearest")
+    for thing in objects:
+        if thing.pose is not None and number in thing.pixels:
+            _draw_axes(axes, frame, thing)
+    taken: list[tuple[float, float]] = []
+    line = LINE_SHARE * (part[0].stop - part[0].start)
+    for thing in objects:
+        mask = thing.pixels.get(number)
+        if mask is None:
+            continue
+        rows, columns = np.nonzero(mask)
+        x = float(columns.mean())
+        y = float(rows.min()) - 4
+        while any(abs(y - b) < line and abs(x - a) < NAME_LINES * line for a, b in taken):
+            y -= line
+        taken.append((x, y))
+        _name(axes, thing, x, y, colours, "bottom")
+
+
+def _picture(frame: Frame) -> NDArray[np.floating]:
+    """A grey picture of what a frame shows, (H, W), 0 to 1."""
+    if frame.image is not None:
+        # pale, so that outlines and names can be read on it
+        return 0.25 + 0.75 * frame.image / 255
+    seen = frame.depth > 0
+    nearest = ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
+    depth = ndimage.median_filter(frame.depth[tuple(nearest)], 5)
+    inverse = 1 / depth
+    low, high = np.quantile(inverse, [0.02, 0.98])
+    share = np.clip((inverse - low) / max(high - low, 1e-9), 0, 1)
+    grey = FARTHEST_SHADE - 0.35 * share
+    # slopes as a lamp at the upper left shows them
+    smooth = ndimage.gaussian_filter(depth, 1.5)
+    down, right = np.gradient(smooth)
+    pitch = smooth / frame.intrinsics[0, 0]
+    lit = np.clip((down + 0.6 * right) / pitch, -3, 3) / 3
+    return np.asarray(np.clip(grey - 0.16 * lit, NEAREST_SHADE, 1))
+
+
+def _draw_axes(axes: Axes, frame: Frame, thing: SceneObject) -> None:
+    """x, y and z of a scan's frame at its centre: red, green, blue."""
+    pose = thing.pose
+    assert pose is not None
+    radius = thing.result.radius or 0.05
+    ends = np.stack([thing.place, *(thing.place + AXIS_LENGTH * radius * pose[:3, :3].T)])
+    camera = frame.camera_to_world
+    in_camera = (ends - camera[:3, 3]) @ camera[:3, :3]
+    if (in_camera[:, 2] < 0.01).any():
+        return
+    at = in_camera[:, :2] / in_camera[:, 2:] * frame.intrinsics[[0, 1], [0, 1]]
+    at = at + frame.intrinsics[:2, 2] - 0.5
+    for end, colour in zip(at[1:], AXIS_COLOURS, strict=True):
+        line = axes.plot(*np.stack([at[0], end]).T, color=colour, lw=1.8, solid_capstyle="round")
+        line[0].set_path_effects([withStroke(linewidth=3.0, foreground="white")])
+
+
+def _name(
+    axes: Axes, thing: SceneObject, x: float, y: float, colours: dict[int, str], side: str
+) -> None:
+    """Write the name of an object, in italics where it is not confident."""
+    options: dict[str, Any] = {"ha": "center", "va": side, "clip_on": True}
+    sure = thing.confident or thing.name == UNKNOWN
+    axes.text(
+        x,
+        y,
+        thing.name.replace("_", " "),
+        fontsize=8.5,
+        color=INK if thing.name == UNKNOWN else colours[thing.number],
+        style="normal" if sure else "italic",
+        weight="bold" if sure and thing.name != UNKNOWN else "normal",
+        path_effects=[withStroke(linewidth=2.6, foreground="white")],
+        zorder=20,
+        **options,
+    )
+
+
+def _draw_from_above(
+    axes: Axes, scene: Scene, objects: Sequence[SceneObject], colours: dict[int, str]
+) -> None:
+    """Where everything is, seen from above, and where the cameras stood; metres.
+
+    The last camera looks upwards, so that left and right are those of the frame beside it.
+    """
+    cameras = np.stack([top.frame.camera_to_world for top in scene.tops])
+    up = scene.tops[0].up
+    ahead = cameras[-1, :3, 2]
+    behind = -ahead if abs(ahead @ up) < 0.99 else cameras[-1, :3, 1]
+    front = upright_axes(up, behind)
+    upright = np.stack([front[1], -front[0], front[2]])
+
+    outlines = [_from_above(thing, upright) for thing in objects]
+    ends = [corners for corners, _ in outlines]
+    everything = np.concatenate([*ends, np.zeros((0, 2))])
+    if not len(everything):
+        everything = (cameras[:, :3, 3] + cameras[:, :3, 2]) @ upright[:2].T
+    low = everything.min(0) - AROUND
+    high = everything.max(0) + AROUND
+    side = float((high - low).max())
+    low, high = (low + high) / 2 - side / 2, (low + high) / 2 + side / 2
+
+    for thing, (corners, picture) in zip(objects, outlines, strict=True):
+        _draw_outline(axes, corners, picture, colours[thing.number], thing.name != UNKNOWN)
+    for thing, (corners, _) in zip(objects, outlines, strict=True):
+        middle = (corners.min(0) + corners.max(0)) / 2
+        _name(axes, thing, float(middle[0]), float(middle[1]), colours, "center")
+    for pose in cameras:
+        _draw_camera(axes, upright @ pose[:3, 3], upright @ pose[:3, 2], low, high, INK)
+    target = scene.target
+    if target is not None and not scene.done:
+        _draw_camera(axes, upright @ target[:3, 3], upright @ target[:3, 2], low, high, ACCENT)
+
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(True)
+        spine.set_color(FAINT)
+    _scale_bar(axes, low, side)
+
+
+def _from_above(thing: SceneObject, upright: Float) -> tuple[Float, Mask | None]:
+    """Corners of an object seen from above, (K, 2), metres; and, of a scan, the cells that it
+    covers.
+
+    The cells begin at the lowest corner less two cells; the first index is along x.
+    """
+    posed = thing.candidates[0] if thing.pose is not None else None
+    if posed is None or posed.vertices is None or posed.faces is None:
+        flat = thing.seen_points @ upright[:2].T
+        try:
+            return flat[ConvexHull(flat).vertices], None
+        except QhullError:  # all in a line
+            return flat, None
+    placed = posed.vertices @ posed.pose[:3, :3].T + posed.pose[:3, 3]
+    corners = placed @ upright.T
+    low = corners[:, :2].min(0) - 2 * CELL
+    count = np.ceil((corners[:, :2].max(0) + 2 * CELL - low) / CELL).astype(int) + 1
+    at = np.stack(np.meshgrid(*(np.arange(n) for n in count), indexing="ij"), -1).reshape(-1, 2)
+    start = np.column_stack([low + at * CELL, np.full(len(at), corners[:, 2].max() + 1.0)])
+    caster = RayCaster([(corners, posed.faces)])
+    away, _ = caster.cast(start, np.broadcast_to([0.0, 0.0, -1.0], start.shape))
+    return corners[:, :2], np.isfinite(away).reshape(count)
+
+
+def _draw_outline(
+    axes: Axes, corners: Float, picture: Mask | None, colour: str, known: bool
+) -> None:
+    """Draw an object as it is seen from above."""
+    style = "-" if known else ":"
+    if picture is None:
+        face = (*matplotlib.colors.to_rgb(colour), 0.25)
+        patch = Polygon(
+            corners, closed=True, facecolor=face, edgecolor=colour, linewidth=1.6, linestyle=style
+        )
+        axes.add_patch(patch)
+        return
+    low = corners.min(0) - 2 * CELL
+    x, y = (low[k] + CELL * np.arange(picture.shape[k]) for k in (0, 1))
+    shape = ndimage.gaussian_filter(picture.astype(float), 0.8).T
+    axes.contourf(x, y, shape, [0.5, 2.0], colors=[colour], alpha=0.25)
+    axes.contour(x, y, shape, [0.5], colors=[colour], linewidths=1.6, linestyles=style)
+
+
+def _draw_camera(
+    axes: Axes, place: Float, ahead: Float, low: Float, high: Float, colour: str
+) -> None:
+    """An arrow where a camera stood, at the border if it is outside."""
+    inset = 0.04 * (high - low)
+    at = np.clip(place[:2], low + inset, high - inset)
+    level = np.linalg.norm(ahead[:2])
+    way = ahead[:2] / level if level > 0.05 else np.array([0.0, -1.0])
+    size = float((high - low).max())
+    end = at + SHORT_CAMERA * size * way
+    arrow = FancyArrowPatch(
+        (at[0], at[1]),
+        (end[0], end[1]),
+        arrowstyle="-|>",
+        mutation_scale=13,
+        color=colour,
+        linewidth=1.6,
+        zorder=15,
+    )
+    axes.add_patch(arrow)
+    if colour == ACCENT:
+        away = at - 0.03 * size * way
+        axes.text(
+            *away,
+            "next",
+            fontsize=8,
+            color=ACCENT,
+            ha="center",
+            va="center",
+            zorder=16,
+            path_effects=[withStroke(linewidth=2.4, foreground="white")],
+        )
+
+
+def _scale_bar(axes: Axes, low: Float, side: float) -> None:
+    """Ten centimetres, or one where little is shown, or a metre where much is."""
+    length = next((step for step in (0.01, 0.1, 1.0) if step > 0.08 * side), 1.0)
+    words = {0.01: "1 cm", 0.1: "10 cm", 1.0: "1 m"}[length]
+    start = low + 0.04 * side
+    axes.plot([start[0], start[0] + length], [start[1], start[1]], color=INK, lw=1.6)
+    axes.text(
+        start[0] + length / 2, start[1] + 0.012 * side, words, fontsize=8, color=INK, ha="center"
+    )
