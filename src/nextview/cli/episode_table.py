@@ -176,17 +176,17 @@ def episode_as_json(
 
     parts = ("answer", "confidence", "beliefs", "most_like", "unknown", "novelty", "radius")
     whole = {"name": name} | {part: getattr(result, part) for part in parts}
-    whole |= _pose_as_json(result)
+    whole |= pose_as_json(result)
     whole |= {
         "unit": None if result.radius is None else "m",
         "threshold_reached": result.confident,
         "views": views,
     }
     whole["warnings"] = sorted(warning.name for warning in result.warnings)
-    return json.dumps(_plain(whole), indent=indent)
+    return json.dumps(plain(whole), indent=indent)
 
 
-def _pose_as_json(result: Recognition) -> dict[str, Any]:
+def pose_as_json(result: Recognition) -> dict[str, Any]:
     """Where the object is: what ``Recognition`` says of it, by the same names."""
     off = result.pose_uncertainty
     candidates = [
@@ -220,12 +220,12 @@ def _pose_as_json(result: Recognition) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """As JSON has it: six digits, and null for what is no number."""
     if isinstance(value, Mapping):
-        return {key: _plain(each) for key, each in value.items()}
+        return {key: plain(each) for key, each in value.items()}
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
+        return [plain(each) for each in value]
     return (round(value, 6) if np.isfinite(value) else None) if isinstance(value, float) else value

@@ -334,7 +334,7 @@ def _draw_camera(
             color=ACCENT,
             ha="center",
             va="center",
-            zorder=16,
+            zorder=25,
             path_effects=[withStroke(linewidth=2.4, foreground="white")],
         )
 

@@ -1,0 +1,248 @@
+"""``nextview look``: which of the known things are where in captured frames of a table."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich import box
+from rich.table import Table
+
+from nextview.captured.camera import UP
+from nextview.captured.check import check_capture
+from nextview.captured.folders import Capture, read_capture
+from nextview.cli.common_options import Three, check_file
+from nextview.cli.episode_table import plain, pose_as_json
+from nextview.cli.progress import Terminal, console, track
+from nextview.errors import ObservationError, UsageError
+from nextview.files import new_file
+from nextview.recognition.poses import place_in_words
+from nextview.scene.objects import UNKNOWN, SceneObject
+from nextview.scene.scene import Look, Scene
+from nextview.sensing.object_frame import Box, upright_axes
+from nextview.session.system import load
+
+MOST_CANDIDATES = 3  # other things that are shown beside a name
+LEAST_BELIEF = 0.01  # of what is shown
+
+
+@dataclass(frozen=True)
+class LookOptions:
+    """What is looked for, and where.
+
+    Attributes:
+        models: bundled memory by name, or folders of your own; several together if there are
+            several.
+        intrinsics: FX FY CX CY, pixels, or a file with them, if not those of the folder.
+        up: the axis of the world that points up, or a direction; by default as the layout says, or
+            the normal of the support plane.
+        region: upright box outside of which nothing is looked for: its low and its high corner,
+            metres (heights along --up).
+        frames: how many frames are looked at, evenly spread over the folder.
+        unknown: share of known things that may be called unknown (0.02); 0 always names a thing.
+    """
+
+    models: tuple[str, ...] = ("ycb",)
+    intrinsics: tuple[float, float, float, float] | Path | None = None
+    up: str | Three | None = None
+    region: tuple[float, float, float, float, float, float] | None = None
+    frames: int = 6
+    unknown: float | None = None
+
+
+@dataclass(frozen=True)
+class LookOutput:
+    """What is made of it.
+
+    Attributes:
+        figure: write a picture of the last frame and of the table from above to this file (PNG,
+            PDF or SVG).
+        json: print JSON instead of a table.
+        overwrite: replace the picture if it exists.
+    """
+
+    figure: Path | None = None
+    json: bool = False
+    overwrite: bool = False
+
+
+def look(
+    path: Path,
+    /,
+    looking: LookOptions = LookOptions(),
+    output: LookOutput = LookOutput(),
+) -> None:
+    """Say which of the known things are where: all that stands on a table, in captured frames.
+
+    Frames that do not fit the others are left out. Objects that are none of the known things are
+    listed as unknown, with their size and place.
+
+    Args:
+        path: folder of captured depth images with poses, in the layout of BOP, TUM RGB-D or
+            7-Scenes.
+    """
+    check_file(output.figure, output.overwrite)
+    if looking.frames < 1:
+        raise UsageError(f"at least one frame is looked at, not {looking.frames}")
+    capture, left_out = check_capture(read_capture(path, looking.intrinsics), masked=False)
+    console.print(f"{capture!r}")
+    system = load(list(looking.models), unknown=looking.unknown)
+    scene = Scene(system, *_where(capture, looking))
+
+    looks: dict[str, Look] = {}
+    few = np.unique(np.linspace(0, len(capture.frames) - 1, looking.frames).round().astype(int))
+
+    def each() -> Any:
+        for done, row in enumerate(few, 1):
+            captured = capture.frames[row]
+            try:
+                looks[captured.name] = scene.update(captured.read(masked=False))
+            except ObservationError as error:
+                left_out[captured.name] = str(error)
+            yield done
+
+    track(each(), len(few), "frames")
+    if not scene.frames:
+        raise ObservationError(f"{path}: no frame can be used: {next(iter(left_out.values()))}")
+
+    if output.json:
+        print(json.dumps(plain(scene_as_json(scene, looks, left_out)), indent=1))
+    else:
+        print_scene(scene, path.name)
+    for name, one in looks.items():
+        for warning in one.warnings:
+            console.print(f"{name}: warning ({warning.name}): {warning.message}", soft_wrap=True)
+    for name, reason in left_out.items():
+        console.print(f"left out: {name}: {reason}", style="yellow", soft_wrap=True)
+    if output.figure is not None:
+        with new_file(output.figure, output.overwrite) as part:
+            scene.plot(part, path.name)
+
+
+def _where(
+    capture: Capture, looking: LookOptions
+) -> tuple[NDArray[np.float64] | None, Box | None]:
+    """The direction up, (3,), and the region in which is looked."""
+    given = looking.up if looking.up is not None else capture.up
+    if isinstance(given, str):
+        if given not in UP:
+            raise UsageError(f"up is {', '.join(UP)} or a direction, three numbers, not {given!r}")
+        given = UP[given]
+    up = None if given is None else np.array(given, np.float64)
+    if looking.region is None:
+        return up, None
+    if up is None:
+        raise UsageError(
+            f"{capture.folder}: a region is upright, and in this layout nothing tells where up is:"
+            " give --up"
+        )
+    low, high = np.array(looking.region[:3]), np.array(looking.region[3:])
+    return up, Box(low, high, upright_axes(up))
+
+
+def print_scene(scene: Scene, name: str) -> None:
+    """Print a row for each object.
+
+    Args:
+        scene: with one frame at least.
+        name: of what was looked at.
+    """
+    objects = scene.objects
+    console = Terminal()
+    if not objects:
+        console.print(f"{name}: nothing stands on the plane.")
+        return
+    table = Table(box=box.SIMPLE, pad_edge=False, padding=(0, 1, 0, 0))
+    frames = len(scene.frames)
+    table.title = f"On the table in {name}, {frames} frame{'s' * (frames > 1)}"
+    for column in ("", "name", "belief", "place, m", "± mm, °", "frames", "touches"):
+        table.add_column(column, justify="right" if column in ("", "frames") else "left")
+    for thing in objects:
+        table.add_row(*_row(thing))
+    console.print(table)
+
+    unsure = [thing for thing in objects if not thing.confident and thing.name != UNKNOWN]
+    for thing in unsure:
+        beliefs = sorted(thing.result.beliefs.items(), key=lambda pair: -pair[1])
+        rest = [f"{one} {belief:.2f}" for one, belief in beliefs[:MOST_CANDIDATES]]
+        console.print(f"{thing.number} is not sure: {', '.join(rest)}")
+
+
+def _row(thing: SceneObject) -> list[str]:
+    """What is printed of an object."""
+    off = thing.pose_uncertainty
+    name = thing.name
+    belief = f"{thing.confidence:.3f}"
+    if thing.name == UNKNOWN:
+        sides = " x ".join(f"{100 * side:.0f}" for side in thing.size)
+        name = f"{UNKNOWN} ({sides} cm)"
+        belief = ""
+    elif not thing.confident:
+        name = f"{name} ?"
+    return [
+        str(thing.number),
+        name,
+        belief,
+        place_in_words(thing.place).removesuffix(" m"),
+        "" if off is None else f"{off.millimetres:.1f}, {off.degrees:.1f}",
+        str(len(thing.pixels)),
+        ", ".join(str(number) for number in thing.touches),
+    ]
+
+
+def scene_as_json(
+    scene: Scene, looks: dict[str, Look], left_out: dict[str, str]
+) -> dict[str, Any]:
+    """All that was found, for JSON.
+
+    Args:
+        scene: what was found.
+        looks: what each frame changed, by its name.
+        left_out: why frames were not read, by their names.
+    """
+    names = [name for name, one in looks.items() if one.taken]
+    objects = []
+    for thing in scene.objects:
+        likely = {
+            name: belief for name, belief in thing.result.beliefs.items() if belief >= LEAST_BELIEF
+        }
+        one: dict[str, Any] = {
+            "number": thing.number,
+            "name": thing.name,
+            "confidence": thing.confidence,
+            "confident": thing.confident,
+            "most_like": thing.result.most_like,
+            "novelty": thing.result.novelty,
+            "beliefs": likely,
+            "place": thing.place,
+            "size": thing.size,
+            "touches": thing.touches,
+            "warnings": sorted({warning.name for warning in thing.warnings}),
+        }
+        one |= pose_as_json(thing.result)
+        one["frames"] = {
+            names[number]: {"pixels": int(mask.sum()), "box": _box_of(mask)}
+            for number, mask in thing.pixels.items()
+        }
+        objects.append(one)
+    frames = [
+        {
+            "name": name,
+            "taken": one.taken,
+            "appeared": one.appeared,
+            "moved": one.moved,
+            "gone": one.gone,
+            "warnings": [warning.message for warning in one.warnings],
+        }
+        for name, one in looks.items()
+    ]
+    return {"unit": "m", "objects": objects, "frames": frames, "left_out": left_out}
+
+
+def _box_of(mask: NDArray[np.bool_]) -> list[int]:
+    """Left, top, width and height of what a mask holds, pixels, as BOP has it."""
+    rows, columns = np.nonzero(mask)
+    left, top = int(columns.min()), int(rows.min())
+    return [left, top, int(columns.max()) - left + 1, int(rows.max()) - top + 1]
