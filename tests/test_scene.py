@@ -1,16 +1,20 @@
 """All things on a table: found, named and placed in one frame or several, and what goes wrong."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from scipy.spatial import cKDTree
 
 import nextview
+from nextview.cli.main import main
 from nextview.errors import ObservationError
 from nextview.geometry.mesh import make_mesh
 from nextview.sensing.frame import Frame
+from nextview.sensing.object_frame import Box
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
 from nextview.things.memory import open_memory
@@ -179,3 +183,103 @@ def test_a_frame_with_a_wrong_pose_is_left_out(system, meshes, wrong):
 
     assert scene.update(frame).taken
     assert set(by_name(scene)) == set(NAMES)
+
+
+def test_where_to_look_next_shows_what_was_hidden(system, meshes):
+    camera = camera_over(list(meshes.values()), seed=3)
+    scene = nextview.Scene(system)
+    scene.update(camera.frame(view(20)))
+    hidden = set(NAMES) - set(by_name(scene))
+    assert hidden == {"mug"}
+    assert not scene.done
+
+    scene.update(camera.frame(scene.target))
+    assert set(by_name(scene)) == set(NAMES)
+
+
+def test_no_view_is_asked_for_that_the_camera_cannot_be_brought_to(system, meshes):
+    camera = camera_over([meshes["mug"], meshes["banana"]])
+    scene = nextview.Scene(system, reachable=lambda pose: pose[0, 3] > 0.1)
+    assert scene.target is None
+    scene.update(camera.frame(view(20)))
+    assert scene.target[0, 3] > 0.1
+    assert scene.target[2, 3] > 0.1
+    nowhere = nextview.Scene(system, reachable=lambda pose: False)
+    nowhere.update(camera.frame(view(20)))
+    assert nowhere.target is None
+
+
+def test_only_the_region_is_looked_at(system, meshes):
+    camera = camera_over([meshes["cracker_box"], meshes["mug"]])
+    middle = camera.table.things[1].placed.mean(0)
+    region = Box(middle - 0.1, middle + 0.1)
+    scene = nextview.Scene(system, region=region)
+    scene.update(camera.frame(view(20)))
+    assert set(by_name(scene)) == {"mug"}
+
+
+def test_a_table_full_of_unknown_things(system):
+    rings = []
+    for number, (radius, tube) in enumerate([(0.06, 0.022), (0.05, 0.015), (0.045, 0.02)]):
+        ring = trimesh.creation.torus(radius, tube)
+        rings.append(make_mesh(ring.vertices, ring.faces, f"ring {number}", "m"))
+    camera = camera_over(rings, gap=0.1)
+    scene = nextview.Scene(system)
+    for degrees in (20, 110):
+        scene.update(camera.frame(view(degrees)))
+    assert [thing.name for thing in scene.objects] == ["unknown"] * 3
+    assert scene.target is not None
+
+
+def test_a_hand_over_the_table_changes_no_name(system, meshes):
+    camera = camera_over([meshes["cracker_box"], meshes["banana"]])
+    scene = nextview.Scene(system)
+    frame = camera.frame(view(20))
+    rows, columns = np.nonzero(camera.owner == 1)  # the banana
+    depth = frame.depth.copy()
+    side = slice(int(columns.max()) + 40, int(columns.max()) + 120)
+    below = slice(int(rows.mean()), depth.shape[0])
+    depth[below, side] = 0.35  # an arm that comes in from below, before everything
+    scene.update(Frame(depth, frame.intrinsics, frame.pose, pixel_centre=0.5))
+    found = by_name(scene)
+    assert {"cracker_box", "banana"} <= set(found)
+    arm = np.zeros(depth.shape, bool)
+    arm[below, side] = True
+    for name in ("cracker_box", "banana"):
+        assert not (found[name].pixels[0] & arm).any()
+
+
+def captured(camera: TableCamera, degrees, folder) -> None:
+    """Frames of a table as a folder in the layout of 7-Scenes."""
+    folder.mkdir()
+    np.savetxt(folder / "camera-intrinsics.txt", camera.sensor.intrinsics - 0.5 * _CENTRE)
+    for number, angle in enumerate(degrees):
+        frame = camera.frame(view(angle))
+        name = folder / f"frame-{number:06d}"
+        millimetres = np.rint(1000 * frame.depth).astype(np.uint16)
+        Image.fromarray(millimetres).save(f"{name}.depth.png")
+        np.savetxt(f"{name}.pose.txt", frame.pose)
+
+
+_CENTRE = np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0.0]])  # OpenCV counts from the first pixel's
+
+
+def test_the_command_says_what_is_on_the_table(meshes, tmp_path, capsys):
+    camera = camera_over([meshes["cracker_box"], meshes["mug"]])
+    captured(camera, (20, 60), tmp_path / "table")
+    figure = tmp_path / "table.png"
+    main(["look", str(tmp_path / "table"), "--up", "z", "--json", "--figure", str(figure)])
+    said = json.loads(capsys.readouterr().out)
+    assert {thing["name"] for thing in said["objects"]} == {"cracker_box", "mug"}
+    assert [frame["taken"] for frame in said["frames"]] == [True, True]
+    for thing in said["objects"]:
+        true = camera.truth[thing["name"]]
+        assert np.linalg.norm(np.array(thing["pose"])[:3, 3] - true[:3, 3]) < 0.01
+        assert set(thing["frames"]) == {frame["name"] for frame in said["frames"]}
+    with Image.open(figure) as picture:
+        assert picture.width > 1000
+
+    with pytest.raises(SystemExit) as end:
+        main(["look", str(tmp_path / "table"), "--frames", "0"])
+    assert end.value.code == 2
+    assert "at least one frame" in capsys.readouterr().err

@@ -121,9 +121,7 @@ def look(
             scene.plot(part, path.name)
 
 
-def _where(
-    capture: Capture, looking: LookOptions
-) -> tuple[NDArray[np.float64] | None, Box | None]:
+def _where(capture: Capture, looking: LookOptions) -> tuple[NDArray[np.float64] | None, Box | None]:
     """The direction up, (3,), and the region in which is looked."""
     given = looking.up if looking.up is not None else capture.up
     if isinstance(given, str):
@@ -192,9 +190,7 @@ def _row(thing: SceneObject) -> list[str]:
     ]
 
 
-def scene_as_json(
-    scene: Scene, looks: dict[str, Look], left_out: dict[str, str]
-) -> dict[str, Any]:
+def scene_as_json(scene: Scene, looks: dict[str, Look], left_out: dict[str, str]) -> dict[str, Any]:
     """All that was found, for JSON.
 
     Args:

@@ -111,9 +111,7 @@ class Ground:
         return np.asarray(~blocked.any(1))
 
 
-def _raise_over(
-    top: Float, one: TableTop, low: Float, shape: tuple[int, int], axes: Float
-) -> None:
+def _raise_over(top: Float, one: TableTop, low: Float, shape: tuple[int, int], axes: Float) -> None:
     """Note how high what a frame shows above the plane reaches over each cell."""
     rows, columns = np.nonzero(one.above)
     few = slice(None, None, max(1, len(rows) // 20_000))

@@ -26,6 +26,9 @@ Mask = NDArray[np.bool_]
 
 GOOD_FIT = 0.85  # share of an object's pixels that its scan explains, from which none is in doubt
 LEAST_GAIN = 0.03  # by which another parting explains more of the pixels, at least
+# the same where an unknown object is cut: any surface has small parts that some thing explains
+LEAST_OF_UNKNOWN = 0.3
+KNOWN_SHARE = 0.5  # share of an object's pixels that are explained, from which it is a known one
 MOST_TRIMMED = 0.25  # share of an object's pixels that may be the plane's
 LEAST_TRIMMED = 0.02
 SHARED = 0.5  # share of a segment that another object's scan explains, from which they may be one
@@ -92,8 +95,7 @@ def part(tracks: Sequence[Track], bench: Bench) -> list[Track]:
     tracks = _cut(tracks, bench)
     tracks = _without_rests(tracks, bench)
     return [
-        track if bench.is_good(track) else replace(track, tries=track.tries + 1)
-        for track in tracks
+        track if bench.is_good(track) else replace(track, tries=track.tries + 1) for track in tracks
     ]
 
 
@@ -329,7 +331,9 @@ def _better(tracks: Sequence[Track], tries: dict[int, list[Track]], bench: Bench
             found.append(track)
             continue
         parts = [next(judged) for _ in tries[row]]
-        if bench.share(parts) >= bench.share([track]) + LEAST_GAIN:
+        before = bench.share([track])
+        wanted = LEAST_GAIN if before >= KNOWN_SHARE else LEAST_OF_UNKNOWN
+        if bench.share(parts) >= before + wanted:
             found.extend(parts)
         else:
             found.append(track)
