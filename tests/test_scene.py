@@ -91,6 +91,19 @@ def test_objects_keep_their_numbers_from_frame_to_frame(system, meshes):
             assert set(by_name(scene)[thing.name].pixels) == {0, 1}
 
 
+def test_a_sure_object_keeps_its_pixels_in_every_frame(system, meshes):
+    camera = camera_over([meshes["cracker_box"], meshes["banana"]])
+    scene = nextview.Scene(system)
+    for degrees in (20, 60, 100, 140):
+        scene.update(camera.frame(view(degrees)))
+    for thing in scene.objects:
+        assert list(thing.pixels) == [0, 1, 2, 3]
+    number = [thing.name for thing in camera.table.things].index("cracker_box")
+    true = camera.owner == number
+    mask = by_name(scene)["cracker_box"].pixels[3]
+    assert (mask & true).sum() > 0.75 * (mask | true).sum()
+
+
 def test_an_empty_table_is_said_to_be_empty(system):
     camera = camera_over([])
     scene = nextview.Scene(system)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from nextview.geometry.viewsphere import angle_between
 from nextview.recognition.protocol import LooksAhead
@@ -87,6 +88,12 @@ class Ground:
             _raise_over(top, one, low, shape, axes)
             shown |= _shows(one.frame, points)
         return cls(points, top, ~shown & (top == 0), shape, low, axes, floor)
+
+    @property
+    def largest_hidden(self) -> int:
+        """Cells of the largest connected part of the table that no frame has shown."""
+        label, count = ndimage.label(self.hidden.reshape(self.shape))
+        return int(np.bincount(label.ravel())[1:].max()) if count else 0
 
     def visible(self, camera: Float) -> Mask:
         """Which cells a camera would see past all that is known, (C,) bool.
@@ -206,8 +213,7 @@ def values(
             worth += _of_object(system, track, views)
 
     ground = Ground.of(tops, tracks)
-    count = int(np.count_nonzero(ground.hidden))
-    if count >= FEWEST_HIDDEN:
+    if ground.largest_hidden >= FEWEST_HIDDEN:
         each = len(tracks) * np.log(max(len(system.classes), 2)) / max(len(ground.hidden), 1)
         for row in np.flatnonzero(views.free):
             seen = ground.visible(views.poses[row, :3, 3]) & ground.hidden

@@ -69,7 +69,7 @@ class SceneObject:
             confident=result.confident,
             place=frame.centre if result.place is None else result.place,
             size=np.ptp(seen @ frame.axes.T, axis=0),
-            pixels={number: one.mask for number, one in zip(track.frames, sightings, strict=True)},
+            pixels=track.pixels,
             seen_points=seen,
             touches=tuple(others),
             result=result,

@@ -137,8 +137,7 @@ class Scene:
                 return False
             if not self._tracks:
                 return True
-            hidden = Ground.of(self._tops, self._tracks).hidden
-            return bool(np.count_nonzero(hidden) < FEWEST_HIDDEN)
+            return Ground.of(self._tops, self._tracks).largest_hidden < FEWEST_HIDDEN
 
     @property
     def target(self) -> Float | None:
