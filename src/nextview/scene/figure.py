@@ -328,7 +328,8 @@ def _draw_camera(
     if colour == ACCENT:
         away = at - 0.03 * size * way
         axes.text(
-            *away,
+            away[0],
+            away[1],
             "next",
             fontsize=8,
             color=ACCENT,

@@ -45,7 +45,7 @@ class Ground:
     Attributes:
         points: middle of each cell on the plane, (C, 3), world, metres.
         top: how high above the plane anything was seen over each, (C,), metres; 0 for nothing.
-        hidden: cells that no frame has shown, (C,) bool.
+        hidden: cells that something hides in every picture that they lie in, (C,) bool.
         shape: rows and columns of cells; C is their product.
         low: of the first cell, along the axes, (2,), metres.
         axes: upright, rows x, y and z in the world, (3, 3).
@@ -80,18 +80,23 @@ class Ground:
         shape = (int(count[0]), int(count[1]))
         at = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 2)
         middle = np.column_stack([low + (at + 0.5) * CELL, np.full(len(at), floor)])
-        points = middle @ axes
+        level = middle @ axes
+        # the plane may lean a little
+        points = level - plane.height(level)[:, None] * axes[2] / (plane.normal @ axes[2])
 
         top = np.zeros(len(points))
+        in_view = np.zeros(len(points), bool)
         shown = np.zeros(len(points), bool)
         for one in tops:
             _raise_over(top, one, low, shape, axes)
-            shown |= _shows(one.frame, points)
-        return cls(points, top, ~shown & (top == 0), shape, low, axes, floor)
+            inside, seen = _seen_in(one.frame, points)
+            in_view |= inside
+            shown |= seen
+        return cls(points, top, in_view & ~shown & (top == 0), shape, low, axes, floor)
 
     @property
     def largest_hidden(self) -> int:
-        """Cells of the largest connected part of the table that no frame has shown."""
+        """Cells of the largest connected part of the table that is hidden."""
         label, count = ndimage.label(self.hidden.reshape(self.shape))
         return int(np.bincount(label.ravel())[1:].max()) if count else 0
 
@@ -102,8 +107,7 @@ class Ground:
             camera: where it stands, (3,), world.
         """
         start = self.axes @ camera
-        ends = np.column_stack([(self.points @ self.axes.T)[:, :2], np.full(len(self.points), 0.0)])
-        ends[:, 2] = self.floor
+        ends = self.points @ self.axes.T
         # Nothing stands higher than the highest, so only the last part of each ray is looked at.
         highest = float(self.top.max()) if len(self.top) else 0.0
         rise = max(start[2] - self.floor, 1e-6)
@@ -114,7 +118,7 @@ class Ground:
         inside = ((cell >= 0) & (cell < self.shape)).all(-1)
         index = np.where(inside, cell[..., 0] * self.shape[1] + cell[..., 1], 0)
         own = index == np.arange(len(ends))[:, None]
-        blocked = inside & ~own & (self.top[index] > along[..., 2] - self.floor)
+        blocked = inside & ~own & (self.top[index] > along[..., 2] - ends[:, None, 2])
         return np.asarray(~blocked.any(1))
 
 
@@ -129,8 +133,8 @@ def _raise_over(top: Float, one: TableTop, low: Float, shape: tuple[int, int], a
     np.maximum.at(top, index, one.height[rows[few], columns[few]][inside].astype(np.float64))
 
 
-def _shows(frame: Frame, points: Float) -> Mask:
-    """Which points, (C, 3), a frame shows, or something beyond them, (C,) bool."""
+def _seen_in(frame: Frame, points: Float) -> tuple[Mask, Mask]:
+    """Which points, (C, 3), lie in a frame's picture; and which it shows, or something beyond."""
     pose = frame.camera_to_world
     in_camera = (points - pose[:3, 3]) @ pose[:3, :3]
     ahead = in_camera[:, 2] > 0.01
@@ -141,7 +145,7 @@ def _shows(frame: Frame, points: Float) -> Mask:
     inside = ahead & (row >= 0) & (row < frame.shape[0])
     inside &= (column >= 0) & (column < frame.shape[1])
     depth = np.where(inside, frame.depth[np.where(inside, row, 0), np.where(inside, column, 0)], 0)
-    return np.asarray(inside & (depth > away - HIDDEN_STEP))
+    return inside, np.asarray(inside & (depth > away - HIDDEN_STEP))
 
 
 def is_sure(track: Track) -> bool:

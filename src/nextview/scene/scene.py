@@ -144,7 +144,7 @@ class Scene:
         """Where to look next so that all objects are sure soonest, camera-to-world, (4, 4).
 
         The sum of what a view is expected to tell of each object that is not sure, and of the part
-        of the table that no frame has shown, less a little for the way. None before the first
+        of the table that is hidden in all frames, less a little for the way. None before the first
         frame, where nothing was found, or no view is left.
         """
         with self._lock:
