@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -19,10 +19,8 @@ from nextview.geometry.ray_caster import RayCaster
 from nextview.scene.objects import UNKNOWN, SceneObject
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.object_frame import upright_axes
+from nextview.sensing.tabletop import TableTop
 from nextview.session.style import ACCENT, BLUE, FAINT, GREY, INK, PAPER, STYLE, PlainFigure
-
-if TYPE_CHECKING:
-    from nextview.scene.scene import Scene
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -53,16 +51,22 @@ CELL = 0.002  # metres, of what is drawn from above
 SHORT_CAMERA = 0.06  # length of the arrow of a camera, of the picture's width
 
 
-def draw_scene(scene: Scene, title: str = "") -> Figure:
+def draw_scene(
+    tops: Sequence[TableTop],
+    objects: Sequence[SceneObject],
+    target: Float | None = None,
+    title: str = "",
+) -> Figure:
     """Draw the last frame with outlines, names and axes of poses, and the table from above.
 
     Args:
-        scene: with one frame at least.
+        tops: what each frame shows, at least one.
+        objects: what was found.
+        target: where the camera is to look next, camera-to-world, (4, 4); None for nowhere.
         title: of what is shown.
     """
-    top = scene.tops[-1]
-    objects = scene.objects
-    number = len(scene.tops) - 1
+    top = tops[-1]
+    number = len(tops) - 1
     colours = {
         thing.number: GREY if thing.name == UNKNOWN else COLOURS[k % len(COLOURS)]
         for k, thing in enumerate(objects)
@@ -74,20 +78,20 @@ def draw_scene(scene: Scene, title: str = "") -> Figure:
         width = HEIGHT * (aspect + 1) + 3 * MARGIN
         height = HEIGHT + TOP + MARGIN
         figure = PlainFigure(figsize=(width, height))
-        _heading(figure, scene, objects, title, width, height)
+        _heading(figure, len(tops), objects, title, width, height)
 
         high = HEIGHT / height
         left = figure.add_axes((MARGIN / width, MARGIN / height, HEIGHT * aspect / width, high))
         _draw_frame(left, top.frame, number, objects, colours, (rows, columns))
         start = (2 * MARGIN + HEIGHT * aspect) / width
         right = figure.add_axes((start, MARGIN / height, HEIGHT / width, high))
-        _draw_from_above(right, scene, objects, colours)
+        _draw_from_above(right, tops, objects, colours, target)
         return figure
 
 
 def _heading(
     figure: Figure,
-    scene: Scene,
+    frames: int,
     objects: Sequence[SceneObject],
     title: str,
     width: float,
@@ -95,7 +99,6 @@ def _heading(
 ) -> None:
     """Say how many objects were found, and in how many frames."""
     named = sum(thing.name != UNKNOWN for thing in objects)
-    frames = len(scene.tops)
     said = f"{named} known things"
     if named < len(objects):
         said += f", {len(objects) - named} unknown"
@@ -217,14 +220,18 @@ def _name(
 
 
 def _draw_from_above(
-    axes: Axes, scene: Scene, objects: Sequence[SceneObject], colours: dict[int, str]
+    axes: Axes,
+    tops: Sequence[TableTop],
+    objects: Sequence[SceneObject],
+    colours: dict[int, str],
+    target: Float | None,
 ) -> None:
     """Where everything is, seen from above, and where the cameras stood; metres.
 
     The last camera looks upwards, so that left and right are those of the frame beside it.
     """
-    cameras = np.stack([top.frame.camera_to_world for top in scene.tops])
-    up = scene.tops[0].up
+    cameras = np.stack([top.frame.camera_to_world for top in tops])
+    up = tops[0].up
     ahead = cameras[-1, :3, 2]
     behind = -ahead if abs(ahead @ up) < 0.99 else cameras[-1, :3, 1]
     front = upright_axes(up, behind)
@@ -247,8 +254,7 @@ def _draw_from_above(
         _name(axes, thing, float(middle[0]), float(middle[1]), colours, "center")
     for pose in cameras:
         _draw_camera(axes, upright @ pose[:3, 3], upright @ pose[:3, 2], low, high, INK)
-    target = scene.target
-    if target is not None and not scene.done:
+    if target is not None:
         _draw_camera(axes, upright @ target[:3, 3], upright @ target[:3, 2], low, high, ACCENT)
 
     axes.set_xlim(low[0], high[0])

@@ -202,7 +202,8 @@ class Scene:
 
         if not self._tops:
             raise SessionError("there is nothing to draw before the first frame: update with one")
-        figure = draw_scene(self, title)
+        target = None if self.done else self.target
+        figure = draw_scene(self._tops, self.objects, target, title)
         if path is not None:
             save_figure(figure, Path(path))
         return figure
