@@ -292,6 +292,13 @@ def test_the_command_says_what_is_on_the_table(meshes, tmp_path, capsys):
     with Image.open(figure) as picture:
         assert picture.width > 1000
 
+    one = tmp_path / "table" / "frame-000000.depth.png"
+    intrinsics = tmp_path / "table" / "camera-intrinsics.txt"
+    main(["look", str(one), "--intrinsics", str(intrinsics), "--depth-scale", "0.001"])
+    shown = capsys.readouterr().out
+    assert "cracker_box" in shown
+    assert "mug" in shown
+
     with pytest.raises(SystemExit) as end:
         main(["look", str(tmp_path / "table"), "--frames", "0"])
     assert end.value.code == 2

@@ -35,7 +35,11 @@ class LookOptions:
     Attributes:
         models: bundled memory by name, or folders of your own; several together if there are
             several.
-        intrinsics: FX FY CX CY, pixels, or a file with them, if not those of the folder.
+        intrinsics: FX FY CX CY, pixels, or a file with them (the pinhole matrix, or what ROS,
+            librealsense or Open3D wrote), if not those of the folder.
+        depth_scale: metres that one step of the depth images stands for, if not as the files say.
+        depth_topic: of a ROS 2 bag with several topics of depth images.
+        world_frame: of a ROS 2 bag: the frame of tf that is the world, z up.
         up: the axis of the world that points up, or a direction; by default as the layout says, or
             the normal of the support plane.
         region: upright box outside of which nothing is looked for: its low and its high corner,
@@ -46,6 +50,9 @@ class LookOptions:
 
     models: tuple[str, ...] = ("ycb",)
     intrinsics: tuple[float, float, float, float] | Path | None = None
+    depth_scale: float | None = None
+    depth_topic: str | None = None
+    world_frame: str | None = None
     up: str | Three | None = None
     region: tuple[float, float, float, float, float, float] | None = None
     frames: int = 6
@@ -80,13 +87,20 @@ def look(
     listed as unknown, with their size and place.
 
     Args:
-        path: folder of captured depth images with poses, in the layout of BOP, TUM RGB-D or
-            7-Scenes.
+        path: folder of captured depth images with poses (BOP, TUM RGB-D, 7-Scenes, or depth images
+            with the intrinsics of the camera), a ROS 2 bag, or one depth image (.png).
     """
     check_file(output.figure, output.overwrite)
     if looking.frames < 1:
         raise UsageError(f"at least one frame is looked at, not {looking.frames}")
-    capture, left_out = check_capture(read_capture(path, looking.intrinsics), masked=False)
+    read = read_capture(
+        path,
+        looking.intrinsics,
+        depth_scale=looking.depth_scale,
+        depth_topic=looking.depth_topic,
+        world_frame=looking.world_frame,
+    )
+    capture, left_out = check_capture(read, masked=False)
     console.print(f"{capture!r}")
     system = load(list(looking.models), unknown=looking.unknown)
     scene = Scene(system, *_where(capture, looking))
