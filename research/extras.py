@@ -9,6 +9,7 @@ EXTRAS = {  # packages by the optional part, as in pyproject.toml, that brings t
     "ap-gym": ("ap_gym", "gymnasium"),
     "arm": ("gymnasium_robotics", "mink", "mujoco"),
     "film": ("imageio_ffmpeg",),
+    "ppf": ("cv2",),
     "rl": (*checks.EXTRAS["envs"], *checks.EXTRAS["train"], "stable_baselines3"),
 }
 PROJECT = "./research"

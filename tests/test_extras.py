@@ -226,6 +226,7 @@ def test_a_script_without_its_extra_says_what_to_install(base):
         "research/film.py": "./research[film]",
         "research/growth.py": "nextview[large]",
         "research/measure_study.py": "nextview[benchmark]",
+        "research/point_pairs.py": "./research[ppf]",
         "research/thing_features.py": "nextview[train]",
         "research/train_agent.py": "./research[rl]",
         "research/train_grid.py": "nextview[train]",

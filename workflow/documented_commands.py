@@ -81,9 +81,10 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs a recording of the reader's; tests/test_recordings.py writes such and reads them"
     ),
     r"-m zipfile|efficientnet|resnet34-b627a593": "weights of others, which are fetched first",
-    r"research\.(film|real_things|touching_things|growth)|verified_things": (
+    r"research\.(film|real_things|touching_things|growth|point_pairs)|(verified|many)_things": (
         "needs the YCB scans, and minutes"
     ),
+    r"peers/monty\.py": "needs an environment of its own, and an hour",
     r"research\.(train_grid|thing_features)": "trains for hours",
     r"research\.simulated_arm": "takes an hour; research/tests/test_arm.py has episodes of it",
     r"benchmarks/(render|replay|latency|session_latency)\.py": "measures time, on a quiet machine",

@@ -1,0 +1,153 @@
+"""Monty of the Thousand Brains Project on YCB scans in random 3D rotations, for a row beside ours.
+
+    python research/peers/monty.py scans YCB WORK
+    python research/peers/monty.py teach WORK
+    python research/peers/monty.py recognise WORK
+    python research/peers/monty.py table WORK
+
+Monty needs an environment of its own, in which nextview need not be installed:
+
+    pip install --no-deps tbp.monty==0.55.0
+    pip install mujoco==3.3.7 "numpy<2" hydra-core pydantic numpy-quaternion torch torch-geometric \
+        scipy pandas scikit-learn scikit-image matplotlib pillow sympy tqdm importlib_resources \
+        trimesh tyro
+
+and OSMesa, Mesa's renderer without a screen (Debian: libosmesa6), with MUJOCO_GL=osmesa. The scans
+are written as its simulator reads them, under its own names, in metres, with the y axis up and one
+grey: Monty's feature of colour tells nothing. Its own configurations are used: it is taught by the
+surface agent (``only_surf_agent_training_10obj_mujoco``) and tested with the distant agent and
+noise (``randrot_noise_10distinctobj_dist_agent_mujoco``). Changed are only the names of the things,
+the rotations (six of its fourteen to teach, three drawn by its seed to test), and shadows, which
+the renderer draws very slowly and no depth shows.
+
+The ten things are the first five of each of Monty's own lists of ten distinct and ten similar
+things, those that are on both counted once.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from tyro.extras import subcommand_cli_from_dict
+
+DISTINCT = ("mug", "bowl", "potted_meat_can", "spoon", "strawberry")
+SIMILAR = ("e_cups", "knife", "fork", "c_cups", "d_cups")
+THINGS = (*DISTINCT, *SIMILAR)
+ROTATIONS = ((0, 0, 0), (0, 90, 0), (0, 180, 0), (0, 270, 0), (90, 0, 0), (90, 180, 0))
+"""In which the things are taught, degrees: those of Monty's that show the faces of a cube."""
+
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+TAUGHT = "taught"  # folders below WORK
+TESTED = "tested"
+MODEL = "model.pt"
+OBJECTS = "mujoco/objects/ycb"  # where Monty's simulator looks for things
+
+
+def scans(folder: tyro.conf.Positional[Path], work: tyro.conf.Positional[Path]) -> None:
+    """Write the scans as Monty's simulator reads them.
+
+    Args:
+        folder: of the scans, PLY, metres, z up.
+        work: folder to write to.
+    """
+    import trimesh
+    from PIL import Image
+
+    for name in THINGS:
+        place = work / OBJECTS / name
+        place.mkdir(parents=True, exist_ok=True)
+        mesh = trimesh.load(folder / f"{name}.ply", process=False, force="mesh")
+        mesh.apply_translation(-mesh.bounds.mean(0))
+        mesh.apply_transform(Y_UP)
+        plain = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        plain.export(place / "textured.obj", include_normals=False)
+        Image.new("RGB", (4, 4), (128, 128, 128)).save(place / "texture_map.png")
+    print(f"{len(THINGS)} scans in {work / OBJECTS}")
+
+
+def teach(work: tyro.conf.Positional[Path], steps: int = 1000) -> None:
+    """Teach Monty the things, in one rotation after the other; goes on where it was stopped.
+
+    Args:
+        work: folder that ``scans`` wrote.
+        steps: by which each is explored in each rotation; 1000 in Monty's configuration.
+    """
+    before = ""
+    for number, rotation in enumerate(ROTATIONS):
+        place = work / TAUGHT / f"{number}"
+        if not list(place.rglob(MODEL)):
+            _run(
+                work,
+                "only_surf_agent_training_10obj_mujoco",
+                "experiment.config.n_train_epochs=1",
+                f"experiment.config.train_env_interface_args.object_names=[{','.join(THINGS)}]",
+                "experiment.config.train_env_interface_args.object_init_sampler.rotations="
+                f"[{list(rotation)}]",
+                f"experiment.config.recognition_policy.policies.0.num_exploring_steps={steps}",
+                f"experiment.config.model_name_or_path='{before}'",
+                f"experiment.config.logging.output_dir={place.absolute()}",
+            )
+        before = str(next(place.rglob(MODEL)).parent.absolute())
+
+
+def recognise(work: tyro.conf.Positional[Path], rotations: int = 3) -> None:
+    """Show Monty each thing in random rotations.
+
+    Args:
+        work: folder that ``scans`` wrote.
+        rotations: how many of each thing.
+    """
+    taught = sorted((work / TAUGHT).rglob(MODEL))
+    if not taught:
+        raise SystemExit(f"{work}: nothing was taught; run the stage teach first")
+    print(f"{len(taught)} of {len(ROTATIONS)} rotations were taught")
+    _run(
+        work,
+        "randrot_noise_10distinctobj_dist_agent_mujoco",
+        f"experiment.config.n_eval_epochs={rotations}",
+        f"experiment.config.eval_env_interface_args.object_names=[{','.join(THINGS)}]",
+        f"experiment.config.model_name_or_path={taught[-1].parent.absolute()}",
+        f"experiment.config.logging.output_dir={(work / TESTED).absolute()}",
+        "experiment.config.logging.python_log_level=WARNING",
+    )
+
+
+def _run(work: Path, experiment: str, *changes: str) -> None:
+    """Run one of Monty's experiments with some changes, and say how long it took."""
+    for name in ("MONTY_DATA", "MONTY_MODELS", "MONTY_LOGS"):
+        os.environ[name] = str(work.absolute())
+    import hydra
+    from tbp.monty.hydra import instantiate_experiment
+    from tbp.monty.simulators.mujoco import MuJoCoSimulator
+
+    usual = MuJoCoSimulator._configure_spec_settings
+
+    def drawn_plainly(simulator: Any) -> None:
+        usual(simulator)
+        simulator.spec.visual.quality.shadowsize = 0
+        simulator.spec.visual.quality.offsamples = 0
+
+    MuJoCoSimulator._configure_spec_settings = drawn_plainly
+    with hydra.initialize_config_module("tbp.monty.conf", version_base=None):
+        config = hydra.compose("experiment", [f"experiment={experiment}", *changes])
+
+    start = time.perf_counter()
+    begun = time.process_time()
+    with instantiate_experiment(config.experiment) as made:
+        made.run()
+    seconds = time.perf_counter() - start
+    print(f"{experiment}: {seconds:.0f} s, {time.process_time() - begun:.0f} s of CPU")
+
+
+def main() -> None:
+    """Run one of the stages."""
+    subcommand_cli_from_dict({"scans": scans, "teach": teach, "recognise": recognise})
+
+
+if __name__ == "__main__":
+    main()
