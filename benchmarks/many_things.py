@@ -4,6 +4,7 @@ is right.
     python benchmarks/many_things.py make YCB THINGS [--count 1000] [--seed 0]
     python benchmarks/many_things.py teach THINGS MEMORY [--first 1000]
     python benchmarks/many_things.py measure THINGS MEMORY [--frames 100] [--seed 1]
+        [--save FOLDER]
 
 ``make`` writes a PLY file a thing, metres. The first ones are the scans of the folder YCB
 themselves. All others are scans in turn, each stretched along its x, y and z by factors of its own,
@@ -44,7 +45,7 @@ from tyro.extras import subcommand_cli_from_dict
 
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import UsageError
-from nextview.files import new_file, new_folder
+from nextview.files import new_file, new_folder, read_record, write_record
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated
@@ -238,12 +239,24 @@ class Outcome:
     seconds: float
 
 
+@dataclass(frozen=True)
+class Found:
+    """What was found of one thing.
+
+    Attributes:
+        outcomes: after one view and after two.
+    """
+
+    outcomes: tuple[Outcome, ...]
+
+
 def measure(
     things: tyro.conf.Positional[Path],
     models: tyro.conf.Positional[Path],
     frames: int = 100,
     seed: int = 1,
     sensor: str = "wrist",
+    save: Path | None = None,
 ) -> None:
     """Show some of the things, and recognise them among all.
 
@@ -253,6 +266,8 @@ def measure(
         frames: how many things are shown.
         seed: of which are shown, and how.
         sensor: what the views are taken with.
+        save: folder in which what was found is kept, and looked for: one for each MODELS, seed
+            and sensor.
     """
     begun = time.perf_counter()
     recogniser = TaughtRecogniser(models / "memory.json", threads=1)
@@ -264,7 +279,14 @@ def measure(
     outcomes: list[Outcome] = []
     shown(known, things, int(drawn[0]), sensor, np.random.default_rng(seed))
     for thing in track(drawn.tolist(), "things shown"):
-        outcomes += shown(known, things, thing, sensor, np.random.default_rng([seed, thing]))
+        file = None if save is None else save / f"{known.names[thing]}.json"
+        if file is not None and file.exists():
+            outcomes += read_record(file, Found, "what was found of a thing").outcomes
+            continue
+        found = shown(known, things, thing, sensor, np.random.default_rng([seed, thing]))
+        outcomes += found
+        if file is not None:
+            write_record(file, Found(tuple(found)))
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"{len(known.names)} things; loaded in {loaded:.1f} s; at most {peak:.2f} GB of memory")

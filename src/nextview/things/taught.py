@@ -61,7 +61,7 @@ class TaughtThings:
         """
         about = recogniser.card.memory
         assert about is not None
-        known = [thing.name for thing in about.things]
+        known = {thing.name: number for number, thing in enumerate(about.things)}
         self.names = tuple(surface.name for surface in surfaces)
         strange = sorted(set(self.names) - set(known))
         if strange or not surfaces:
@@ -69,13 +69,13 @@ class TaughtThings:
             raise ModelError(f"a memory of {len(known)} things: {what}")
 
         memory = recogniser.memory
-        number = {known.index(name): k for k, name in enumerate(self.names)}
+        number = {known[name]: k for k, name in enumerate(self.names)}
         rows = [row for row, thing in enumerate(memory.thing.tolist()) if thing in number]
         owners = np.array([number[int(memory.thing[row])] for row in rows])
         self.rows = np.array(rows)
         self.recogniser = recogniser
         self.residuals = residuals
-        self.symmetries = tuple(about.things[known.index(name)].symmetries for name in self.names)
+        self.symmetries = tuple(about.things[known[name]].symmetries for name in self.names)
         self.verifier = Verifier(surfaces, owners, memory.rotations[self.rows], weights)
         self.templates: ViewTemplates | None = None
 
