@@ -185,7 +185,16 @@ class _Surface:
         return float(np.linalg.norm(np.median(self.points, 0) - camera))
 
     def pulls(self, other: _Surface, shift: Float, reach: float) -> _Pulls:
-        """What the points of another surface, moved by a shift, say of a further one."""
+        """Return how the points of another surface, moved by a shift, disagree with this one.
+
+        Args:
+            other: the other surface.
+            shift: of the other surface, world, (3,), metres.
+            reach: distance beyond which points do not count, metres.
+
+        Returns:
+            The deviations.
+        """
         pose = self.sighting.frame.camera_to_world
         points = other.points[other.sample] + shift
         inside = (points - pose[:3, 3]) @ pose[:3, :3]

@@ -179,8 +179,7 @@ class ObservedObject:
         return self.state.revision
 
     def add(self, frame: Frame) -> Observation:
-        """Take in a frame: it is seen anew from three object radii in the camera's direction, as
-        the networks take it.
+        """Take in a frame and return its observation from three object radii.
 
         ObservationError where the object is not found in it; the frame is then not taken in.
         """
@@ -188,8 +187,7 @@ class ObservedObject:
         return self.state.observations[-1]
 
     def reconsider(self, novelty: Callable[[Sequence[Observation]], float]) -> None:
-        """Count what touches the object as a part of it, or do not, where its observations are less
-        novel then.
+        """Decide by their novelty whether touching things are parts of the object.
 
         An object of another order of size is another thing, such as the wall behind it, and is not
         considered.
@@ -347,9 +345,7 @@ class ObservedObject:
     def _support(
         self, frame: Frame, samples: Samples | None
     ) -> tuple[Plane | None, Float, np.random.Generator]:
-        """The support plane, where one is seen, the direction up, (3,), and the state of the random
-        numbers after both were found.
-        """
+        """Return the support plane, if it is seen, the direction up, (3,), and the generator."""
         before = self.state
         up = None if frame.pose is None else self.up
         if before.frame is not None:
@@ -380,8 +376,9 @@ class ObservedObject:
         up: Float,
         two: bool,
     ) -> list[ViewWarning]:
-        """What is likely to be wrong with a frame, beside those taken before; ``two`` says that the
-        object may be two.
+        """Return likely faults of a frame, beside those taken before.
+
+        ``two`` says that the object may be two.
         """
         before = self.state
         warnings = check_frame(frame) + check_observation(made[-1])
@@ -412,9 +409,7 @@ class ObservedObject:
         return plausibility.check_lean(lean_of(planes, poses, upright_axes(self.up)))
 
     def _near(self, samples: Samples) -> Mask:
-        """Which samples lie in the sphere of the object, as it is known from earlier frames, (N,)
-        bool.
-        """
+        """Return which samples lie in the object's sphere of earlier frames, (N,) bool."""
         known = self.state.frame
         if known is None:
             return np.zeros(len(samples.points), bool)
@@ -456,9 +451,7 @@ class ObservedObject:
         return plane if plane is None or up is None else self._under_the_object(frame, every, plane)
 
     def _under_the_object(self, frame: Frame, samples: Samples, plane: Plane) -> Plane:
-        """That of the level planes in the first frame on which the object stands; one of them is
-        given.
-        """
+        """Return the level plane of the first frame on which the object stands."""
         planes = support.level_planes(samples, plane)
         if len(planes) == 1 or self.known is not None:
             return plane
@@ -582,9 +575,7 @@ class ObservedObject:
     def _distance(
         self, frame: Frame, axes: Float, above: Mask, ground: Float, noise: Noise
     ) -> float:
-        """From the camera to the object, metres: to the point that asks for it, or to the middle of
-        what stands on the plane, (M, 2), by the pixels above it, (h, w).
-        """
+        """Return the distance from the camera to the object, metres."""
         camera = frame.camera_to_world[:3, 3]
         if self.point is not None:
             distance = float(np.linalg.norm(self.point - camera))
@@ -623,9 +614,7 @@ class ObservedObject:
         return sightings
 
     def _place(self) -> Float | None:
-        """Where the object is known to be, (3,), world, metres: by the point that asks for it,
-        or earlier frames.
-        """
+        """Return the known place of the object, (3,), world, metres."""
         if self.point is not None:
             return self.point
         return None if self.state.frame is None else self.state.frame.centre
@@ -638,9 +627,7 @@ class ObservedObject:
         to_cells: Float,
         optical_axis: Float,
     ) -> int:
-        """The object's label: by the point; else that of most cells that were the object's
-        before; else as aimed at.
-        """
+        """Return the object's label: by the point, by earlier cells, or as aimed at."""
         if self.point is not None:
             asked = to_cells @ self.point
             here = labels[-1]
@@ -732,9 +719,7 @@ class ObservedObject:
 
 
 def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
-    """All that a frame shows, from a pose in the object frame, in object radii; no finer than it
-    has to be.
-    """
+    """Return all that a frame shows, in the object frame and object radii."""
     k = sighting.frame.intrinsics.copy()
     step = max(
         1, int(FINEST * min(k[0, 0], k[1, 1]) / max(float(np.linalg.norm(pose[:3, 3])), 1.0))
@@ -752,9 +737,7 @@ def noise_of(frame: Frame) -> Noise:
 
 
 def _ahead(frame: Frame) -> Float:
-    """What the middle of the picture, or all of it, shows in the median, straight ahead, (3,),
-    world, metres.
-    """
+    """Return the median position in the middle of the picture, (3,), world, metres."""
     height, width = frame.shape
     down = height // AHEAD + 1
     across = width // AHEAD + 1

@@ -42,9 +42,7 @@ MOST_ALONE = 4.0
 
 @dataclass(frozen=True)
 class Samples:
-    """A grid of points of a frame, world, metres, with the distance from a plane up to which
-    each is on it.
-    """
+    """A grid of points of a frame, world, metres, with their tolerance from a plane."""
 
     points: Float
     tolerance: Float
@@ -64,11 +62,19 @@ class Samples:
 
 
 def sample(frame: Frame, pixels: NDArray[np.bool_], noise: Noise) -> Samples:
-    """What blocks of the given pixels, (H, W) bool, which all have a depth, show in the mean.
+    """Return the means over blocks of pixels.
 
-    The mean inverse depth of some pixels of a plane is that at the mean of their places in the
-    picture, with less noise than that of one. A block is left out where fewer than half of its
-    pixels are given.
+    The mean inverse depth of pixels of a plane is that at the mean of their places in the picture,
+    with less noise than that of one. A block is left out if fewer than half of its pixels are
+    given.
+
+    Args:
+        frame: the frame.
+        pixels: pixels to use, (H, W) bool; all have a depth.
+        noise: of the frame.
+
+    Returns:
+        The samples.
     """
     step = 1
     side = max(1, int(np.sqrt(np.count_nonzero(pixels) / SAMPLES)))
@@ -97,9 +103,7 @@ def sample(frame: Frame, pixels: NDArray[np.bool_], noise: Noise) -> Samples:
 
 
 def _block_sums(values: NDArray[np.floating], side: int) -> Float:
-    """Sums over squares of so many pixels; what is left over at the right and at the bottom is
-    left out.
-    """
+    """Return sums over squares of pixels; incomplete squares are left out."""
     height, width = (n // side for n in values.shape)
     of_rows = _sums_along(values[: height * side], side)
     return np.asarray(_sums_along(of_rows[:, : width * side].T, side).T, np.float64)
@@ -115,7 +119,7 @@ def _sums_along(values: NDArray[np.floating], side: int) -> NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Plane:
-    """Positions p with ``normal @ p + offset`` = 0; above it that is the height in metres.
+    """A plane: ``normal @ p + offset`` is the height of a position p, metres.
 
     Attributes:
         normal: of unit length, (3,).
@@ -137,9 +141,7 @@ class Plane:
         return np.abs(self.height(samples.points)) < samples.tolerance
 
     def extent(self, samples: Samples) -> Float:
-        """The samples on it, (M, 3), connected with most of them in the picture: no wall at its
-        height.
-        """
+        """Return the samples on the plane, (M, 3), connected with most of them."""
         on = self.holds(samples)
         if not on.any():
             return samples.points[on]
@@ -150,8 +152,15 @@ class Plane:
 
 
 def steep(samples: Samples, up: Float) -> Mask:
-    """Which samples lie on a surface that rises steeply, by what is seen above or below them in
-    the picture.
+    """Return the samples on surfaces that rise steeply.
+
+    Args:
+        samples: the samples.
+        up: direction against gravity, (3,).
+
+    Returns:
+        Whether each is on such a surface, by its neighbours above and below in the picture, (N,)
+        bool.
     """
     upright = np.zeros(len(samples.points), bool)
     if not len(upright):
@@ -170,11 +179,16 @@ def steep(samples: Samples, up: Float) -> Mask:
 def find_plane(
     samples: Samples, rng: Generator, up: Float | None = None, above: Float | None = None
 ) -> Plane | None:
-    """The plane with most samples on it, by RANSAC (Fischler and Bolles 1981), with all trials in
-    one product.
+    """Find the plane with most samples by RANSAC (Fischler and Bolles 1981).
 
-    The camera and a point ``above``, (3,), lie above it, and it is level against ``up``, (3,),
-    where these are given. None if too few samples lie on any.
+    Args:
+        samples: the samples.
+        rng: source of all random numbers.
+        up: direction to which the plane is perpendicular, (3,); None for any plane.
+        above: point that lies above the plane, as the camera does, (3,); None for none.
+
+    Returns:
+        The plane; None if too few samples lie on any.
     """
     points = samples.points
     if len(points) < 10:
@@ -218,8 +232,15 @@ def find_plane(
 
 
 def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:
-    """The plane of least squares through the samples within ``loose`` tolerances of one, if ten
-    are; three times.
+    """Fit a plane to the samples near it by least squares, three times.
+
+    Args:
+        plane: the plane.
+        samples: the samples.
+        loose: tolerances within which samples count.
+
+    Returns:
+        The refined plane; the plane itself if fewer than ten samples are near.
     """
     points = samples.points
     tolerance = loose * samples.tolerance
@@ -283,8 +304,18 @@ def lies_better_as_range(
     up: Float | None,
     above: Float | None = None,
 ) -> bool:
-    """Whether more of a frame lies on a plane if its depth is taken for the distance along each
-    ray.
+    """Return whether the frame fits a plane better if its depth is taken along each ray.
+
+    Args:
+        frame: the frame.
+        plane: found with the depth as it is; None if there is none.
+        samples: of the frame.
+        rng: source of all random numbers.
+        up: direction against gravity, (3,); None if it is not known.
+        above: point that lies above the plane, (3,); None for none.
+
+    Returns:
+        True if more of the frame lies on a plane then.
     """
     along = samples.points - samples.camera
     depth = along @ frame.camera_to_world[:3, 2]
@@ -316,12 +347,19 @@ def _share_held(samples: Samples, on: NDArray[np.bool_], normal: Float) -> float
 
 
 def mistake_in_pose(plane: Plane, pose: Float, up: Float) -> str | None:
-    """The mistake in a camera-to-world pose, (4, 4), without which the largest plane in view would
-    be level; or None.
+    """Return the mistake in a pose without which the largest plane would be level.
 
-    Floors and tables are level and walls upright. A plane that leans in between points to a wrong
-    pose; so does one that is level but lies over the camera. Of a wall nothing is said: seen from
+    Floors and tables are level and walls upright. A plane that leans in between indicates a wrong
+    pose; so does one that is level but lies over the camera. A wall indicates nothing: seen from
     the side it would pass for a floor.
+
+    Args:
+        plane: the largest plane in view.
+        pose: camera-to-world, (4, 4).
+        up: direction against gravity, (3,).
+
+    Returns:
+        The mistake, in words; None if there is none.
     """
     if plane.normal @ up > TILT or abs(plane.normal @ up) < np.sqrt(1 - TILT**2):
         return None
@@ -341,7 +379,15 @@ def mistake_in_pose(plane: Plane, pose: Float, up: Float) -> str | None:
 
 
 def inside_box(frame: Frame, box: Box) -> Mask:
-    """Pixels whose position lies in an upright box, (H, W) bool."""
+    """Return the pixels whose positions lie in an upright box.
+
+    Args:
+        frame: the frame.
+        box: the box.
+
+    Returns:
+        The pixels, (H, W) bool.
+    """
     inside = frame.depth > 0
     for axis, low, high in zip(box.axes, box.low, box.high, strict=True):
         position = frame.along(axis)
@@ -350,7 +396,17 @@ def inside_box(frame: Frame, box: Box) -> Mask:
 
 
 def inside_sphere(frame: Frame, centre: Float, radius: float, part: Part = WHOLE) -> Mask:
-    """Pixels whose position lies in a sphere, (H, W) bool; or those of a part of the frame."""
+    """Return the pixels whose positions lie in a sphere.
+
+    Args:
+        frame: the frame.
+        centre: of the sphere, world, (3,), metres.
+        radius: of the sphere, metres.
+        part: rows and columns to compute.
+
+    Returns:
+        The pixels of the part, (H, W) bool.
+    """
     x, y, z = (
         frame.along(axis, float(-at), part) for axis, at in zip(np.eye(3), centre, strict=True)
     )
@@ -358,8 +414,16 @@ def inside_sphere(frame: Frame, centre: Float, radius: float, part: Part = WHOLE
 
 
 def above_plane(frame: Frame, plane: Plane, noise: Noise, part: Part = WHOLE) -> Mask:
-    """Pixels that are higher above a plane than the noise of the frame explains, (H, W) bool; or
-    those of a part.
+    """Return the pixels that are higher above a plane than the noise explains.
+
+    Args:
+        frame: the frame.
+        plane: the plane.
+        noise: of the frame.
+        part: rows and columns to compute.
+
+    Returns:
+        The pixels of the part, (H, W) bool.
     """
     depth = frame.depth[part]
     height = frame.along(plane.normal, plane.offset, part)

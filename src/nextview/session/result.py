@@ -54,6 +54,11 @@ class Recognition:
         unknown_rate: share of objects of known classes that may be called unknown; 0: none.
         impossible: classes whose objects have not such a size.
         poses_in: the frame in which poses are given.
+
+    Example:
+        >>> result = nextview.recognise(sample_mesh("chair"), start=3)
+        >>> result.answer, result.confident
+        ('chair', True)
     """
 
     views: tuple[View, ...]

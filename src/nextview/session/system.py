@@ -56,6 +56,10 @@ class System:
         sphere: the candidates.
         unknown: share of objects of known classes that may be called unknown.
         loaded: the arguments of ``load`` that make it.
+
+    Example:
+        >>> nextview.load().recognise(sample_mesh("table"), start=33).answer
+        'table'
     """
 
     models: Models
@@ -286,12 +290,19 @@ def load(
         recogniser: one of your own instead of that of the models: an object or "MODULE:NAME", see
             ``recognition.own_recogniser``. It is pickled with the system.
 
+    Returns:
+        The system.
+
     Raises:
         ModelError: there are no such models, one cannot be used, or the recogniser has no novelty
             score.
         PolicyError: there is no such policy, or it cannot be made.
         RiskError: the error rate cannot be promised.
         UsageError: a threshold, a rate or a number of views makes no sense.
+
+    Example:
+        >>> nextview.load(policy="gain", max_views=3).policy_name
+        'gain'
     """
     given = dict(locals())
     names = _names_of(models)
@@ -441,9 +452,17 @@ _bundled = lru_cache(maxsize=1)(load)
 
 
 def recognise(what: str | Path | Mesh | Camera | FrameCamera, **options: Any) -> Recognition:
-    """What an object is, by the bundled models, in one call. Options as for ``System.recognise``.
+    """Recognise an object with the bundled models; options as for ``System.recognise``.
 
-    >>> recognise("chair.off")                                                  # doctest: +SKIP
-    chair (belief 0.998, 2 views, 1.41 cells of travel, confident)
+    Args:
+        what: mesh file, mesh, folder of captured views, or camera.
+        **options: see ``System.recognise``.
+
+    Returns:
+        The result.
+
+    Example:
+        >>> nextview.recognise(sample_mesh("chair"), start=3).answer
+        'chair'
     """
     return _bundled().recognise(what, **options)

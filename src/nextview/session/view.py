@@ -38,6 +38,11 @@ class View:
             frame.
         joint: What all views up to this one say together, its poses in the object frame as it was
             known then; None where the recogniser judges views one by one, or nothing was seen.
+
+    Example:
+        >>> view = nextview.recognise(sample_mesh("chair"), start=3).views[0]
+        >>> view.index, view.belief.shape
+        (3, (10,))
     """
 
     index: int

@@ -37,13 +37,21 @@ LARGEST = 16_384  # pixels that an image may be high or wide
 
 
 class SimulatedCamera:
-    """Looks at one normalised mesh from any pose.
+    """Looks at one normalised mesh from any pose, without errors.
 
     The image is lit by a headlight: a pixel's brightness grows with the cosine between the ray and
     the surface normal. It is a square of ``size`` pixels that the unit sphere just fills from
     ``distance`` object radii; or of ``shape``, height and width, through ``intrinsics``, (3, 3),
-    pixels, the first pixel's centre at 0.5. UsageError: no size of an image. ObservationError: the
-    camera stands in the object, or a matrix that no pinhole has.
+    pixels, the first pixel's centre at 0.5.
+
+    Raises:
+        UsageError: the size or the shape is not that of an image.
+        ObservationError: the camera stands in the object, or no pinhole has this matrix.
+
+    Example:
+        >>> camera = nextview.SimulatedCamera(sample_mesh("chair"), size=64)
+        >>> camera.observe(nextview.ViewSphere.named("40").poses[3]).depth.shape
+        (64, 64)
     """
 
     def __init__(
