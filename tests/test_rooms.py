@@ -43,6 +43,7 @@ DESK = trimesh.util.concatenate(
     [box((0.8, 1.5, 0.04), (0, 0, 0.7))]
     + [box((0.05, 0.05, 0.68), (x, y, 0.34)) for x in (-0.35, 0.35) for y in (-0.7, 0.7)]
 )
+MUG = trimesh.creation.cylinder(0.04, 0.1).apply_translation((-0.1, 0.2, 0.77))
 MONITOR = sample_of_size("monitor", 0.45, (0, 0.1, 0.72))
 BED = trimesh.util.concatenate(
     [box((2.0, 1.5, 0.45), (0, 0, 0.225)), box((0.06, 1.5, 0.5), (-1.0, 0, 0.7))]
@@ -77,6 +78,12 @@ def assert_is(thing: ObservedObject, mesh: trimesh.Trimesh, radius=0.15) -> None
     true = meshed(mesh)
     assert thing.object_frame.radius == pytest.approx(true.radius, rel=radius)
     assert np.linalg.norm(thing.object_frame.centre - true.centre) < 0.35 * true.radius
+
+
+def share_of(thing: ObservedObject, which: np.ndarray, number: int) -> float:
+    """Intersection over union of what was taken for the object and what shows a mesh."""
+    mask = thing.sightings[-1].mask
+    return float((mask & (which == number)).sum() / (mask | (which == number)).sum())
 
 
 def middle_of(mesh: trimesh.Trimesh) -> np.ndarray:
@@ -176,6 +183,49 @@ def test_a_monitor_stands_on_its_desk(asked, elevation):
     )
     thing.add(seen)
     assert_is(thing, MONITOR, radius=0.2)
+
+
+@pytest.mark.parametrize("height", [0.3, 0.66, 0.7, 0.72])
+def test_a_table_is_named_by_a_point_under_its_top_or_on_it_where_no_floor_is_measured(height):
+    scene = [DESK, NEAR_WALL]
+    pose = pose_at(25, 20, 1.8, (0, 0, 0.6))
+    _, which = cast(scene, pose)
+    thing = ObservedObject(point=(0.05, -0.1, height))
+    thing.add(frame(scene, pose))
+    assert share_of(thing, which, 0) > 0.8
+    assert_is(thing, DESK)
+    assert [warning.name for warning in thing.warnings] == ["support"]
+
+
+@pytest.mark.parametrize("height", [0.3, 0.6])
+def test_a_point_under_a_top_names_the_table_where_the_picture_ends_above_its_floor(height):
+    scene = [DESK, NEAR_WALL, MUG, FLOOR]
+    pose = pose_at(20, 0, 1.0, (-0.3, 0, 0.74))
+    _, which = cast(scene, pose)
+    assert not (which == 3).any()
+    thing = ObservedObject(point=(0, 0, height))
+    thing.add(frame(scene, pose))
+    assert share_of(thing, which, 0) > 0.8
+
+
+@pytest.mark.parametrize("height", [0.7, 0.72, 0.77])
+def test_a_point_at_a_thing_on_a_table_names_the_thing(height):
+    scene = [DESK, NEAR_WALL, MUG]
+    pose = pose_at(25, 20, 1.2, (0, 0, 0.72))
+    _, which = cast(scene, pose)
+    thing = ObservedObject(point=(-0.1, 0.2, height))
+    thing.add(frame(scene, pose))
+    assert share_of(thing, which, 2) > 0.8
+    assert thing.warnings == []
+
+
+def test_a_wrong_pose_is_no_support_out_of_the_picture():
+    """The camera's axes are OpenGL's: no plane is level, so nothing tells where the floor is."""
+    pose = pose_at(25, 20, 1.8, (0, 0, 0.6))
+    seen = frame([DESK, NEAR_WALL], pose)
+    wrong = Frame(seen.depth, seen.intrinsics, pose @ np.diag([1.0, -1, -1, 1]), pixel_centre=0.5)
+    with pytest.raises(ObservationError):
+        ObservedObject(point=(0, 0, 0.3)).add(wrong)
 
 
 @pytest.mark.parametrize("asked", ["mask", "point", "aim"])

@@ -63,6 +63,8 @@ SAME = 0.01
 BELOW = 0.02
 AHEAD = 16  # half the width of the middle of the picture, as a part of the picture
 MASK_POINTS = 2000  # pixels of a mask that tell where its bottom is
+# share of what is seen that may lie lower than the lowest that counts: noise
+LOWEST_SEEN = 0.01
 TOO_LITTLE = "too little is seen of the object"
 NO_SUPPORT = (
     "no support plane is seen below the camera: give a mask or a box, or check the pose (inverse?"
@@ -425,11 +427,14 @@ class ObservedObject:
             samples = samples.some(~segmentation.steep(samples, up))
         plane = find_plane(samples, rng, up, self._above())
         share = 0.0 if plane is None else float(plane.holds(samples).mean())
-        if self.point is not None and up is not None and share < 1 / 3:
+        # A fit that rises over the point, above which no plane was tried, cuts through a surface.
+        cuts = plane is not None and self.point is not None and plane.height(self.point) < 0
+        if self.point is not None and up is not None and (cuts or share < 1 / 3):
             # The point may lie on the plane, or a little below.
             higher = self.point + (2 * np.median(samples.tolerance) + BELOW) * up
             under = find_plane(samples, deepcopy(rng), up, higher)
-            if under is not None and (more := float(under.holds(samples).mean())) > 2 * share:
+            more = 0.0 if under is None else float(under.holds(samples).mean())
+            if more > (1 if cuts else 2) * share:
                 plane = under
                 share = more
         # else no other is twice as large
@@ -448,7 +453,11 @@ class ObservedObject:
             raise ObservationError(
                 "the depth is measured along the rays, a range: give it along the optical axis"
             )
-        return plane if plane is None or up is None else self._under_the_object(frame, every, plane)
+        if plane is None or up is None:
+            return plane
+        plane = self._under_the_object(frame, every, plane)
+        asked = None if frame.mask is not None else self.point
+        return None if support.is_named(every, plane, _target_in(frame, every, asked)) else plane
 
     def _under_the_object(self, frame: Frame, samples: Samples, plane: Plane) -> Plane:
         """Return the level plane of the first frame on which the object stands."""
@@ -467,10 +476,7 @@ class ObservedObject:
         of_walls = np.zeros(len(samples.points), bool)
         for wall in walls:
             of_walls |= wall.height(samples.points) < samples.tolerance
-        side = frame.shape[1] / (samples.columns.max() + 1)
-        axis = frame.intrinsics[[1, 0], [2, 2]] / side
-        target = support.Target(axis, frame.shape[1] / side, self.point)
-        return support.aimed_at(samples, planes, of_walls, target)
+        return support.aimed_at(samples, planes, of_walls, _target_in(frame, samples, self.point))
 
     def _above(self) -> Float | None:
         """A point that is known to be above the support plane."""
@@ -515,8 +521,11 @@ class ObservedObject:
                 raise ObservationError(
                     "nothing is seen where the object should be: a wrong pose, or a wrong box?"
                 )
-        elif plane is not None and samples is not None:
-            return self._on_the_plane(frame, axes, plane, samples, noise)
+        elif samples is not None:
+            base = self._base(samples, axes[2]) if plane is None else plane
+            if base is None:
+                raise ObservationError(NO_SUPPORT)
+            return self._above_the_base(frame, axes, base, plane, samples, noise)
         else:
             raise ObservationError(NO_SUPPORT)
         return (
@@ -525,18 +534,43 @@ class ObservedObject:
             False,
         )
 
-    def _on_the_plane(
-        self, frame: Frame, axes: Float, plane: Plane, samples: Samples, noise: Noise
+    def _base(self, samples: Samples, up: Float) -> Plane | None:
+        """The level plane through the lowest that a frame shows, where the support is out of the
+        picture: the object is named by a point, and a level plane is seen, but over the point.
+
+        Such a plane is a part of the object, as the top is of a table; that it is level tells that
+        the pose is right. None where no plane tells it.
+        """
+        if self.point is None:
+            return None
+        level = samples.some(~segmentation.steep(samples, up))
+        if find_plane(level, np.random.default_rng(0), up) is None:
+            return None
+        lowest = float(np.quantile(samples.points @ up, LOWEST_SEEN))
+        margin = segmentation.ASIDE * float(np.median(samples.tolerance))
+        return Plane(up, -min(lowest, float(self.point @ up) - margin))
+
+    def _above_the_base(
+        self,
+        frame: Frame,
+        axes: Float,
+        base: Plane,
+        plane: Plane | None,
+        samples: Samples,
+        noise: Noise,
     ) -> Found:
+        """Find the object among what rises above a plane: that on which it stands, if it is seen,
+        or one that lies as low as all that is seen.
+        """
         earlier = self.state.sightings
         cell = self.state.cell
-        height = frame.along(plane.normal, plane.offset)
-        above = segmentation.above_plane(frame, plane, noise)
+        height = frame.along(base.normal, base.offset)
+        above = segmentation.above_plane(frame, base, noise)
         place = self._place()
-        walls = find_walls(samples, plane, np.random.default_rng(0), place)
+        walls = find_walls(samples, base, np.random.default_rng(0), place)
         free = before_walls(frame, walls, noise)
         above &= free
-        ground = plane.extent(samples) @ axes[:2].T
+        ground = base.extent(samples) @ axes[:2].T
         if not cell:
             cell = clusters.CELL * self._distance(frame, axes, above, ground, noise)
 
@@ -728,6 +762,13 @@ def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
     k[:2, 2] += 0.5 - (step // 2 + 0.5) / step
     few = (slice(step // 2, None, step),) * 2
     return SceneView(sighting.frame.depth[few] / np.float32(radius), sighting.mask[few], pose, k)
+
+
+def _target_in(frame: Frame, samples: Samples, place: Float | None) -> support.Target:
+    """Where the object is looked for in a frame: at a place, (3,), world, if one is given."""
+    side = frame.shape[1] / (samples.columns.max() + 1)
+    axis = frame.intrinsics[[1, 0], [2, 2]] / side
+    return support.Target(axis, frame.shape[1] / side, place)
 
 
 def noise_of(frame: Frame) -> Noise:

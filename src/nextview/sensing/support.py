@@ -163,6 +163,41 @@ def aimed_at(samples: Samples, planes: list[Plane], in_the_way: Mask, target: Ta
     return planes[-1]
 
 
+def is_named(samples: Samples, plane: Plane, target: Target) -> bool:
+    """Whether a place on a level surface, or under it, names the surface itself, such as the top of
+    a table: nothing stands there, and it is no ground.
+
+    Args:
+        samples: of the frame.
+        plane: the level plane.
+        target: the place where the object is.
+    """
+    if target.place is None or plane.height(target.place) > np.median(samples.tolerance):
+        return False
+    off = target.off(samples, plane)
+    above = plane.height(samples.points) > samples.tolerance
+    on = plane.holds(samples) & ~steep(samples, plane.normal)
+    if on.sum() < 3 or _thing_there(samples, above, off) is not None:
+        return False
+
+    its_own = _surface_there(samples, on, off)
+    away = float(np.linalg.norm(target.place - samples.camera))
+    wide = (
+        np.linalg.norm(np.ptp(_in_plane(samples.points[its_own], plane), 0)) > GROUND_WIDTH * away
+    )
+    return not (wide and _leaves_picture(samples, its_own))
+
+
+def _surface_there(samples: Samples, on: Mask, off: Float) -> Mask:
+    """Which samples of a level plane, (N,) bool, are of its surface that is nearest to where the
+    object is looked for, scraps left out.
+    """
+    surface = _surfaces(samples, on, GROUND_STEP)
+    size = np.bincount(surface, on)
+    large = on & (size[surface] > LARGE_PART * size.max())
+    return np.asarray(surface == surface[np.where(large, off, np.inf).argmin()])
+
+
 def _carries(samples: Samples, plane: Plane, level: Mask, free: Mask, target: Target) -> bool:
     """Whether a plane carries what the camera is aimed at, or what stands at a place; it is no
     part of it.
@@ -171,10 +206,7 @@ def _carries(samples: Samples, plane: Plane, level: Mask, free: Mask, target: Ta
     if on.sum() < 3:
         return False
     off = target.off(samples, plane)
-    surface = _surfaces(samples, on, GROUND_STEP)
-    size = np.bincount(surface, on)
-    large = on & (size[surface] > LARGE_PART * size.max())
-    its_own = surface == surface[np.where(large, off, np.inf).argmin()]
+    its_own = _surface_there(samples, on, off)
     ground = _in_plane(samples.points[its_own], plane)
     try:
         outline = ConvexHull(ground)
