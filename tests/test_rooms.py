@@ -208,6 +208,19 @@ def test_a_point_under_a_top_names_the_table_where_the_picture_ends_above_its_fl
     assert share_of(thing, which, 0) > 0.8
 
 
+def test_a_table_is_known_whole_once_a_later_frame_shows_its_floor():
+    scene = [DESK, NEAR_WALL, MUG, FLOOR]
+    thing = ObservedObject(point=(0.05, -0.1, 0.4))
+    thing.add(frame(scene, pose_at(20, 0, 1.0, (-0.3, 0, 0.74))))
+    assert thing.sightings[0].plane is None
+
+    pose = pose_at(35, 60, 1.9, (0, 0, 0.6))
+    thing.add(frame(scene, pose))
+    assert share_of(thing, cast(scene, pose)[1], 0) > 0.8
+    assert_is(thing, DESK)
+    assert thing.warnings == []
+
+
 @pytest.mark.parametrize("height", [0.7, 0.72, 0.77])
 def test_a_point_at_a_thing_on_a_table_names_the_thing(height):
     scene = [DESK, NEAR_WALL, MUG]
