@@ -364,6 +364,19 @@ def test_thin_things_keep_their_length(thick):
     assert np.ptp(kept.columns) == np.ptp(facets.columns)
 
 
+@pytest.mark.parametrize("wide", [0, 2])
+@pytest.mark.parametrize("azimuth", [100, 130, -110])
+def test_a_handle_behind_the_edge_of_its_mug_is_kept_by_a_mask(azimuth, wide):
+    body = trimesh.creation.cylinder(0.04, 0.1).apply_translation((0, 0, 0.05))
+    upright = trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0), (0, 0, 0))
+    handle = trimesh.creation.torus(0.028, 0.005).apply_transform(upright)
+    handle.apply_translation((0.045, 0, 0.05))
+    scene = [trimesh.util.concatenate([body, handle]), TABLE]
+    thing = ObservedObject()
+    thing.add(frame(scene, pose_at(30, azimuth, 0.5, (0, 0, 0.05)), mask_of=0, wide=wide))
+    assert_is(thing, scene[0], radius=0.05)
+
+
 def test_a_second_look_does_not_make_an_object_of_another_order_of_size(monkeypatch):
     """All on the table would count as one where what touches is joined, and the score would
     prefer it.

@@ -23,7 +23,7 @@ def trimmed(depth: NDArray[np.float32], mask: Mask, noise: Noise, high: Mask | N
     The inside is what is farther from the edge; of a thing that is too thin for that, as much
     farther as leaves a third of it. From there the mask grows back over pixels as near as their
     neighbours: EDGE pixels, and as far as they are ``high`` over the support plane, for the legs of
-    a chair are as thin as an edge.
+    a chair are as thin as an edge. What is ``high`` behind a step, and wider than EDGE, is kept.
 
     Args:
         depth: metres, (H, W), 0 where nothing was measured.
@@ -48,9 +48,12 @@ def trimmed(depth: NDArray[np.float32], mask: Mask, noise: Noise, high: Mask | N
     found = inside
     if high is not None:
         far = z - minimum_filter(np.where(own, z, np.inf), 3, mode="constant", cval=np.inf) > step
-        part_of, count = label(own & high[part] & ~far | inside)
+        near = own & high[part] & ~far
+        # behind a step in depth, but wider than the edge of a mask: a handle beside its mug
+        wide = binary_erosion(np.pad(near, 1), np.ones((3, 3), bool), EDGE // 2)[1:-1, 1:-1]
+        part_of, count = label(near | inside)
         reached = np.zeros(count + 1, bool)
-        reached[part_of[inside]] = True
+        reached[part_of[inside | wide]] = True
         found = reached[part_of]
     depth_there = z.astype(np.float32)
     left = own & ~found
