@@ -8,15 +8,19 @@ cross-entropy method (Rubinstein 1999) draws some pairs of weights, keeps the be
 anew around these. It needs ``pip install 'nextview[envs]'``.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import gymnasium
 import numpy as np
 import tyro
 
-import nextview.benchmark.environments  # noqa: F401  # registers the environment
+from nextview.checks import extras
+
+if TYPE_CHECKING:
+    import gymnasium
 
 DRAWN = 9  # agents of each round
 KEPT = 3  # the best of them
@@ -94,6 +98,11 @@ def main(
         episodes: that each agent is judged by.
         seed: of all draws.
     """
+    with extras():
+        import gymnasium
+
+        import nextview.benchmark.environments  # noqa: F401  # registers the environment
+
     name = "nextview/RecogniseThings-v0"
     options = {"objective": "belief", "max_views": 3, "travel_price": 0.02}
     env = gymnasium.make(name, scans=scans, models=models, seed=seed, **options)

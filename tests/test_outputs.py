@@ -12,9 +12,12 @@ from pathlib import Path
 import pytest
 from pipeline import refused, run_python
 
+from nextview.captured.writing import write_capture
 from nextview.cli.commands import COMMANDS
 from nextview.cli.main import main
 from nextview.data.predictions import Predictions
+from nextview.geometry.mesh import load_mesh
+from nextview.geometry.viewsphere import ViewSphere
 
 ROOT = Path(__file__).parent.parent
 SAMPLE = str(ROOT / "samples/chair.off")
@@ -24,6 +27,10 @@ SMALL = "--size 32 --epochs 1 --views-per-object 2 --batch 8 --validation-share 
 WRITES = {
     "recognise": (f"recognise {SAMPLE} --max-views 1 --figure", "e.png"),
     "recognise --record": (f"recognise {SAMPLE} --max-views 1 --record", "e.rrd"),
+    "look": (
+        "look {capture} --models {knobs_memory} --frames 1 --figure",
+        "t.png",
+    ),
     "demo": ("demo --figure", "demo.svg"),
     "capture": (f"capture {SAMPLE}", "folder", "--radius 0.4 --viewpoints 12"),
     "scenes": (
@@ -70,7 +77,10 @@ def made(furniture, views, models, predictions, results, knobs, knobs_memory, tm
     training, own = folder / "p.npz", folder / "views.zarr"
     Predictions.load(predictions).of_split("train").save(training)
     shutil.copytree(views, own)
+    can = load_mesh(knobs / "can.ply", unit="m")
+    list(write_capture(can, folder / "capture", ViewSphere((40.0,), 3), 0.07, table=True))
     return {
+        "capture": folder / "capture",
         "furniture": furniture,
         "views": own,
         "models": models,

@@ -12,7 +12,7 @@ import nextview
 
 PACKAGE = Path(nextview.__file__).parent
 ROOMS = {
-    "Front door": ["session", "errors"],
+    "Front door": ["session", "scene", "errors"],
     "Geometry": ["geometry"],
     "Sensing": ["sensing"],
     "Recognition": ["recognition"],

@@ -50,7 +50,12 @@ ASK_FOR_SCALE = (
 
 
 def is_depth_folder(folder: Path) -> bool:
-    """Whether a folder holds depth images in ``depth/``."""
+    """Whether a folder holds depth images in ``depth/``, and is not BOP's without its cameras.
+
+    BOP's has ``mask_visib/`` too; without ``scene_camera.json`` it was not written to its end.
+    """
+    if (folder / "mask_visib").is_dir():
+        return False
     return next(folder.glob("depth/*.png"), None) is not None
 
 

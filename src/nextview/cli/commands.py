@@ -34,9 +34,7 @@ COMMANDS = {  # by name, in the order in which they are listed
     "recognise": Command(
         f"{CLI}.recognise:recognise", "recognise the object of a mesh or of captured frames"
     ),
-    "look": Command(
-        f"{CLI}.look:look", "say which known things are where on a table: captured views"
-    ),
+    "look": Command(f"{CLI}.look:look", "say which known things stand where on a table"),
     "demo": Command(f"{CLI}.recognise:demo", "recognise a sample object, and draw the episode"),
     "learn": Command(
         f"{TEACHING}.learn:learn_things",

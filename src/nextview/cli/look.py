@@ -48,7 +48,7 @@ class LookOptions:
         unknown: share of known things that may be called unknown (0.02); 0 always names a thing.
     """
 
-    models: tuple[str, ...] = ("ycb",)
+    models: str | tuple[str, ...] = "ycb"
     intrinsics: tuple[float, float, float, float] | Path | None = None
     depth_scale: float | None = None
     depth_topic: str | None = None
@@ -102,7 +102,8 @@ def look(
     )
     capture, left_out = check_capture(read, masked=False)
     console.print(f"{capture!r}")
-    system = load(list(looking.models), unknown=looking.unknown)
+    models = looking.models if isinstance(looking.models, str) else list(looking.models)
+    system = load(models, unknown=looking.unknown)
     scene = Scene(system, *_where(capture, looking))
 
     looks: dict[str, Look] = {}
