@@ -40,7 +40,13 @@ _NOT_PLUGINS = (
 
 
 def needs_package(package: str, extra: str, project: str = "nextview") -> str:
-    """What to say of a missing package: the end of a sentence that begins with what needs it."""
+    """What to say of a missing package: the end of a sentence that begins with what needs it.
+
+    Args:
+        package: as pip knows it.
+        extra: part of the installation that brings it.
+        project: whose part it is.
+    """
     return f"needs the package {package}: pip install '{project}[{extra}]'"
 
 
@@ -88,6 +94,10 @@ def one_line(text: str, most: int = 80) -> str:
 
     >>> print(one_line("a\n  b\x1b[31m"))
     a b\x1b[31m
+
+    Args:
+        text: anything.
+        most: length in characters.
     """
     text = " ".join(text[: 10 * most].split())
     text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
@@ -97,13 +107,24 @@ def one_line(text: str, most: int = 80) -> str:
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """The known name that a wrong one is nearest to, as the next part of a sentence; "" if none
     is near.
+
+    Args:
+        name: that is not known.
+        known: names.
     """
     near = get_close_matches(name, list(known), 1, 0.6)
     return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def whole(value: Any, what: str, least: int = 0, most: int = 2**31 - 1) -> int:
-    """A whole number within limits; UsageError if it is none."""
+    """A whole number within limits; UsageError if it is none.
+
+    Args:
+        value: what was handed in.
+        what: its name in the sentence.
+        least: smallest value.
+        most: largest value.
+    """
     if (
         isinstance(value, bool | np.bool_)
         or not isinstance(value, Integral)
@@ -115,7 +136,13 @@ def whole(value: Any, what: str, least: int = 0, most: int = 2**31 - 1) -> int:
 
 
 def one_of(value: Any, known: Iterable[Any], what: str) -> None:
-    """See that a value is one of some; UsageError if it is none, with those that are known."""
+    """See that a value is one of some; UsageError if it is none, with those that are known.
+
+    Args:
+        value: what was handed in.
+        known: values that are taken.
+        what: its name in the sentence.
+    """
     known = list(known)
     if value not in known:
         named = ", ".join(str(one) for one in known if one is not None)
@@ -125,7 +152,15 @@ def one_of(value: Any, known: Iterable[Any], what: str) -> None:
 def number(
     value: Any, what: str, least: float = -np.inf, most: float = np.inf, above: float = -np.inf
 ) -> float:
-    """A finite number within limits, ``above`` the last excluded; UsageError if it is none."""
+    """A finite number within limits, ``above`` the last excluded; UsageError if it is none.
+
+    Args:
+        value: what was handed in.
+        what: its name in the sentence.
+        least: smallest value.
+        most: largest value.
+        above: the value has to be larger than this.
+    """
     fits = isinstance(value, Real) and not isinstance(value, bool | np.bool_)
     if not fits or not np.isfinite(float(value)) or not (least <= value <= most and value > above):
         reach = [f"of at least {least:g}"] * (least > -np.inf) + [f"above {above:g}"] * (
@@ -175,7 +210,12 @@ def check_array(
 
 
 def points(value: Any, what: str) -> NDArray[np.float64]:
-    """Points in space, (N, 3) float64; UsageError if they are none."""
+    """Points in space, (N, 3) float64; UsageError if they are none.
+
+    Args:
+        value: what was handed in.
+        what: its name in the sentence.
+    """
     try:
         array = np.asarray(value, np.float64)
     except (TypeError, ValueError):

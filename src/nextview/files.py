@@ -43,6 +43,11 @@ def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None
 
     A ``folder`` may be there if it is empty. ResultsError: it exists, is a link, or its place
     cannot be written.
+
+    Args:
+        path: of the output.
+        overwrite: whether a file that exists may be replaced.
+        folder: whether the output is a folder.
     """
     if path.is_symlink():
         raise ResultsError(f"{path}: is a link; give what it points to")
@@ -63,6 +68,10 @@ def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None
 def new_file(path: Path, overwrite: bool = False) -> Iterator[Path]:
     """Write a file whole or not at all: yields a temporary path beside it, of the same suffix;
     see ``check_new``.
+
+    Args:
+        path: of the output.
+        overwrite: whether a file that exists may be replaced.
     """
     check_new(path, overwrite)
     with _beside(path) as temporary:
@@ -166,6 +175,10 @@ def unfinished(output: Path, key: str) -> Iterator[Path]:
     It is the folder that an earlier run with the same key left, or a new one. It is removed at the
     end, but stays after an error if there is anything in it. Folders that earlier runs with other
     keys left are removed, and temporary ones of runs that were killed. Use it inside ``only_one``.
+
+    Args:
+        output: what the parts are for.
+        key: what the run depends on: parts of another key are of no use.
 
     Raises:
         ResultsError: it cannot be written.
@@ -331,6 +344,12 @@ def regular_file(
 
     Else it is an ``error``, which says ``what`` it should be ("a model card"); ``largest`` is a
     size in bytes.
+
+    Args:
+        path: that was handed in.
+        what: the file should be, in the sentence ("a model card").
+        error: kind of error that is raised.
+        largest: size in bytes.
     """
     # Not Path.exists, which raises where a name is too long.
     if not os.path.exists(path):
@@ -346,6 +365,12 @@ def read_record(
 ) -> T:
     """A typed record from a JSON file; an ``error`` if the file is missing, too large, or no
     such record.
+
+    Args:
+        path: of the JSON file.
+        record: type of the record.
+        what: the file should be, in the sentence.
+        error: kind of error that is raised.
     """
     regular_file(path, what, error, LARGEST_RECORD)
     try:
@@ -361,6 +386,12 @@ def decode_record(
     """A typed record from JSON, or from the objects that JSON was read to.
 
     Where it is none, an ``error`` names the field; its sentence begins with ``where``.
+
+    Args:
+        content: JSON, or what it was read to.
+        record: type of the record.
+        where: beginning of the sentence of an error.
+        error: kind of error that is raised.
     """
     try:
         if isinstance(content, bytes):
@@ -371,7 +402,13 @@ def decode_record(
 
 
 def write_record(path: Path, record: Any, overwrite: bool = False) -> None:
-    """Write a record as indented JSON, whole or not at all; see ``new_file``."""
+    """Write a record as indented JSON, whole or not at all; see ``new_file``.
+
+    Args:
+        path: of the JSON file.
+        record: a dataclass.
+        overwrite: whether a file that exists may be replaced.
+    """
     with new_file(path, overwrite) as part:
         part.write_bytes(
             msgspec.json.format(msgspec.json.encode(record, enc_hook=_plain), indent=1) + b"\n"
@@ -393,6 +430,11 @@ def sha256_of(path: Path) -> str:
 def checked_bytes(path: Path, sha256: str, what: str = "weights") -> bytes:
     """The content of a file whose hash a card holds; ModelError if it is missing, or not that
     file.
+
+    Args:
+        path: of the file.
+        sha256: its hash, hexadecimal.
+        what: the file holds, in the sentence.
     """
     regular_file(path, what, ModelError)
     content = path.read_bytes()

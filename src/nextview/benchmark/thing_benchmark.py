@@ -324,7 +324,14 @@ def _mesh(scan: Path, unit: str) -> Mesh:
 def replayed(
     episode: ThingEpisode, name: str, make: Callable[[ThingEpisode], Policy], job: _Job
 ) -> list[ThingRun]:
-    """The runs of one policy in one episode."""
+    """The runs of one policy in one episode.
+
+    Args:
+        episode: what is sensed and verified.
+        name: of the policy.
+        make: the policy for an episode.
+        job: starts, views and rules of all episodes.
+    """
     rng = np.random.default_rng((job.setting.seed, job.thing, job.draw, crc32(name.encode())))
     times = job.repeats if name == "random" else 1
     return [run(episode, make(episode), job.views, rng) for _ in range(times)]

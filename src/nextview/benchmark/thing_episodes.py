@@ -277,7 +277,13 @@ class _Stage:
 
     @classmethod
     def of(cls, mesh: Mesh, setting: Setting, seed: tuple[int, ...]) -> "_Stage":
-        """Turn a thing, draw its sensor and what stands around it."""
+        """Turn a thing, draw its sensor and what stands around it.
+
+        Args:
+            mesh: the thing, metres.
+            setting: sensor, distance and occlusion.
+            seed: of all draws of the episode.
+        """
         rng = np.random.default_rng(seed)
         turn = rotation_z(rng.uniform(0, 2 * np.pi))
         standing = rotated(mesh, turn)

@@ -42,7 +42,12 @@ class RingSteps:
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        """The free view that comes next, of each episode."""
+        """The free view that comes next, of each episode.
+
+        Args:
+            state: of the episodes.
+            rng: draws among equals.
+        """
         azimuths = self.sphere.azimuths
         ring, azimuth = np.divmod(state.current, azimuths)
         steps = TURN_AHEAD * np.arange(1, azimuths)
@@ -67,7 +72,12 @@ class FairCeiling:
     needs: tuple[str, ...] = ("outlook",)
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        """The free view that is expected to raise the log-belief in the truth most."""
+        """The free view that is expected to raise the log-belief in the truth most.
+
+        Args:
+            state: of the episodes.
+            rng: draws among equals.
+        """
         assert state.outlook is not None
         outlook = state.outlook[0]
         assert outlook is not None
@@ -99,7 +109,12 @@ class Foresight:
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
-        """The free view after which the belief in the truth is largest."""
+        """The free view after which the belief in the truth is largest.
+
+        Args:
+            state: of the episodes.
+            rng: draws among equals.
+        """
         views = np.flatnonzero(state.visited[0]).tolist()
         if state.step > 1 and self.episode.belief_in_truth(views) >= SETTLED_BELIEF:
             return Spread(SPHERE).next_views(state, rng)

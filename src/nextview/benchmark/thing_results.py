@@ -75,7 +75,12 @@ def views_of(tables: ThingTables) -> list[int]:
 
 
 def values_of(tables: ThingTables, things: str) -> dict[tuple[str, str, int], tuple[float, ...]]:
-    """Value and interval by policy, measure and views."""
+    """Value and interval by policy, measure and views.
+
+    Args:
+        tables: all measures.
+        things: which half of the things, or all.
+    """
     some = tables.measures[tables.measures["things"] == things]
     keys = zip(some["policy"], some["measure"], some["views"], strict=True)
     numbers = some[["value", "low", "high"]].to_numpy(np.float64)
@@ -171,7 +176,12 @@ def _plain_tex(text: str) -> str:
 
 
 def look_of_policy(policy: str, tables: ThingTables) -> dict[str, Any]:
-    """Colour and line of a policy, the same in all figures."""
+    """Colour and line of a policy, the same in all figures.
+
+    Args:
+        policy: its name.
+        tables: that name all policies.
+    """
     own = [name for name in policies_of_tables(tables) if name not in COLOURS]
     colour = COLOURS.get(policy) or OWN[own.index(policy) % len(OWN)]
     return {"color": colour, "linestyle": ":" if policy in CEILINGS else "-"}

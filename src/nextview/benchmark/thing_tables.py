@@ -94,7 +94,12 @@ class _Runs:
 
     @classmethod
     def of(cls, runs: Sequence[tuple[int, ThingRun]], threshold: float) -> "_Runs":
-        """Put runs side by side, each with the number of its thing."""
+        """Put runs side by side, each with the number of its thing.
+
+        Args:
+            runs: pairs of a thing's number and a run.
+            threshold: belief from which on a run is sure.
+        """
         things = np.array([thing for thing, _ in runs])
         right = np.array([each.right for _, each in runs], np.float64)
         sure = np.array([each.confidence for _, each in runs], np.float64) >= threshold
@@ -117,12 +122,23 @@ class _Runs:
         )
 
     def mean(self, values: Float, drawn: Float) -> Float:
-        """Mean over things of a value of each run, in each sample of things, (S,)."""
+        """Mean over things of a value of each run, in each sample of things, (S,).
+
+        Args:
+            values: of each run, (R,).
+            drawn: how often each sample holds each thing, (S, things).
+        """
         weights = drawn[:, self.things] * self.weight
         return np.asarray(weights @ values / weights.sum(1), np.float64)
 
     def quantile(self, values: Float, drawn: Float, share: float) -> Float:
-        """Quantile of the known values of runs, in each sample of things, (S,)."""
+        """Quantile of the known values of runs, in each sample of things, (S,).
+
+        Args:
+            values: of each run, (R,); NaN where it is not known.
+            drawn: how often each sample holds each thing, (S, things).
+            share: of the runs that lie below, 0 to 1.
+        """
         known = ~np.isnan(values)
         if not known.any():
             return np.full(len(drawn), np.nan)

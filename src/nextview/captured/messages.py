@@ -159,6 +159,10 @@ def parts_of(transform: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
 def matrix_of(position: tuple[float, ...], quaternion: tuple[float, ...]) -> Float:
     """A position, (3,), and a quaternion (x, y, z, w) as a pose, (4, 4).
 
+    Args:
+        position: (3,), metres.
+        quaternion: (4,), x, y, z, w.
+
     Raises:
         ObservationError: the quaternion is none of a rotation.
     """

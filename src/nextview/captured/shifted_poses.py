@@ -243,7 +243,12 @@ def _is_explained(shifted: Shifted, as_read: Index, late: Index) -> bool:
 
 
 def relative_change(poses: Float, others: Float) -> NDArray[np.bool_]:
-    """Of which two cameras the pose relative to each other differs, (N, N)."""
+    """Of which two cameras the pose relative to each other differs, (N, N).
+
+    Args:
+        poses: camera-to-world, (N, 4, 4).
+        others: the same cameras with other poses, (N, 4, 4).
+    """
     relative = np.linalg.inv(poses)[:, None] @ poses[None]
     other_relative = np.linalg.inv(others)[:, None] @ others[None]
     return np.abs(relative - other_relative).max((2, 3)) > SAME_POSE

@@ -144,12 +144,22 @@ class TransformTree:
         return self._above(frame)[-1]
 
     def moves(self, frame: str, world: str) -> bool:
-        """Whether a frame moves in another, as far as transforms say."""
+        """Whether a frame moves in another, as far as transforms say.
+
+        Args:
+            frame: name of the frame that may move.
+            world: name of the frame that stands still.
+        """
         links = self._between(frame, world)
         return any(not self._links[child].fixed for child in links)
 
     def pose(self, frame: str, world: str, time: float) -> Float:
         """From a frame into another, (4, 4), at some time, seconds.
+
+        Args:
+            frame: name of the frame whose pose is asked for.
+            world: name of the frame that it is given in.
+            time: seconds, of the clock of the transforms.
 
         Raises:
             NoTransformError: nothing joins them, or not at that time.

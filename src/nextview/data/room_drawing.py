@@ -194,7 +194,15 @@ def draw_rooms(
 def room_tasks(
     dataset: Path, out: Path, rooms: int | None, seed: int, split: str | None
 ) -> list[Task]:
-    """All rooms that are asked for, see ``draw_rooms``."""
+    """All rooms that are asked for, see ``draw_rooms``.
+
+    Args:
+        dataset: folder of meshes.
+        out: folder of the rooms.
+        rooms: how many of them; None for one an object.
+        seed: of all draws.
+        split: whose objects are shown; None for all.
+    """
     if rooms is not None:
         whole(rooms, "the number of rooms", 1, MOST_SCENES)
     whole(seed, "a seed", 0, 2**31 - 1)
@@ -280,7 +288,13 @@ def draw_room(source: Source, task: Task, seed: int) -> RoomLayout:
 
 
 def life_radius(mesh: Mesh, label: str, rng: np.random.Generator) -> float:
-    """The object radius that a mesh has in life, metres: by its unit, or drawn by its class."""
+    """The object radius that a mesh has in life, metres: by its unit, or drawn by its class.
+
+    Args:
+        mesh: of the object.
+        label: its class.
+        rng: draws the size.
+    """
     if mesh.metres is not None:
         return mesh.metres
     size = LIFE_SIZES.get(label)

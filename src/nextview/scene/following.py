@@ -44,7 +44,12 @@ class Outline:
 
     @classmethod
     def of(cls, track: Track, up: Float) -> Outline | None:
-        """That of an object: of its scan where it was named, else of what was seen of it."""
+        """That of an object: of its scan where it was named, else of what was seen of it.
+
+        Args:
+            track: the object, judged.
+            up: direction against gravity in the world, (3,).
+        """
         axes = upright_axes(up)[:2]
         posed = track.posed
         if posed is not None and posed.vertices is not None:

@@ -136,7 +136,12 @@ def taken_over(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]
 
 
 def bench_judged(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]:
-    """Judge objects, if there is any frame."""
+    """Judge objects, if there is any frame.
+
+    Args:
+        tracks: objects, not judged yet.
+        benches: what parts the pixels of each frame.
+    """
     return benches[-1].judge(tracks) if tracks else []
 
 
@@ -313,6 +318,10 @@ def _parts(track: Track, masks: Sequence[Mask], bench: Bench) -> list[Track]:
 
 def new_track(mask: Mask, bench: Bench) -> Track:
     """An object that no earlier frame showed.
+
+    Args:
+        mask: its pixels in the frame, (H, W) bool.
+        bench: what parts the pixels of the frame.
 
     Raises:
         ObservationError: too little is seen of it.

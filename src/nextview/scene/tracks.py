@@ -104,6 +104,10 @@ class Track:
     def without(self, number: int, up: Float) -> Track | None:
         """The same object without what a frame shows of it; None if no other frame shows it.
 
+        Args:
+            number: of the frame.
+            up: direction against gravity in the world, (3,).
+
         Raises:
             ObservationError: what is seen of the object has no size.
         """

@@ -309,6 +309,10 @@ def _joined(
 def on_ground(points: Float, plane: Float) -> Mask:
     """Which points, (N, 2), lie within the hull of what was seen of the plane, (M, 2), (N,)
     bool.
+
+    Args:
+        points: (N, 2), in the plane.
+        plane: points of the plane that were seen, (M, 2).
     """
     if len(plane) < 3:
         return np.ones(len(points), bool)
@@ -363,6 +367,11 @@ def nearest(
 ) -> int:
     """The cluster nearest to a point, in cells, (2,), seen from above, in most frames; 0 if
     there is none.
+
+    Args:
+        footprints: of the frames.
+        labels: the cluster of each piece, one array a footprint.
+        point: (2,), cells, seen from above.
     """
     cells = np.concatenate([f.cells for f in footprints])
     label = np.concatenate(labels)

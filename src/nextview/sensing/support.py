@@ -97,6 +97,11 @@ def under_points(samples: Samples, planes: list[Plane], points: Float) -> Plane 
     some points, (N, 3).
 
     None where no plane is seen there: the bottom is hidden, or the object hangs in the air.
+
+    Args:
+        samples: of the frame.
+        planes: that were found in it.
+        points: of the object's surface, (N, 3), metres.
     """
     away = float(np.median(np.linalg.norm(points - samples.camera, axis=1)))
     for plane in planes:
@@ -130,7 +135,12 @@ class Target:
     place: Float | None
 
     def off(self, samples: Samples, plane: Plane) -> Float:
-        """How far each sample lies from there, (N,): 1 is as far as the object may be off."""
+        """How far each sample lies from there, (N,): 1 is as far as the object may be off.
+
+        Args:
+            samples: of the frame.
+            plane: that is looked for beneath the object.
+        """
         if self.place is None:
             pixels = np.hypot(samples.rows - self.axis[0], samples.columns - self.axis[1])
             return np.asarray(pixels / (AIM * self.width))

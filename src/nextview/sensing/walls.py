@@ -124,6 +124,11 @@ def before_walls(frame: Frame, walls: Sequence[Plane], noise: Noise) -> Mask:
     At some metres the noise of a pixel is as deep as a thing that stands against the wall. So what
     counts is the mean over the pixels around each, in a coarser picture; beside a thing that is off
     the wall, and the pixel is not.
+
+    Args:
+        frame: of the depth camera.
+        walls: vertical planes that were found in it.
+        noise: of its pixels.
     """
     if not walls:
         return np.ones(frame.shape, bool)

@@ -227,7 +227,12 @@ def weights_of(verification: Verification, where: str) -> EvidenceWeights:
 
 
 def residuals_of(verification: Verification, things: Sequence[int]) -> KnownResiduals | None:
-    """The residuals that a card holds, of some of its things; None if it holds none."""
+    """The residuals that a card holds, of some of its things; None if it holds none.
+
+    Args:
+        verification: of the card.
+        things: rows of the things that are meant.
+    """
     if not verification.usual:
         return None
     usual = np.array(verification.usual)[list(things)]

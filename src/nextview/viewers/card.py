@@ -153,6 +153,11 @@ def geometry_card(walk: Walk, direction: NDArray[np.float64], what: str) -> str:
     """The two leading hypotheses as rendered from a direction, (3,), and where they differ.
 
     Nothing where no geometry is known, or only one hypothesis is left.
+
+    Args:
+        walk: the episode so far.
+        direction: from the object to the camera, (3,).
+        what: the view is, in the heading.
     """
     rivals = walk.rival_pictures(direction)
     outlook = walk.session.outlook
