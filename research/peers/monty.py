@@ -1,9 +1,8 @@
-"""Monty of the Thousand Brains Project on YCB scans in random 3D rotations, for a row beside ours.
+"""Monty of the Thousand Brains Project on YCB scans in random 3D rotations.
 
     python research/peers/monty.py scans YCB WORK
     python research/peers/monty.py teach WORK
     python research/peers/monty.py recognise WORK
-    python research/peers/monty.py table WORK
 
 Monty needs an environment of its own, in which nextview need not be installed:
 
@@ -21,7 +20,8 @@ the rotations (six of its fourteen to teach, three drawn by its seed to test), a
 the renderer draws very slowly and no depth shows.
 
 The ten things are the first five of each of Monty's own lists of ten distinct and ten similar
-things, those that are on both counted once.
+things, those that are on both counted once. Teaching takes hours; no figure of ours was made with
+it yet.
 """
 
 from __future__ import annotations
