@@ -132,6 +132,7 @@ def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
                 np.int64
             )
         )
+
     p = specs.predictions
     there = {"visibility", *p.maps, *(TRUE + name for name in known_maps(p))}
     there |= {"azimuth_bins"} if p.azimuth_bins is not None else set()
@@ -141,6 +142,7 @@ def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
         bins = lacking[0] == "azimuth_bins"
         what = "what the recogniser says of the azimuth bins" if bins else f"the map {lacking[0]!r}"
         raise EntryError(f"policy {name} needs {what}, which these predictions lack")
+
     return policy
 
 
@@ -162,6 +164,7 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
     if measured := TRUE_MEASURE.fullmatch(name):
         values = true_measure(p, measured[1])[specs.objects].astype(np.float64)
         return OracleMeasure(p.sphere, values, measured[2] == "-peak")
+
     match = MAP_ORACLE.fullmatch(name)
     true, base, how = match.groups("") if match else ("", "", "")
     predicted = [name for name in p.maps if how == "-oracle-valley" and not name.endswith(SPHERE)]
@@ -173,6 +176,7 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
         raise EntryError(
             f"no true map is called {name!r}; there are {there}, and more after nextview measure"
         )
+
     known = plain in policy_names() or map_policy(plain, p.sphere, (), p.maps) is not None
     card = plain.removeprefix(VISIBLE)
     if known or card in bundled_policies() or card.endswith(".json") or ":" in name:
@@ -182,6 +186,7 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
             "the policy discriminate needs the memory of taught things that made these predictions:"
             " name its models, --models FOLDER (or ycb), or its card, --policies FOLDER/memory.json"
         )
+
     names = [*policy_names(), *map_policy_names(p.maps), *bundled_policies(), *ORACLES]
     names += ["true-MEASURE-all", *(f"{kind}-K" for kind in FIXED)]
     raise EntryError(

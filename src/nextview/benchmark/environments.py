@@ -210,6 +210,7 @@ class Task:
                 for name, wide in widths.items()
             ]
         )
+
         return gymnasium.spaces.Box(
             np.where(high > 1, -MAP_LIMIT, 0).astype(np.float32), high.astype(np.float32)
         )

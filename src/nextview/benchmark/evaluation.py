@@ -275,6 +275,7 @@ def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]
     rows: list[tuple] = []
     left_out = {} if p.maps else {"maps": "these predictions hold none"}
     known = known_maps(p)
+
     for name, predicted in p.maps.items():
         if name.endswith("-sphere"):  # its window is judged
             continue
@@ -310,6 +311,7 @@ def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]
                         (name, by, label, over + measure, value[i], low[i], high[i], beside)
                     )
     columns = ["map", "by", "label", "measure", "value", "low", "high", "published"]
+
     return pd.DataFrame(rows, columns=columns).astype({"published": "float64"}), left_out
 
 

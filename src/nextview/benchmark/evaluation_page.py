@@ -65,6 +65,7 @@ def write_evaluation(
     p = chosen_split(Predictions.load(predictions), predictions, settings.split)
     p = p.deduplicate() if settings.deduplicate else p
     noted = {}
+
     for name in settings.cards:
         card = find_card(name)
         what = "shapes" if settings.deduplicate else "objects"
@@ -80,6 +81,7 @@ def write_evaluation(
     }
     made |= {"models": p.models, "objects": len(p)}
     found = evaluate(p, settings.samples, np.random.default_rng([settings.seed, 0]))
+
     with new_folder(out, overwrite, last="evaluate.json", withdraw=True) as part:
         for name, frame in found.tables().items():
             frame.to_csv(part / f"{name}.csv", index=False)
@@ -97,6 +99,7 @@ def write_evaluation(
                     f"{path}: became the card of another model while this ran, and is left as it is"
                 )
             write_card(path, replace(card, scores={**card.scores, **scores}))
+
     return found
 
 

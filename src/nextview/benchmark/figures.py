@@ -166,6 +166,7 @@ def differences(results: Results, threshold: float) -> Figure:
     ]
     figure, axes = new_figure(4.6, 0.6 + 0.24 * max(3, len(rows)))
     row: Any  # a named tuple
+
     for y, row in enumerate(rows.itertuples()):
         colour = look_of(row.policy, results)["color"]
         axes.hlines(y, 100 * row.low, 100 * row.high, color=colour, linewidth=1.6)
@@ -176,6 +177,7 @@ def differences(results: Results, threshold: float) -> Figure:
     axes.grid(axis="y", visible=False)
     axes.tick_params(axis="y", length=0)
     axes.set_xlabel(f"accuracy, percentage points: difference to {results.settings['reference']}")
+
     return figure
 
 

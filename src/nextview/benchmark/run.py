@@ -159,6 +159,7 @@ def _prepare(predictions: Path, s: BenchmarkSettings) -> tuple[Grid, list[str], 
         raise UsageError(
             f"policies take 1 to {s.max_views} views (--max-views), and --views asks for {asked}"
         )
+
     table = Predictions.load(predictions)
     if s.uncalibrated:
         table = replace(table, calibration=PLAIN_SUM)
@@ -181,6 +182,7 @@ def _prepare(predictions: Path, s: BenchmarkSettings) -> tuple[Grid, list[str], 
     ]
     names = list(dict.fromkeys([*([s.reference] if s.policies else []), *names]))
     thresholds = tuple(sorted({*s.thresholds, *promised.values()}))
+
     return Grid(specs, s.runs, thresholds, s.max_views, s.seed, decay, s.stopping), names, promised
 
 

@@ -254,6 +254,7 @@ def _check_same(out: Path, settings: ThingSettings, things: TaughtThings) -> Non
     if not file.exists():
         write_record(file, made)
         return
+
     before = read_record(file, _Made, "a record of episodes", ResultsError)
     for name in _Made.__struct_fields__:
         old, new = getattr(before, name), getattr(made, name)

@@ -140,6 +140,7 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
         self._travel = 0.0
         self._over = False
         self._value = self._judged()
+
         return self._observed(), self._info()
 
     def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:

@@ -240,6 +240,7 @@ class ThingEpisode:
             total = np.sum([self.log_evidence(view) for view in seen], axis=0)
             here = SPHERE.azimuth[views[-1]]
             joint = recogniser.calibration.joint(total, len(seen), classes, here)[None]
+
         return EpisodeState(
             current=np.array([views[-1]]),
             visited=visited,
@@ -298,6 +299,7 @@ class _Stage:
         around = None
         if setting.occlusion != "none":
             around = hiding_boxes(standing, VISIBLE_SHARES[setting.occlusion], (*seed, 2))
+
         return cls(standing, around, sensor, (*seed, 7), in_truth)
 
     def camera(self, view: int) -> SensedCamera:
@@ -333,6 +335,7 @@ def hiding_boxes(standing: Mesh, wanted: tuple[float, float], seed: tuple[int, .
     alone = SimulatedCamera(standing, SHARE_SIDE)
     own = [alone.observe(pose).depth for pose in poses]
     found: list[tuple[float, Mesh]] = []
+
     for _ in range(LAYOUTS_TRIED):
         boxes = boxes_around(
             standing.vertices, int(rng.integers(FEWEST_BOXES, MOST_BOXES + 1)), rng
@@ -348,6 +351,7 @@ def hiding_boxes(standing: Mesh, wanted: tuple[float, float], seed: tuple[int, .
         found.append((max(wanted[0] - share, share - wanted[1]), boxes))
         if found[-1][0] <= 0:
             break
+
     return min(found, key=lambda pair: pair[0])[1]
 
 
@@ -378,6 +382,7 @@ def _observation(kept: "KeptArrays", view: int) -> Observation:
             bool(free),
         )
     pose, intrinsics, (radius,) = np.split(numbers[:26], (16, 25))
+
     return Observation(
         kept[f"{view}.depth"],
         pose.reshape(4, 4),

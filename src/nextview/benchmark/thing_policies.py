@@ -92,6 +92,7 @@ class FairCeiling:
         )
         cameras = outlook.cameras(SPHERE.directions)
         gain = replace(outlook, hypotheses=hypotheses).expect(cameras).gain(0)
+
         return best_view(SPHERE, state, gain[None] + 1e-9 * rng.random((1, len(SPHERE))))
 
 
@@ -157,6 +158,7 @@ def policies_of(
         if ":" not in name:
             raise UsageError(f"no policy is called {name}; there are {', '.join(POLICIES)}")
         known[name] = _always(make_policy(name, SPHERE))
+
     return {name: known[name] for name in names}
 
 

@@ -154,6 +154,7 @@ def latex(tables: ThingTables) -> str:
         "\\toprule",
         " & ".join(["", *map(str, views), "until sure", "wrong"]) + " \\\\",
     ]
+
     for things in groups_of(tables):
         lines += [
             "\\midrule",
@@ -218,6 +219,7 @@ def difference_figure(tables: ThingTables) -> Figure:
     rows = tests[(tests["measure"] == "accuracy") & (tests["views"] == at)]
     policies = [name for name in policies_of_tables(tables) if name != REFERENCE][::-1]
     figure, axes = new_figure(4.6, 0.8 + 0.3 * max(3, len(policies)))
+
     for things, shift, marker in ((ALL, 0.14, "o"), (CONFUSABLE, -0.14, "s")):
         some = rows[rows["things"] == things].set_index("policy")
         for y, policy in enumerate(policies):
@@ -245,4 +247,5 @@ def difference_figure(tables: ThingTables) -> Figure:
     axes.tick_params(axis="y", length=0)
     axes.set_xlabel(f"named right after {at} views, percentage points: difference to random")
     legend(axes)
+
     return figure

@@ -108,6 +108,7 @@ class _Runs:
         rows = np.arange(len(runs))
         arcs = [SPHERE.arc[each.views[:-1], each.views[1:]] for _, each in runs]
         travel = np.concatenate([np.zeros((len(runs), 1)), np.cumsum(arcs, axis=1)], 1)
+
         return cls(
             things=things,
             weight=1 / np.bincount(things)[things],
@@ -188,6 +189,7 @@ def summarise_things(runs: Sequence[EpisodeRuns], alike: Alikeness, how: Compare
     groups = {ALL: np.ones(len(alike.names), bool), CONFUSABLE: alike.confusable}
     rows: list[tuple] = []
     tests: list[tuple] = []
+
     for things, chosen in groups.items():
         some = [each for each in runs if chosen[number[each.thing]]]
         if not some:
@@ -201,6 +203,7 @@ def summarise_things(runs: Sequence[EpisodeRuns], alike: Alikeness, how: Compare
             rows += [(things, policy, *row) for row in _rows(sampled[policy])]
             rows += [(things, policy, *row) for row in _times(together)]
         tests += [(things, *row) for row in _differences(sampled)]
+
     return ThingTables(
         pd.DataFrame(
             rows, columns=["things", "policy", "measure", "views", "value", "low", "high"]
@@ -248,6 +251,7 @@ def _differences(sampled: dict[str, Sampled]) -> list[tuple]:
     """Differences to random: policy, measure, views, difference, interval and p-value."""
     if REFERENCE not in sampled:
         return []
+
     found = []
     for policy, own in sampled.items():
         if policy == REFERENCE:

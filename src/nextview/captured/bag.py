@@ -369,6 +369,7 @@ def _transforms(bag: Bag) -> TransformTree:
         for connection, _, message in (bag.messages(topics) if topics else ())
         for each in message.transforms
     )
+
     try:
         for fixed, each in said:
             child = each.child_frame_id.lstrip("/")
@@ -378,6 +379,7 @@ def _transforms(bag: Bag) -> TransformTree:
         tree.sort()
     except TransformError as error:
         raise DatasetError(f"{bag.path}: {error}") from None
+
     return tree
 
 
@@ -394,12 +396,14 @@ def _intrinsics(bag: Bag, topic: str, image: RecordedImage) -> tuple[Float, str]
             f"{bag.path}: the camera_info of {topic} is missing (there is {there}): give"
             " --intrinsics FX FY CX CY, or a file with them"
         )
+
     info = next(bag.messages(found))[2]
     if (info.width, info.height) != image.size:
         raise DatasetError(
             f"{bag.path}: {found[0].topic} is of images of {info.width} x {info.height} pixels, and"
             f" {topic} has {image.size[0]} x {image.size[1]}"
         )
+
     distorts = bool(np.any(np.asarray(info.d)))
     try:
         return intrinsics_of(info, rectified=distorts and "rect" in topic), found[0].topic

@@ -135,6 +135,7 @@ def intrinsics_of(info: Any, rectified: bool = False) -> Float:
         raise ObservationError(
             f"the camera is not calibrated: {'p' if rectified else 'k'} of camera_info is zero"
         )
+
     return k
 
 

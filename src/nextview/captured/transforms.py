@@ -168,6 +168,7 @@ class TransformTree:
         root = self.root(frame)
         if self.root(world) != root:
             raise NoTransformError(f"tf does not join {frame!r} with {world!r}")
+
         ways = []
         for each in (frame, world):
             pose = np.eye(4)
@@ -180,6 +181,7 @@ class TransformTree:
                     )
                 pose = step @ pose
             ways.append(pose)
+
         return np.asarray(np.linalg.inv(ways[1]) @ ways[0])
 
     def _above(self, frame: str) -> list[str]:

@@ -61,6 +61,7 @@ def _policies(rows: list[Any], threshold: float, reference: str) -> Table:
     title = f"threshold {threshold:g}; in brackets 95 % intervals; points over {reference}"
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
     table.add_column("policy", overflow="fold", min_width=20)
+
     for column in ("accuracy", "class\nmean", "views", "travel\ncells", f"over\n{reference}", "p"):
         table.add_column(column, justify="right", no_wrap=True)
     for i, s in enumerate(rows):
@@ -80,6 +81,7 @@ def _policies(rows: list[Any], threshold: float, reference: str) -> Table:
         table.add_row(
             s.policy, *accuracy, f"{s.n_views:.2f}", f"{s.travel:.2f}", over, p, style=style
         )
+
     return table
 
 

@@ -151,7 +151,9 @@ def _where(capture: Capture, looking: LookOptions) -> tuple[NDArray[np.float64] 
             f"{capture.folder}: a region is upright, and in this layout nothing tells where up is:"
             " give --up"
         )
+
     low, high = np.array(looking.region[:3]), np.array(looking.region[3:])
+
     return up, Box(low, high, upright_axes(up))
 
 
@@ -194,6 +196,7 @@ def _row(thing: SceneObject) -> list[str]:
         belief = ""
     elif not thing.confident:
         name = f"{name} ?"
+
     return [
         str(thing.number),
         name,
@@ -215,6 +218,7 @@ def scene_as_json(scene: Scene, looks: dict[str, Look], left_out: dict[str, str]
     """
     names = [name for name, one in looks.items() if one.taken]
     objects = []
+
     for thing in scene.objects:
         likely = {
             name: belief for name, belief in thing.result.beliefs.items() if belief >= LEAST_BELIEF
@@ -249,6 +253,7 @@ def scene_as_json(scene: Scene, looks: dict[str, Look], left_out: dict[str, str]
         }
         for name, one in looks.items()
     ]
+
     return {"unit": "m", "objects": objects, "frames": frames, "left_out": left_out}
 
 

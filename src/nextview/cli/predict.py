@@ -82,6 +82,7 @@ def summed_up(p: Predictions) -> list[str]:
         of_all = p.calibration.log_belief(p.log_evidence.sum(1), len(p.sphere), classes).argmax(1)
     right = answers == p.labels[:, None]
     fused = of_all == p.labels
+
     for split in np.unique(p.splits):
         here = p.splits == split
         shares = (
@@ -89,4 +90,5 @@ def summed_up(p: Predictions) -> list[str]:
             f" {fused[here].mean():.3f}"
         )
         lines.append(f"{here.sum()} {split} objects: {shares}".replace("  ", " "))
+
     return lines

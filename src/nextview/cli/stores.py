@@ -67,6 +67,7 @@ def render(
         console.print(f"{takes}; those of {size} are for models of your own", style="yellow")
     found = rendering.listing(dataset, how)
     console.print(found.summary())
+
     try:
         before = int(ViewStore.open(store).done.sum())
     except DatasetError:
@@ -88,6 +89,7 @@ def render(
         raise DatasetError(
             f"{store}: none of the {len(made)} meshes can be used; see the reasons above"
         )
+
     console.print(
         f"{store}: {done} of {len(made)} objects, {len(sphere)} views each", soft_wrap=True
     )

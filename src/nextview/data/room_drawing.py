@@ -425,6 +425,7 @@ def _furniture(
     objects: list[Standing] = []
     slabs: list[Slab] = []
     others = source.furniture.get(split, ())
+
     for _ in range(int(rng.integers(FURNITURE[0], FURNITURE[1] + 1))):
         for _ in range(PLACES_TRIED):
             thing: Standing | Slab | None = _cabinet(room, rng)
@@ -445,6 +446,7 @@ def _furniture(
                 taken.append(outline)
                 (objects if isinstance(thing, Standing) else slabs).append(thing)  # type: ignore[arg-type]
                 break
+
     return objects, slabs
 
 
@@ -510,6 +512,7 @@ def _lying(
     radius, azimuth, rest = how
     rotation = IDENTITY if np.array_equal(rest, np.eye(3)) else tuple(rest.ravel().tolist())
     sha256 = mesh_hash(source.folder / file)
+
     for _ in range(PLACES_TRIED):
         aside = _on_top(top, rng)
         thing = Standing(
@@ -526,6 +529,7 @@ def _lying(
         if _fits(outline, top, taken):
             taken.append(outline)
             return thing
+
     return None
 
 

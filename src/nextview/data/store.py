@@ -145,6 +145,7 @@ class ViewStore:
         path = Path(path)
         if not (path / "zarr.json").is_file():
             raise DatasetError(f"{path}: there is no view store; make one with nextview render")
+
         try:
             group = zarr.open_group(path, mode="r+")
         except DAMAGED as error:
@@ -154,7 +155,9 @@ class ViewStore:
         content = group.attrs.asdict()
         if content.get("format") != FORMAT:
             raise DatasetError(f"{path}: not a view store of format {FORMAT}; render it again")
+
         content.setdefault("rotated", content.get("turn", False))  # its name before
+
         return cls(
             path,
             group,

@@ -187,6 +187,7 @@ def checked_pose(pose: Any) -> NDArray[np.float64]:
         raise ObservationError(
             f"the last row of the pose is {pose[3].tolist()}, not 0 0 0 1: is it transposed?"
         )
+
     rotation = pose[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID:
         raise ObservationError(
@@ -196,12 +197,14 @@ def checked_pose(pose: Any) -> NDArray[np.float64]:
         raise ObservationError(
             "the pose is mirrored: an axis is reversed (OpenCV axes are x right, y down, z forward)"
         )
+
     distance = float(np.sqrt((pose[:3, 3] ** 2).sum()))
     if distance > 2 * FARTHEST:
         what = f"the camera stands {distance:.4g} object radii from the object"
         raise ObservationError(
             f"{what}: is its position in millimetres? Divide it by the object radius"
         )
+
     return pose
 
 
@@ -230,10 +233,12 @@ def checked_intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.fl
         raise ObservationError(
             f"the last row of the intrinsics is {last}, not 0 0 1: are they transposed?"
         )
+
     focal = intrinsics[0, 0], intrinsics[1, 1]
     if not min(focal) > 0.01 * max(shape):  # less would show all that lies ahead: metres, say
         wanted = f"positive numbers of pixels, about as many as the image has a side ({max(shape)})"
         raise ObservationError(f"the focal lengths are {wanted}, not {focal[0]:g} and {focal[1]:g}")
+
     return intrinsics
 
 

@@ -285,6 +285,7 @@ def _columns(data: bytes, at: int, element: Element) -> tuple[Scalars, Lists, ND
     scalars: Scalars = {}
     lists: Lists = {}
     place = np.append(at, ends[:-1])  # in each row, of the next column
+
     for column in element.properties:
         if column.count is None:
             scalars[column.name] = _gathered(data, place, column.kind)
@@ -296,6 +297,7 @@ def _columns(data: bytes, at: int, element: Element) -> tuple[Scalars, Lists, ND
         places = np.repeat(starts, counts) + within * column.kind.itemsize
         lists[column.name] = (_gathered(data, places, column.kind), counts)
         place = starts + counts * column.kind.itemsize
+
     return scalars, lists, np.diff(ends, prepend=at)
 
 

@@ -47,13 +47,17 @@ def read_stl(
         raise MeshError(
             f"the file is cut short or damaged, {announced} faces do not take {len(data)} bytes"
         )
+
     held, rest = divmod(len(data) - HEADER_BYTES, FACET.itemsize)
     if held > announced and rest == 0:  # other bytes after the end are somebody's notes
         raise MeshError(f"it announces {announced} faces, but holds {held}")
+
     check_faces(announced, max_faces)
     facets = np.frombuffer(data, FACET, announced, HEADER_BYTES)
+
     with np.errstate(invalid="ignore"):  # of numbers that are none, which are refused with the mesh
         vertices = facets["corners"].reshape(-1, 3).astype(np.float64)
+
     return vertices, np.arange(len(vertices)).reshape(-1, 3)
 
 

@@ -146,6 +146,7 @@ def features(
             parts.append(np.take_along_axis(believed, (np.arange(n) + ahead[:, None]) % n, 1))
     if VISIBILITY in inputs:
         parts.append(visibility_of(state)[rows[:, None], cells_from(sphere)[start]])
+
     return np.concatenate(
         [np.asarray(part, np.float64).reshape(len(rows), -1) for part in parts], 1
     )
@@ -232,6 +233,7 @@ class Gain:
                 f"a gain policy takes some of {known} and of the maps that are predicted, not"
                 f" {other}"
             )
+
         check_weight(self.travel_weight)
         if self.frame not in get_args(CellFrame):
             raise PolicyError(

@@ -131,6 +131,7 @@ class OffGrid:
         turned = replace(
             state, current=current, visited=visited, reachable=reachable, visibility=visibility
         )
+
         return replace(turned, travel=None, places=None), ahead
 
     def _grid_directions(self, state: EpisodeState) -> Float:

@@ -133,6 +133,7 @@ def _draw_frame(
     axes.set_xlim(part[1].start - 0.5, part[1].stop - 0.5)
     axes.set_ylim(part[0].stop - 0.5, part[0].start - 0.5)
     axes.axis("off")
+
     for thing in objects:
         mask = thing.pixels.get(number)
         if mask is None:
@@ -149,6 +150,7 @@ def _draw_frame(
             _draw_axes(axes, frame, thing)
     taken: list[tuple[float, float]] = []
     line = LINE_SHARE * (part[0].stop - part[0].start)
+
     for thing in objects:
         mask = thing.pixels.get(number)
         if mask is None:
@@ -289,6 +291,7 @@ def _from_above(thing: SceneObject, upright: Float) -> tuple[Float, Mask | None]
     start = np.column_stack([low + at * CELL, np.full(len(at), corners[:, 2].max() + 1.0)])
     caster = RayCaster([(corners, posed.faces)])
     away, _ = caster.cast(start, np.broadcast_to([0.0, 0.0, -1.0], start.shape))
+
     return corners[:, :2], np.isfinite(away).reshape(count)
 
 

@@ -85,6 +85,7 @@ def assign(
     outlines = [Outline.of(track, top.up) for track in tracks]
     own: dict[int, Mask] = {}
     new = []
+
     for segment in segments:
         points = _points(segment, top.frame)
         shares = np.array(
@@ -99,6 +100,7 @@ def assign(
         else:
             for row, mask in _divided(segment, rows, tracks, outlines, top).items():
                 own[row] = own.get(row, np.zeros_like(segment)) | mask
+
     return own, new
 
 
@@ -133,10 +135,12 @@ def _divided(
         label[explained & (label == 0)] = row + 1
     if not label.any():
         return {int(rows[0]): segment}
+
     nearest = ndimage.distance_transform_edt(
         label == 0, return_distances=False, return_indices=True
     )
     label = np.where(segment, label[tuple(nearest)], 0)
+
     return {int(row): label == row + 1 for row in rows if (label == row + 1).any()}
 
 
@@ -203,6 +207,7 @@ def _agreement_of_points(track: Track, frame: Frame) -> Agreement:
     off = (depth - in_camera[inside, 2])[depth > 0]
     if not len(off):
         return Agreement(0, 0.0, 0.0)
+
     return Agreement(
         len(off),
         float((np.abs(off) < STEP_BEHIND).mean()),

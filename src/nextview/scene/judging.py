@@ -108,6 +108,7 @@ class Judge:
         counted = 0
         belief = even
         views = []
+
         for seen in observations:
             alone = even
             score: ViewScore | None = None
@@ -133,6 +134,7 @@ class Judge:
                 score=score,
             )
             views.append(view)
+
         return views
 
     def _impossible(self, thing: ObservedObject) -> tuple[str, ...]:

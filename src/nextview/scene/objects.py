@@ -62,6 +62,7 @@ class SceneObject:
         seen = np.concatenate([one.hull for one in sightings])
         pair = [other for other in touching if track.number in other]
         others = sorted({number for both in pair for number in both} - {track.number})
+
         return cls(
             number=track.number,
             name=result.answer or UNKNOWN,

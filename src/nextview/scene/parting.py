@@ -151,13 +151,16 @@ def _taken(loser: Track, taker: Track, bench: Bench) -> tuple[Track, Track] | No
     rendered = bench.render(taker)
     if mask is None or rendered is None:
         return None
+
     own = mask & rendered.explained(mask.shape)
     count = int(np.count_nonzero(own))
     if count < FEWEST or count < LEAST_TAKEN * np.count_nonzero(mask):
         return None
+
     rest = mask & ~rendered.around(mask.shape)
     before = taker.mask_in(bench.number)
     own = own if before is None else own | before
+
     try:
         grown = taker.with_mask(bench.number, own, bench.top)
         if bench.top.is_thing(rest):
@@ -167,6 +170,7 @@ def _taken(loser: Track, taker: Track, bench: Bench) -> tuple[Track, Track] | No
     except ObservationError:
         return None
     gone = replace(loser, frames=()) if left is None else replace(left, result=loser.result)
+
     return gone, replace(grown, result=taker.result)
 
 

@@ -109,6 +109,7 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Fl
     z = frame.depth[rows, columns]
     pose, (x, y) = frame.camera_to_world, frame.rays
     ij = []
+
     for axis in axes[:2]:
         a, b, c = (pose[:3, :3].T @ axis / cell).astype(np.float32)
         position = z * (a * x[columns] + b * y[rows] + c) + np.float32(axis @ pose[:3, 3] / cell)
@@ -135,6 +136,7 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Fl
     at, piece = np.divmod(pairs, many)
     cells = np.stack(np.divmod(used[at], side), 1) + low
     pixels = count[pairs]
+
     return Footprint(cells, piece, pieces, area, pixels)
 
 
@@ -159,6 +161,7 @@ def clusters(
     sizes = [len(f.cells) for f in footprints]
     if not sum(sizes):
         return [np.zeros(n, np.int64) for n in sizes], np.zeros(1, bool)
+
     first = np.cumsum([0, *(len(f.pieces.stands) for f in footprints)])
     node = np.concatenate([f.piece + start for f, start in zip(footprints, first, strict=False)])
     cells = np.concatenate([f.cells for f in footprints])
@@ -170,6 +173,7 @@ def clusters(
     within = _within_outlines(footprints, shared)
     strength, apart, either = _links(footprints, shared, beside, within, joins)
     cluster, doubtful = _joined(strength, apart, size)
+
     for a, b in np.argwhere(np.triu(either)):  # in doubt until a frame shows which
         if (
             cluster[a] != cluster[b]
@@ -178,9 +182,11 @@ def clusters(
             doubtful.append((int(a), int(b)))
     two = np.zeros(cluster.max() + 2, bool)
     whole = np.bincount(cluster, size)
+
     for a, b in doubtful:
         if min(size[a], size[b]) > TWO * max(whole[cluster[a]], whole[cluster[b]]):
             two[[cluster[a] + 1, cluster[b] + 1]] = True
+
     return np.split(np.where(near, cluster[node] + 1, 0), np.cumsum(sizes)[:-1]), two
 
 
@@ -274,6 +280,7 @@ def _links(
     touch &= ~(both & low) if joins == "by their border" else joins == "always"
     strength[touch | inside] = TOUCH
     side_by_side = same & beside & (strength == 0)
+
     return (
         strength,
         same & beside & both & (shared < OVERLAP) & ~inside & ~touch,

@@ -143,6 +143,7 @@ def _grown(
     flat = wide.ravel()
     row = wide.shape[1]
     bare = np.flatnonzero(np.pad(mask & (label == 0), 1))
+
     for _ in range(GROWN):
         beside = bare[:, None] + (1, row, -1, -row)
         off = np.where(flat[beside] > 0, np.abs(deep[beside] - deep[bare, None]), np.inf)
@@ -152,6 +153,7 @@ def _grown(
             break
         flat[bare[joins]] = flat[beside[nearest][joins]]
         bare = bare[~joins]
+
     return wide[1:-1, 1:-1]
 
 
@@ -207,6 +209,7 @@ def _touching(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse) ->
     wide = np.pad(label, far)
     deep = np.pad(inverse, far, constant_values=np.nan)
     meeting = []
+
     for (one, other), (down, right) in zip(NEXT, ((0, 1), (1, 0)), strict=True):
         a = label[one]
         b = label[other]
@@ -230,6 +233,7 @@ def _touching(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse) ->
     size = np.sqrt(np.bincount(label.ravel()))
     touch = _borders(label, meeting) > np.maximum(CONTACT * np.minimum.outer(size, size), 2)
     touch[0] = touch[:, 0] = False
+
     return touch
 
 

@@ -167,6 +167,7 @@ class _Surface:
         normals = -facets.planes / np.linalg.norm(facets.planes, axis=1, keepdims=True)
         noise = sighting.noise.at(depth) * depth**2
         every = max(1, len(depth) // POINTS)
+
         return cls(
             sighting=sighting,
             facets=facets,

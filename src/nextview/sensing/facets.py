@@ -66,6 +66,7 @@ def estimate_noise(depth: NDArray[np.float32], usable: NDArray[np.bool_]) -> Noi
     """
     q = np.where(usable, 1 / np.where(usable, depth, 1), np.nan)
     found = []
+
     for lag in LAGS:
         second = (
             np.abs(q[:, : -2 * lag] - 2 * q[:, lag:-lag] + q[:, 2 * lag :])
@@ -78,11 +79,13 @@ def estimate_noise(depth: NDArray[np.float32], usable: NDArray[np.bool_]) -> Noi
         found.append((lag, second[known], depth[:, lag:-lag][known]))
     if not found:
         return Noise(np.ones(1), np.zeros(1))
+
     typical = np.array([_sigma(second) for _, second, _ in found])
     grain = found[int((typical >= 0.7 * typical.max()).argmax())][0]
     _, second, at = found[-1]
     parts = np.array_split(np.argsort(at), min(BINS, len(at)))
     depths = np.array([np.median(at[part]) for part in parts], np.float64)
+
     return Noise(depths, np.array([_sigma(second[part]) for part in parts]), grain)
 
 
@@ -259,6 +262,7 @@ def _moments(weight: Float, x: Float, y: Float, q: Float) -> Float:
     moments = np.empty((10, *weight.shape))
     moments[0] = weight
     moments[6] = q
+
     for product, one, other in (
         (1, 0, x),
         (2, 0, y),
@@ -270,6 +274,7 @@ def _moments(weight: Float, x: Float, y: Float, q: Float) -> Float:
     ):
         np.multiply(moments[one], other, out=moments[product])
     np.multiply(q, q, out=moments[9])
+
     return moments
 
 

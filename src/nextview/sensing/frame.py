@@ -73,6 +73,7 @@ class Frame:
             raise ObservationError(
                 f"the first pixel's centre has the coordinate 0 or 0.5, not {pixel_centre!r}"
             )
+
         intrinsics[:2, 2] += 0.5 - pixel_centre
         object.__setattr__(self, "depth", depth)
         object.__setattr__(self, "intrinsics", intrinsics)
@@ -304,6 +305,7 @@ def check_pose(pose: ArrayLike) -> NDArray[np.float64]:
         raise ObservationError(
             f"the last row of a pose is 0, 0, 0, 1, not {last}" + ": transposed?" * transposed
         )
+
     rotation = pose[:3, :3]
     gram = rotation.T @ rotation
     scale = np.sqrt(np.trace(gram) / 3)
@@ -315,6 +317,8 @@ def check_pose(pose: ArrayLike) -> NDArray[np.float64]:
         raise ObservationError(
             "the pose is mirrored (left-handed axes): one axis has the wrong sign"
         )
+
     u, _, vt = np.linalg.svd(rotation)
     pose[:3, :3] = u @ vt  # poses from text files are rounded
+
     return pose

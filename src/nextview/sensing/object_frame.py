@@ -185,6 +185,7 @@ def smallest_circle(points: Float) -> tuple[Float, float]:
     corners = points[:1]
     centre = points[0]
     radius = 0.0
+
     while True:
         distance = np.linalg.norm(points - centre, axis=1)
         farthest = int(distance.argmax())

@@ -216,6 +216,7 @@ class ObservedObject:
             if s.footprint is not None and s.chosen is not None
         ]
         found: list[clusters.Joins] = []
+
         for joins in (j for j in get_args(clusters.Joins) if old and j != self.state.joins):
             labels, _ = clusters.clusters([foot for foot, _ in old], joins)
             votes = np.concatenate(
@@ -667,6 +668,7 @@ class ObservedObject:
             here = labels[-1]
             target = clusters.nearest(footprints, labels, asked)
             return target if target in here else clusters.nearest(footprints[-1:], [here], asked)
+
         before = [s.chosen for s in self.sightings if s.chosen is not None]
         votes = np.concatenate(
             [[0], *(now[then] for now, then in zip(labels[:-1], before, strict=True))]
@@ -689,6 +691,7 @@ class ObservedObject:
             return clusters.nearest(
                 footprints[-1:], labels[-1:], to_cells @ self.object_frame.centre
             )
+
         return clusters.central(footprints[-1], labels[-1], ground, optical_axis)
 
     def sighting_of(self, frame: Frame, mask: Mask, plane: Plane | None, noise: Noise) -> Sighting:
@@ -705,6 +708,7 @@ class ObservedObject:
         """
         if np.count_nonzero(mask) < FEWEST:
             raise ObservationError(TOO_LITTLE)
+
         part = within(mask, 2)
         corner = (part[0].start, part[1].start)
         coarse = max(1, max(mask[part].shape) // SIZE)
@@ -715,11 +719,14 @@ class ObservedObject:
             facets = without_outliers(facets, noise, coarse)
         if len(facets.planes) * coarse**2 < FEWEST:
             raise ObservationError(TOO_LITTLE)
+
         pose = frame.camera_to_world
         few = slice(None, None, max(1, len(facets.planes) // 3000))
         points = facets.some(few).points @ pose[:3, :3].T + pose[:3, 3]
+
         with suppress(QhullError):  # all in one plane: they do as they are
             points = points[ConvexHull(points).vertices]
+
         return Sighting(frame, noise, facets, mask, points, plane)
 
     def _estimate(self, sightings: Sequence[Sighting], axes: Float) -> ObjectFrame:

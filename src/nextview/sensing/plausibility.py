@@ -108,6 +108,7 @@ def refuse_far(frame: Frame, last: Frame | None, target: Float | None, radius: f
         raise ObservationError(
             f"{what}: is the pose in millimetres, or are target and pose of different worlds?"
         )
+
     refuse_depth_scale(frame, last, target, radius)
 
 
@@ -195,19 +196,23 @@ def _times_behind(frame: Frame, target: Float, radius: float) -> float:
     x, y, z = pose[:3, :3].T @ (target - pose[:3, 3])
     if z <= 0:
         return 0.0
+
     k, (height, width) = frame.intrinsics, frame.shape
     column = int(k[0, 0] * x / z + k[0, 2])
     row = int(k[1, 1] * y / z + k[1, 2])
     if not (0 <= column < width and 0 <= row < height):
         return 0.0
+
     few = frame.depth[::4, ::4]
     around = frame.depth[max(0, row - 4) : row + 5, max(0, column - 4) : column + 5]
     if not (around > 0).any():
         return 0.0
+
     there = float(np.median(around[around > 0]))
     nearest = float(np.quantile(few[few > 0], 0.02)) if (few > 0).any() else 0.0
     if nearest < NOTHING_NEARER * (z + radius) or there < MUCH_FARTHER * (z + radius):
         return 0.0
+
     return min(TIMES_TOO_LARGE, key=lambda times: abs(np.log(times * z / there)))
 
 
@@ -240,6 +245,7 @@ def _agreeing(first: Frame, second: Frame, scale: float) -> tuple[int, float]:
     seen = scale * second.depth[row, column]
     confirmed = int(((seen > 0) & (np.abs(seen - z) < CHANGED * z)).sum())
     seen_through = int((seen > (1 + CHANGED) * z).sum())
+
     return confirmed, confirmed / max(confirmed + seen_through, 1)
 
 
@@ -272,6 +278,7 @@ def check_frame(frame: Frame) -> list[ViewWarning]:
             " is the"
         )
         found.append(ViewWarning("far origin", message + " pose in millimetres?"))
+
     return found
 
 
@@ -424,6 +431,7 @@ def _diagnose(points: Float, pose: Float) -> tuple[str, str]:
             "scale",
             f"{what}: lengths in metres? Divide depth and camera position by the object radius",
         )
+
     for name, said in (
         ("opengl", "OpenGL's (x right, y up, z backward)"),
         ("ros", "a ROS body's (x forward, z up)"),
@@ -440,8 +448,10 @@ def _diagnose(points: Float, pose: Float) -> tuple[str, str]:
             "inverse pose",
             "the pose is inverse: camera-to-world is expected, this is world-to-camera",
         )
+
     middle = float(np.median(np.linalg.norm(points, axis=1)))
     factor = distance / middle if middle > 0 else 1.0
+
     for scale in factor * np.array([1, 0.9, 0.8, 1.1, 1.2]):
         scaled = pose.copy()
         scaled[:3, 3] /= scale
@@ -455,6 +465,7 @@ def _diagnose(points: Float, pose: Float) -> tuple[str, str]:
         f"the surface that is seen reaches {reach:.2g} object radii from the object's centre, more"
         " than 1"
     )
+
     return (
         "outside",
         f"{what}: a wrong pose, centre or radius, or more in the picture than the object?",
@@ -490,6 +501,7 @@ def _seen_through(first: Observation, second: Observation) -> float:
     seen = np.flatnonzero(first.depth)
     if len(seen) == 0 or not second.depth.any():
         return 0.0
+
     scene = second.scene
     depth = second.depth
     pose = second.pose
@@ -503,6 +515,7 @@ def _seen_through(first: Observation, second: Observation) -> float:
     points = points[points[:, 2] > 0.1]
     if len(points) == 0:
         return 1.0
+
     height, width = depth.shape
     at = points[:, :2] / points[:, 2:] * k[[0, 1], [0, 1]] + k[:2, 2]
     column, row = np.floor(at).astype(np.int64).T
@@ -512,12 +525,15 @@ def _seen_through(first: Observation, second: Observation) -> float:
     )
     if not inside.any():
         return 0.0
+
     column = column[inside]
     row = row[inside]
     away = points[inside, 2]
     missing = np.ones(len(away), bool)
+
     for dy in (-margin, 0, margin):
         for dx in (-margin, 0, margin):
             there = depth[row + dy, column + dx]
             missing &= (there == 0) | (there > away + 0.1)
+
     return float(missing.mean())

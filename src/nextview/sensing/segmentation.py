@@ -363,6 +363,7 @@ def mistake_in_pose(plane: Plane, pose: Float, up: Float) -> str | None:
     """
     if plane.normal @ up > TILT or abs(plane.normal @ up) < np.sqrt(1 - TILT**2):
         return None
+
     rotation = pose[:3, :3]
     mistakes = {
         "the camera's axes are OpenGL's?": rotation @ AXES["opengl"],
@@ -375,6 +376,7 @@ def mistake_in_pose(plane: Plane, pose: Float, up: Float) -> str | None:
     seen = rotation.T @ plane.normal
     rises = {mistake: float(right @ seen @ up) for mistake, right in mistakes.items()}
     likeliest = max(rises, key=lambda mistake: rises[mistake])
+
     return likeliest if rises[likeliest] > TILT else None
 
 

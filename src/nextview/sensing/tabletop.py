@@ -167,15 +167,18 @@ class TableTop:
         away_from_camera = self.frame.depth[part][one[part]]
         if not away_from_camera.any():
             return False
+
         focal = float(self.frame.intrinsics[[0, 1], [0, 1]].mean())
         reach = max(2.0, gap * focal / float(np.median(away_from_camera[away_from_camera > 0])))
         near = within(one, int(reach) + 1)
         if not other[near].any():
             return False
+
         away, nearest = ndimage.distance_transform_edt(~one[near], return_indices=True)
         beside = np.nonzero(other[near] & (away <= reach))
         if not len(beside[0]):
             return False
+
         few = slice(None, None, max(1, len(beside[0]) // BESIDE_POINTS))
         rows, columns = beside[0][few], beside[1][few]
         depth = self.frame.depth[near]
@@ -183,6 +186,7 @@ class TableTop:
         its = depth[rows, columns]
         known = (own > 0) & (its > 0)
         apart = np.abs(own - its)[known]
+
         return bool(len(apart)) and float(np.median(apart)) < step
 
 

@@ -234,6 +234,7 @@ def _draw_belief(
     """Bars of the classes shown, with a mark where belief is enough."""
     best = int(view.belief.argmax())
     at = 0.015 + 0.97 * threshold
+
     for row, c in enumerate([*shown, *[best][: best not in shown]]):
         share = float(view.belief[c])
         colour = BLUE if c == best else GREY

@@ -37,6 +37,7 @@ def surface(seen: Observation) -> Triangles:
     )
     rim = edges[times == 1]  # has steps as large as pixels: they are smoothed away
     count = np.maximum(np.bincount(rim.ravel(), minlength=len(points)), 1)[:, None]
+
     for _ in range(5):
         beside = np.stack(
             [
@@ -46,6 +47,7 @@ def surface(seen: Observation) -> Triangles:
             1,
         )
         points = np.where(count > 1, 0.5 * points + 0.5 * beside / count, points)
+
     return points, faces.astype(np.int32)
 
 

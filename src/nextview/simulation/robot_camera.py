@@ -65,6 +65,7 @@ class RobotCamera:
             raise UsageError(
                 f"a target is named by {', '.join(get_args(Named))}, not by {one_line(repr(named))}"
             )
+
         self.scene = scene
         self.named = named
         self._directions = ViewSphere.named("40").directions

@@ -141,10 +141,12 @@ class SensedCamera:
             measured = self._cropped(measured, mask, rng)
         if np.count_nonzero(measured) < FEWEST:
             return None
+
         frame = Frame(measured, self.sensor.intrinsics, believed, pixel_centre=0.5)
         mask[part] &= inside_sphere(
             frame, self.object_frame.centre, REACH * self.object_frame.radius, part
         )
+
         return (
             replace(frame, mask=mask, pixel_centre=0.5)
             if np.count_nonzero(mask) >= FEWEST

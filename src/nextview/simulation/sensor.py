@@ -200,6 +200,7 @@ class Sensor:
         source = sources[part]
         if not depth.size:
             return measured, sources
+
         intrinsics = self.intrinsics - [[0, 0, part[1].start], [0, 0, part[0].start], [0, 0, 0]]
         axial, lateral, grazing, flying, holes = rng.spawn(5)
         q = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0)
@@ -244,6 +245,7 @@ class Sensor:
             found = changed > 1 / self.farthest
             made = np.where(found, 1 / np.where(found, changed, 1), 0)
             measured[part] = np.where(lost | (made < self.nearest), 0, made)
+
         return measured, sources
 
     def _noisy(self, q: Image, angle: Image, rng: np.random.Generator) -> Image:
@@ -563,6 +565,7 @@ def normal_field(
     part = part or (slice(0, shape[0]), slice(0, shape[1]))
     if grain < NO_GRAIN:
         return white[part]
+
     far = int(4 * grain + 0.5) + 1  # as far as the window reaches
     inside = all(
         s.start >= far and s.stop + far <= side for s, side in zip(part, shape, strict=True)
@@ -573,6 +576,7 @@ def normal_field(
         filtered = gaussian_filter(window, grain)[far:-far, far:-far]
     else:
         filtered = gaussian_filter(white, grain, mode="wrap")[part]
+
     return np.asarray(filtered) / _power(grain)
 
 

@@ -72,6 +72,7 @@ def fit_memory(
     judged = np.sort(rng.permutation(len(label))[:MOST_THINGS])
     fold = rng.permutation(len(label)) % FOLDS
     alike = _judged(views, thing, held_out[judged], held_out_views[judged])
+
     for row, t in enumerate(judged):
         if several[t]:
             alike[row][:, (fold[thing] == fold[t]) & several[thing]] = NO_LIKENESS
@@ -85,6 +86,7 @@ def fit_memory(
     where = held_out_views[judged]
     of_class = label[thing]
     scored = []
+
     for h in HEADS if several.any() else (0.0,):
         for w in WEIGHTS:
             sums = _sums(w * alike, h * heads + sizes, where, drawn, VIEWS)
@@ -103,6 +105,7 @@ def fit_memory(
     scores = [-logs.max(-1) - own[logs.argmax(-1)] for logs, own in zip(each, usual, strict=True)]
     quantiles = np.quantile(scores, np.linspace(0, 1, LEVELS), axis=(1, 2)).T
     confused = _confused(beliefs[1], truth, judged, label)
+
     return Fit(
         weight, correlation, head * whole[0], head * whole[1], quantiles, usual, accuracy, confused
     )

@@ -238,6 +238,7 @@ class Outlook:
         sensor = ExpectedSensor.of([view for _, view in seen])
         hypotheses = Hypotheses.leading(verified)
         used = [each for each, _ in seen]
+
         return cls(
             caster=verifier.caster,
             hypotheses=hypotheses,

@@ -91,6 +91,7 @@ class ViewTemplates:
         things = []
         rotations = []
         found = []
+
         for thing in range(len(caster.surfaces)):
             for look, picture in _rendered(caster, thing, looks):
                 things.append(thing)

@@ -69,6 +69,7 @@ def fit_calibration(
     """
     if not 0 < number(delta, "--delta") < 1:
         raise UsageError(f"delta is a probability between 0 and 1, not {delta}")
+
     table = Predictions.load(predictions).by_shape()
     with card_to_fit(card) as (model, write):
         _check_recogniser(card, model, predictions, table)
@@ -85,6 +86,7 @@ def fit_calibration(
         loss(data, c, np.random.default_rng([seed, 2]), walks=walks)
         for c in (PLAIN_SUM, calibration)
     )
+
     return FittedCalibration(calibration, len(data), before, after)
 
 

@@ -96,6 +96,7 @@ def _compute(path: Path, target: Path, spec: InputSpec) -> Iterator[int]:
     """Compute and write the inputs of all objects; yields how many are done."""
     store = ViewStore.open(path)
     chosen = np.flatnonzero(store.done).tolist()
+
     for first in chosen[:1]:  # a size that the views do not have is refused before anything is made
         from_store(spec, store, first)
     places = np.zeros((len(store), len(store.sphere), 2), np.int64)

@@ -87,6 +87,7 @@ class Views(OwnBatches):
         source[rows[source, objects] < 0] = 0
         row = rows[source, objects]
         view = (turn * np.array([own.inputs.shape[1] for own in self.sources])[source]).astype(int)
+
         for batch in np.arange(n).reshape(-1, self.batch)[:, self.share]:
             images = [self.sources[source[k]].inputs[row[k], view[k]] for k in batch]
             drawn = [np.stack(images), self.labels[objects[batch]]]
@@ -276,6 +277,7 @@ def fit_recogniser(
         for name, values in best.net.state_dict().items()  # counters stay those of the end
     }
     best.net.load_state_dict(way)
+
     return best.net.eval()
 
 
@@ -376,6 +378,7 @@ def train_recogniser(
     sources = [_source(each, views, training, recipe, planes, track) for each in stores]
     fitted = sources, views.labels, (training, validating), recipe, out, weights, hardware, azimuths
     train_once(out, run, partial(fit_recogniser, *fitted))
+
     return [out]
 
 

@@ -163,6 +163,7 @@ def geometry_card(walk: Walk, direction: NDArray[np.float64], what: str) -> str:
     outlook = walk.session.outlook
     if rivals is None or outlook is None:
         return ""
+
     names = [outlook.caster.surfaces[thing].name for thing in rivals.things]
     if names[0] == names[1]:
         names = [f"{names[0]}, likeliest pose", f"{names[1]}, second pose"]
@@ -170,6 +171,7 @@ def geometry_card(walk: Walk, direction: NDArray[np.float64], what: str) -> str:
         (name, _image(picture, 128)) for name, picture in zip(names, rivals.pictures, strict=True)
     ]
     both.append(("where they differ", _image(differing(rivals), 128)))
+
     return (
         f"<p>The two likeliest, as {what} would show them: they differ in {rivals.share:.0%} of"
         f" the pixels.</p>{_captioned(both)}"
