@@ -26,7 +26,9 @@ def env(knobs, knobs_memory):
 
 
 def test_gymnasium_finds_nothing_wrong_with_it(env):
-    check_env(env.unwrapped, skip_render_check=True)
+    check_env(env.unwrapped, skip_render_check=True)  # raises what it finds
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
 
 
 def test_the_observation_is_the_joint_belief_of_thing_and_pose(env):
