@@ -13,14 +13,26 @@ from nextview.data.pool import each
 print(sorted(result for _, result in each(math.sqrt, [1, 4, 9], 2)), flush=True)
 """
 
-OWN_FUNCTION = """
+TEXT = """
+from nextview.data.pool import each
+print([result for _, result in each(len, ["/home/__main__"], 2)])
+"""
+
+OWN_CODE = """
+from dataclasses import dataclass
+from functools import partial
+from operator import attrgetter
 from nextview.data.pool import each
 
-def double(x):
-    return 2 * x
+def double(x, times=2):
+    return times * x
+
+@dataclass(frozen=True)
+class Mine:
+    value: int
 
 if __name__ == "__main__":
-    print(sorted(result for _, result in each(double, [1, 4, 9], 2)))
+    print(sorted(result for _, result in each({function}, {items}, 2)))
 """
 
 
@@ -40,8 +52,24 @@ def test_a_plain_script_without_a_guard_may_use_workers(tmp_path, way):
     assert done.stdout == "script runs\n[1.0, 2.0, 3.0]\n"
 
 
-def test_functions_of_a_guarded_script_reach_the_workers(tmp_path):
-    (tmp_path / "script.py").write_text(OWN_FUNCTION)
+def test_text_that_looks_like_the_script_is_no_reason_to_run_it(tmp_path):
+    (tmp_path / "script.py").write_text(TEXT)
+    done = subprocess.run(
+        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert (done.stderr, done.stdout) == ("", "[14]\n")
+
+
+@pytest.mark.parametrize(
+    ("function", "items"),
+    [
+        ("double", "[1, 4, 9]"),
+        ("partial(double, times=2)", "[1, 4, 9]"),
+        ("attrgetter('value')", "[Mine(2), Mine(8), Mine(18)]"),
+    ],
+)
+def test_what_a_guarded_script_defines_reaches_the_workers(tmp_path, function, items):
+    (tmp_path / "script.py").write_text(OWN_CODE.format(function=function, items=items))
     done = subprocess.run(
         [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True
     )

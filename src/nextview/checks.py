@@ -1,6 +1,4 @@
-"""What users hand in, checked once at the door: numbers, points, and plugins, which are code of
-their own.
-"""
+"""Check user input where it enters: numbers, points, and plugins."""
 
 import importlib
 import os
@@ -104,9 +102,20 @@ def one_line(text: str, most: int = 80) -> str:
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
+def number_of(count: int, noun: str) -> str:
+    """Return a count in words: "1 view", "2 views".
+
+    Args:
+        count: how many there are.
+        noun: its plural ends in s.
+    """
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """The known name that a wrong one is nearest to, as the next part of a sentence; "" if none
-    is near.
+    """Return the known name that is nearest to a wrong one, as the next part of a sentence.
+
+    The text is empty if no name is near.
 
     Args:
         name: that is not known.
@@ -163,10 +172,13 @@ def number(
     """
     fits = isinstance(value, Real) and not isinstance(value, bool | np.bool_)
     if not fits or not np.isfinite(float(value)) or not (least <= value <= most and value > above):
-        reach = [f"of at least {least:g}"] * (least > -np.inf) + [f"above {above:g}"] * (
-            above > -np.inf
-        )
-        reach += [f"of at most {most:g}"] * (most < np.inf)
+        reach = []
+        if least > -np.inf:
+            reach.append(f"of at least {least:g}")
+        if above > -np.inf:
+            reach.append(f"above {above:g}")
+        if most < np.inf:
+            reach.append(f"of at most {most:g}")
         raise UsageError(
             f"{what} is a number{' ' if reach else ''}{', '.join(reach)}, not"
             f" {one_line(repr(value))}"
@@ -236,8 +248,9 @@ def plugin(path: str) -> Any:
 
 @cache
 def plugins(group: str) -> dict[str, str]:
-    """What installed packages add, MODULE:NAME by name: the entry points of a group,
-    "nextview.policies".
+    """Return the entry points of a group, such as "nextview.policies".
+
+    They are what installed packages add: MODULE:NAME by name.
     """
     from importlib.metadata import entry_points
 

@@ -1,5 +1,4 @@
-"""Files that nextview writes and reads: outputs whole or not at all, typed JSON records, checked
-weights.
+"""Write and read files: complete or absent outputs, typed JSON records, checked weights.
 
 What exists is refused; with ``overwrite`` exactly the files that are written are replaced. A file
 is written under a temporary name beside its place and then renamed, so a run that is killed leaves
@@ -52,7 +51,11 @@ def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None
     if path.is_symlink():
         raise ResultsError(f"{path}: is a link; give what it points to")
     if path.exists():
-        kind = "folder" if path.is_dir() else "file" if path.is_file() else "pipe or a device"
+        kind = "pipe or a device"
+        if path.is_dir():
+            kind = "folder"
+        elif path.is_file():
+            kind = "file"
         if kind != ("folder" if folder else "file"):
             raise ResultsError(f"{path}: is a {kind}; give another name")
         if not overwrite and not (folder and not any(path.iterdir())):
@@ -66,8 +69,9 @@ def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None
 
 @contextmanager
 def new_file(path: Path, overwrite: bool = False) -> Iterator[Path]:
-    """Write a file whole or not at all: yields a temporary path beside it, of the same suffix;
-    see ``check_new``.
+    """Write a file completely or not at all; see ``check_new``.
+
+    Yields a temporary path beside the file, with the same suffix.
 
     Args:
         path: of the output.
@@ -133,8 +137,9 @@ def new_folder(
 
 
 def _replace(part: Path, folder: Path, files: Sequence[Path], last: str) -> None:
-    """Move files, by their relative paths, from one folder into another: the deepest first,
-    ``last`` at the end.
+    """Move files from one folder into another, the deepest first, ``last`` at the end.
+
+    Paths are relative to the folders.
     """
     for file in sorted(files, key=lambda file: (file.as_posix() == last, -len(file.parts), file)):
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
@@ -256,8 +261,9 @@ def _remove(folder: Path) -> None:
 
 @contextmanager
 def _beside(path: Path) -> Iterator[Path]:
-    """A temporary folder on the same disk, removed at the end; what the disk refuses becomes one
-    sentence.
+    """Create a temporary folder on the same disk, and remove it at the end.
+
+    An error of the disk becomes one sentence.
     """
     with _folders_above(path):
         temporary = _marked_folder(path, TEMPORARY)
@@ -273,9 +279,7 @@ def _beside(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _folders_above(path: Path) -> Iterator[None]:
-    """Where the block fails, remove those folders above a path that were not there before and
-    hold nothing.
-    """
+    """If the block fails, remove the empty folders above a path that it created."""
     missing = [folder for folder in path.absolute().parents if not folder.exists()]
     try:
         yield
@@ -306,8 +310,9 @@ def _sync_folder(path: Path) -> None:
 
 @contextmanager
 def only_one(path: Path) -> Iterator[None]:
-    """One writer of ``path`` at a time, among processes; DatasetError if another is at it, or it
-    cannot be written.
+    """Admit one writer of ``path`` at a time, among processes.
+
+    DatasetError is raised if another one is writing, or the path cannot be written.
     """
     from filelock import FileLock, Timeout  # here, as whoever only recognises needs none
 
@@ -339,8 +344,9 @@ def only_one(path: Path) -> Iterator[None]:
 def regular_file(
     path: Path, what: str, error: type[NextviewError], largest: int | None = None
 ) -> None:
-    """See that a path names a regular file: a pipe would wait for its writer, a device might never
-    end.
+    """Check that a path names a regular file.
+
+    A pipe would wait for its writer, and a device might never end.
 
     Else it is an ``error``, which says ``what`` it should be ("a model card"); ``largest`` is a
     size in bytes.
@@ -363,8 +369,9 @@ def regular_file(
 def read_record(
     path: Path, record: type[T], what: str, error: type[NextviewError] = ModelError
 ) -> T:
-    """A typed record from a JSON file; an ``error`` if the file is missing, too large, or no
-    such record.
+    """Read a typed record from a JSON file.
+
+    An ``error`` is raised if the file is missing, too large, or holds no such record.
 
     Args:
         path: of the JSON file.
@@ -428,8 +435,9 @@ def sha256_of(path: Path) -> str:
 
 
 def checked_bytes(path: Path, sha256: str, what: str = "weights") -> bytes:
-    """The content of a file whose hash a card holds; ModelError if it is missing, or not that
-    file.
+    """Read a file and compare it with the hash on its card.
+
+    ModelError is raised if the file is missing or differs.
 
     Args:
         path: of the file.

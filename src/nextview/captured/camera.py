@@ -22,7 +22,12 @@ HIDDEN = 1.5  # object radii before its centre from which something else hides i
 
 @dataclass(frozen=True)
 class Taken:
-    """A captured view that answered a request, and its angular distance from it."""
+    """A captured view that answered a request, and its angular distance from it.
+
+    Attributes:
+        frame: the captured view.
+        degrees_off: angle between its direction and the requested one, degrees.
+    """
 
     frame: CapturedFrame
     degrees_off: float

@@ -1,5 +1,6 @@
-"""From ROS messages of a depth camera to arrays. Nothing here needs ROS: only the messages' fields
-count.
+"""Convert ROS messages of a depth camera to arrays.
+
+Nothing here needs ROS: only the fields of the messages count.
 
 Depth images are as REP 118 has them (16UC1 millimetres, 32FC1 metres), optical frames as REP 103 (z
 forward, x right, y down), which are nextview's own axes.
@@ -31,15 +32,17 @@ DEPTH_HEADER = struct.Struct("<iff")
 
 
 def depth_of(image: Any) -> NDArray[Any]:
-    """The pixels of a ``sensor_msgs/Image``: (height, width), uint16 millimetres or float32 metres,
-    native byte order.
+    """Return the pixels of a ``sensor_msgs/Image``, (height, width), native byte order.
+
+    They are uint16 millimetres or float32 metres.
 
     Raises:
         ObservationError: it is no depth image, or shorter than it says.
     """
     check_encoding(image.encoding)
     kind = ENCODINGS[image.encoding].newbyteorder(">" if image.is_bigendian else "<")
-    height, width, step = int(image.height), int(image.width), int(image.step)
+    height, width = int(image.height), int(image.width)
+    step = int(image.step)
     data = np.frombuffer(bytes(image.data), np.uint8)
     if step < width * kind.itemsize or len(data) < step * height:
         raise ObservationError(
@@ -106,8 +109,9 @@ def depth_of_compressed(message: Any) -> NDArray[Any]:
 
 
 def intrinsics_of(info: Any, rectified: bool = False) -> Float:
-    """The pinhole matrix of a ``sensor_msgs/CameraInfo``, (3, 3), pixels; the first pixel's centre
-    is at 0.
+    """Return the pinhole matrix of a ``sensor_msgs/CameraInfo``, (3, 3), pixels.
+
+    The centre of the first pixel is at 0.
 
     Args:
         info: the message.
@@ -140,8 +144,9 @@ def intrinsics_of(info: Any, rectified: bool = False) -> Float:
 
 
 def pose_of(transform: Any) -> Float:
-    """A ``geometry_msgs/TransformStamped`` as a matrix, (4, 4): from its child's frame into that of
-    its header.
+    """Return a ``geometry_msgs/TransformStamped`` as a matrix, (4, 4).
+
+    It maps the frame of its child into the frame of its header.
 
     Raises:
         ObservationError: the quaternion is none of a rotation.

@@ -78,7 +78,8 @@ def read_turntable(folder: Path, turn: str) -> Capture:
         (s.facets.points[f] @ axes.T, s.facets.planes[f] @ axes.T)
         for s, f in zip(shown, few, strict=True)
     ]
-    (axis, apart), (_, other) = _fit(clouds, way), _fit(clouds, -way)
+    axis, apart = _fit(clouds, way)
+    _, other = _fit(clouds, -way)
     if np.median(other) < 0.6 * np.median(apart):
         raise DatasetError(
             f"{folder}: its frames agree if the thing turned the other way, not {turn}"
@@ -97,7 +98,8 @@ def read_turntable(folder: Path, turn: str) -> Capture:
     for i, frame in enumerate(frames):
         back = _turned(-way * i, len(frames))
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = back @ axes, back @ [*-axis, plane[3]]
+        pose[:3, :3] = back @ axes
+        pose[:3, 3] = back @ [*-axis, plane[3]]
         posed.append(replace(frame, pose=pose))
     notes = (f"{len(posed)} even steps {turn}",)
     return Capture(folder, "turntable", tuple(posed), (0.0, 0.0, 1.0), notes, object_is_world=True)
@@ -124,7 +126,9 @@ def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
         wanted = list[Float]()
 
         for i, j in pairs:
-            (p, _), (q, normals), shift = turned[i], turned[j], (turns[i] - turns[j])[:, :2]
+            p, _ = turned[i]
+            q, normals = turned[j]
+            shift = (turns[i] - turns[j])[:, :2]
             distance, nearest = cKDTree(q).query(p - shift @ axis)
             close = distance <= np.quantile(distance, CLOSEST)
             near = np.asarray(nearest)[close]

@@ -8,6 +8,7 @@ class Command:
     """A command: the function whose parameters are its options and whose docstring is its help.
 
     Attributes:
+        function: MODULE:NAME of the function that runs the command.
         line: in the list of all commands.
         then: printed at the end; names in braces are arguments, ``found`` is what the function
             returns.

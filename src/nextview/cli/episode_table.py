@@ -10,6 +10,7 @@ from rich.console import JustifyMethod
 from rich.table import Table
 from rich.text import Text
 
+from nextview.checks import number_of
 from nextview.cli.exit_status import printable
 from nextview.cli.progress import Terminal
 from nextview.session.result import Recognition
@@ -92,7 +93,7 @@ def _table_of_views(
 
 def _answer_in_words(result: Recognition, has_threshold: bool) -> Text:
     """What the object is, or that it is unknown, and after how many views."""
-    views = f"{len(result.views)} view{'s' * (len(result.views) > 1)}"
+    views = number_of(len(result.views), "view")
     effort = f"after {views} and {result.travel:.2f} cells of travel"
     if result.unknown:
         why = f": {printable(result.why_unknown)}, {effort}."
@@ -228,4 +229,6 @@ def plain(value: Any) -> Any:
         value = value.tolist()
     if isinstance(value, list | tuple):
         return [plain(each) for each in value]
-    return (round(value, 6) if np.isfinite(value) else None) if isinstance(value, float) else value
+    if isinstance(value, float):
+        return round(value, 6) if np.isfinite(value) else None
+    return value

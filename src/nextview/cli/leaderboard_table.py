@@ -77,7 +77,9 @@ def _policies(rows: list[Any], threshold: float, reference: str) -> Table:
                 " *" if s.differs else "  "
             )
         accuracy = f"{s.accuracy:.3f} ({s.low:.3f}-{s.high:.3f})", f"{s.class_accuracy:.3f}"
-        style = "dim" if oracle else "bold" if s.differs else None
+        style = "bold" if s.differs else None
+        if oracle:
+            style = "dim"
         table.add_row(
             s.policy, *accuracy, f"{s.n_views:.2f}", f"{s.travel:.2f}", over, p, style=style
         )

@@ -15,7 +15,13 @@ LONGEST = 200  # letters of what a server says of itself
 
 @dataclass(frozen=True)
 class Archive:
-    """A published zip file: its address, its SHA-256, and the folder to unpack."""
+    """A published zip file.
+
+    Attributes:
+        url: address of the zip file.
+        sha256: its SHA-256, hexadecimal.
+        folder: folder inside the archive that is unpacked.
+    """
 
     url: str
     sha256: str

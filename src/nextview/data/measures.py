@@ -70,7 +70,14 @@ Views = Callable[[ViewStore, int], Iterator[MeasuredView]]
 
 @dataclass(frozen=True)
 class Measure:
-    """A function of a view, with the input that it needs and which values are good."""
+    """A measure of a view, and what it needs.
+
+    Attributes:
+        function: computes the measure of one view.
+        needs: whether the function needs only the depth image, or the mesh too.
+        source: publication that the measure comes from.
+        good: whether high values (peak) or low values (valley) mark the better views.
+    """
 
     function: Callable[[MeasuredView], float]
     needs: Literal["depth", "mesh"] = "depth"

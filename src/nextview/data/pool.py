@@ -1,5 +1,6 @@
 """Run a function on many items, on all cores or on a dask.distributed cluster."""
 
+import io
 import multiprocessing
 import os
 import pickle
@@ -146,13 +147,28 @@ def _in_pool(
         pool.shutdown(cancel_futures=True)
 
 
+class _NamedModules(pickle.Pickler):
+    """Pickles, and remembers the modules of the functions and classes that it names."""
+
+    def __init__(self) -> None:
+        super().__init__(io.BytesIO())
+        self.modules: set[str] = set()
+
+    def reducer_override(self, named: Any) -> Any:
+        """Called for functions, classes and their instances; they are pickled as usual."""
+        self.modules.add(getattr(named, "__module__", ""))
+        return NotImplemented
+
+
 def _of_script(function: Callable, items: Sequence[Any]) -> bool:
     """Whether a worker needs the script that runs.
 
-    It does if the function, or what it is called with, is defined there. What is sent to workers
-    names the modules that they have to import; nothing is unpickled here.
+    It does if the function, or what it is called with, is defined there: workers import the modules
+    that a pickle names.
     """
-    return b"__main__" in pickle.dumps((function, items))
+    pickler = _NamedModules()
+    pickler.dump((function, items))
+    return "__main__" in pickler.modules
 
 
 class _OwnMain(SpawnProcess):

@@ -144,7 +144,8 @@ def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> 
 
     They are zero where nothing is seen.
     """
-    (i, file), (store, recogniser, maps) = item, _open(*files)
+    i, file = item
+    store, recogniser, maps = _open(*files)
     specs = {recogniser.card.input} | {network.card.input for network in maps.values()}
     inputs = {spec: from_store(spec, store, i) for spec in specs}
     batches = [slice(start, start + BATCH) for start in range(0, len(store.sphere), BATCH)]

@@ -44,6 +44,7 @@ class Predictions:
         classes: their names, in the order of the logits.
         splits: "train", "test" or "" for each object, (N,).
         conflicting: objects that are the very mesh of another one with another label, (N,).
+        sphere: the V viewpoints.
         models: name and SHA-256 of the "recogniser" and of each map network ("lem").
         valley_classes: of each map: those for which the valley is the better view.
         calibration: how far a sum of the recogniser's logits is to be trusted.

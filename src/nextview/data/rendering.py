@@ -113,7 +113,8 @@ def render_object(camera: Camera, sphere: ViewSphere, size: int) -> dict[str, np
 
     for view, pose in enumerate(sphere.poses):
         observation = camera.observe(pose)
-        image[view], points[view] = observation.picture, observation.points
+        image[view] = observation.picture
+        points[view] = observation.points
         depth[view] = np.rint(observation.depth / DEPTH_UNIT).clip(max=np.iinfo(np.uint16).max)
 
     return {
@@ -377,7 +378,8 @@ def _render_entry(
     Returns:
         The reason if its mesh cannot be used; and what is odd about it, a sentence each.
     """
-    (i, entry), store = item, opened(path)
+    i, entry = item
+    store = opened(path)
     try:
         rendered, doubts = _rendered(store, options, sensor, entry)
     except (MeshError, DatasetError) as error:

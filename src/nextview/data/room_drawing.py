@@ -409,7 +409,8 @@ def _standing(
 
     place = rng.uniform(-free, free)
     if against:
-        axis, side = wall % 2, 1 if wall < 2 else -1
+        axis = wall % 2
+        side = 1 if wall < 2 else -1
         place[axis] = side * (room[axis] / 2 - half[axis] - rng.uniform(*AT_WALL))
     return replace(thing, x=_short(place[0]), y=_short(place[1]))
 
@@ -464,7 +465,8 @@ def _cabinet(room: tuple[float, float], rng: np.random.Generator) -> Slab:
     width, depth, height = rng.uniform(*np.transpose(CABINET))
     wall = int(rng.integers(4))
     azimuth = np.pi / 2 * (wall - 1)
-    axis, side = wall % 2, 1 if wall < 2 else -1
+    axis = wall % 2
+    side = 1 if wall < 2 else -1
     free = np.maximum(np.array(room) / 2 - width / 2, 0)
     place = rng.uniform(-free, free)
     place[axis] = side * (room[axis] / 2 - depth / 2 - rng.uniform(*AT_WALL))
@@ -481,7 +483,8 @@ def _table(room: tuple[float, float], rng: np.random.Generator) -> list[Slab]:
     free = np.maximum(np.array(room) / 2 - half - AT_WALL[1], 0)
     place = rng.uniform(-free, free)
     if rng.integers(2):
-        axis, side = wall % 2, 1 if wall < 2 else -1
+        axis = wall % 2
+        side = 1 if wall < 2 else -1
         place[axis] = side * (room[axis] / 2 - half[axis] - rng.uniform(*AT_WALL))
 
     size = width, depth, TABLE_TOP

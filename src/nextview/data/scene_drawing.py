@@ -76,7 +76,15 @@ MOST_SCENES = 100_000  # at each level, of each split
 
 @dataclass(frozen=True)
 class Task:
-    """A scene to draw: mesh file of its target, split, level of clutter, name and file."""
+    """A scene to draw.
+
+    Attributes:
+        target: mesh file of the target, relative to the dataset folder.
+        split: split of the target.
+        level: level of clutter.
+        name: name of the scene.
+        path: file that is written.
+    """
 
     target: str
     split: str
@@ -87,7 +95,12 @@ class Task:
 
 @dataclass(frozen=True)
 class Meshes:
-    """The mesh files that may stand around a target: a folder and sorted paths below it."""
+    """The mesh files that may stand around a target.
+
+    Attributes:
+        folder: dataset folder.
+        files: paths below it, sorted.
+    """
 
     folder: Path
     files: tuple[str, ...]

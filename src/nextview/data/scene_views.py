@@ -81,6 +81,9 @@ class SceneViews:
     Attributes:
         depth: (V, S, S), object radii, 0 = nothing.
         owner: of each pixel: NOTHING, TARGET, OTHER or TABLE_TOP, (V, S, S).
+        intrinsics: of the camera, pixels, (3, 3).
+        poses: camera-to-world, (V, 4, 4).
+        reachable: whether a camera can stand at each view, (V,).
         visible_share: of the target, the truth, (V,).
         clearance: (V,), object radii.
     """
@@ -170,7 +173,13 @@ def scenes_of(p: Predictions) -> "SceneSight | None":
 
 @dataclass(frozen=True)
 class SceneSight:
-    """Reachable views and expected visibility in N scenes, ``rows`` of a store."""
+    """Reachable views and expected visibility in N scenes of a view store.
+
+    Attributes:
+        store: view store of the scenes.
+        rows: row of each scene in the store, (N,).
+        reachable: whether a camera can stand at each view, (N, V).
+    """
 
     store: ViewStore
     rows: NDArray[np.int64]

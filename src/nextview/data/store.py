@@ -49,7 +49,30 @@ Pixels = Annotated[int, Meta(ge=1, le=100_000)]
 
 
 class Attributes(msgspec.Struct, omit_defaults=True):
-    """The objects and views of a store, and how it was rendered."""
+    """The objects and views of a store, and how it was rendered.
+
+    Attributes:
+        format: version of the layout.
+        names: of the objects, unique.
+        labels: class of each object.
+        splits: split of each object; "" if it has none.
+        elevations: of the rings of viewpoints, degrees.
+        azimuths: views on each ring.
+        distance: from the camera to the object centre, object radii.
+        size: side of the images, pixels.
+        seed: seed of the points, and of random rotations and stretches.
+        noise_seed: seed of the sensor errors; None if it is ``seed``.
+        stretch: each axis is scaled by a random factor from 1/(1 + stretch) to 1 + stretch.
+        rotated: whether each object is rotated at random about the vertical.
+        largest_part: whether only the largest connected part of each mesh is kept.
+        sensor: parameters of the simulated sensor; None for clean renders.
+        scene: side of the stored scene images, pixels; None if the objects stand alone.
+        sha256: hash of the mesh file of each object.
+        unit: unit of length of the mesh files; None if it is not known.
+        dataset: path of the meshes.
+        failures: why objects were left out, by name.
+        commands: commands that made the store, in order.
+    """
 
     format: Literal[2]
     names: Annotated[list[Name], Meta(min_length=1)]
@@ -69,7 +92,7 @@ class Attributes(msgspec.Struct, omit_defaults=True):
     sha256: list[str] | None = None
     unit: Literal["mm", "cm", "inch", "foot", "m"] | None = None
     dataset: str = ""
-    failures: dict[str, str] = {}  # why objects were left out, by name
+    failures: dict[str, str] = {}
     commands: list[str] = []
 
 
@@ -110,6 +133,11 @@ class ViewStore:
     a policy takes from each first view; ``radius`` (N,) float64, in the unit of its mesh file;
     ``status`` (N,) uint8. Every chunk has a checksum. Of a chunk that is gone zarr would read the
     fill value, so every read looks for its file.
+
+    Attributes:
+        path: of the store, a zarr folder.
+        group: the arrays.
+        attributes: the objects, the views, and how they were rendered.
     """
 
     path: Path

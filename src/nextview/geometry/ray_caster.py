@@ -57,6 +57,8 @@ def pixel_rays(intrinsics: NDArray[np.float64], shape: tuple[int, int]) -> NDArr
     Returns:
         Rays, (H, W, 3) float32, camera frame, with z = 1, so that multiples of a ray are depths.
     """
-    (height, width), (fx, _, cx), (_, fy, cy) = shape, *intrinsics[:2]
+    height, width = shape
+    fx, _, cx = intrinsics[0]
+    _, fy, cy = intrinsics[1]
     x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
     return np.stack([x, y, np.ones_like(x)], -1).astype(np.float32)

@@ -201,7 +201,8 @@ class Viewpoints:
         Returns:
             Euclidean distance over rows and columns, (...) float64, grid cells.
         """
-        (row_a, column_a), (row_b, column_b) = self.cells(a), self.cells(b)
+        row_a, column_a = self.cells(a)
+        row_b, column_b = self.cells(b)
         steps = np.abs(column_a - column_b)
         return np.hypot(row_a - row_b, np.minimum(steps, self.columns - steps))
 

@@ -108,11 +108,20 @@ def of_true_class(logs: Float, labels: NDArray[np.int64]) -> Float:
 
 
 class RiskBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Upper bounds of the error rate of those who stop at a threshold, from validation objects."""
+    """Upper bounds of the error rate of episodes that stop at a threshold.
 
-    thresholds: tuple[float, ...]  # ascending, (T,)
-    bounds: tuple[tuple[float, ...], ...]  # by the views that may be taken, 1, 2, ..., (views, T)
-    delta: float  # how often such a promise fails
+    They are computed from validation objects.
+
+    Attributes:
+        thresholds: ascending, (T,).
+        bounds: upper bound of the error rate, by the number of views that may be taken (1, 2, ...),
+            (views, T).
+        delta: probability that a bound is exceeded.
+    """
+
+    thresholds: tuple[float, ...]
+    bounds: tuple[tuple[float, ...], ...]
+    delta: float
 
     def __post_init__(self) -> None:
         ascending = all(a < b for a, b in zip(self.thresholds, self.thresholds[1:], strict=False))
@@ -165,25 +174,32 @@ LARGEST_NUMBER = (
 class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """How far the sum of the logits of several views can be trusted.
 
-    Views of one object share their errors, so k views are not k independent pieces of evidence.
+    Views of one object share their errors, so k views are not k independent pieces of evidence. The
+    sum over k views is divided by ``temperature * (1 + correlation * (k - 1))``: the factor by
+    which the variance of a sum of k equally correlated terms grows beyond k. Correlation 0 trusts
+    the sum, 1 the mean.
 
-    The sum over k views is divided by ``temperature * (1 + correlation * (k - 1))``: what the
-    variance of a sum of k equally correlated terms grows by, beyond k. Correlation 0 trusts the
-    sum, 1 the mean.
+    Azimuth bins count as evidence too, if the recogniser predicts them. The object stands still, so
+    views from different azimuths must agree on the direction of its azimuth bin 0. The belief in a
+    class is multiplied by the likelihood of that agreement, summed over all azimuths.
 
-    Azimuth bins count too, if the recogniser knows them: an object stands still, so views from
-    different azimuths have to agree on where its azimuth bin 0 points. The belief in a class is
-    multiplied by the likelihood of that agreement, summed over all azimuths. ModelError: a
-    temperature that is not positive, a negative number, or hypotheses that are not of every class.
+    ModelError is raised for a temperature that is not positive, a negative number, or hypotheses
+    that do not cover every class.
+
+    Attributes:
+        temperature: of a single view.
+        correlation: of the evidence of two views, 0 to 1.
+        risk: error bounds that ``--risk`` uses; None if they are not known.
+        bin_correlation: of the azimuth bins of two views, 0 to 1; None if azimuth bins do not count
+            as evidence of the class.
+        hypotheses: class of each hypothesis, ascending. The hypotheses are things, each in every
+            resting pose that was taught; () if the hypotheses are the classes.
     """
 
-    temperature: float = 1.0  # of a single view
-    correlation: float = 0.0  # of the evidence of two views, 0 .. 1
-    risk: RiskBounds | None = None  # for stopping with a promise; None if not known
-    # of the azimuth bins of two views, 0 .. 1; None where these shall not count for the class
+    temperature: float = 1.0
+    correlation: float = 0.0
+    risk: RiskBounds | None = None
     bin_correlation: float | None = None
-    # what the azimuth bins are given, by the class of each, ascending: things, each in every
-    # resting pose that it was taught in. () where they are given the classes.
     hypotheses: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -329,11 +345,17 @@ PLAIN_SUM = Calibration()  # trusts the sum of the logits as it stands, as the t
 
 
 class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
-    """How likely each size is for each class; added to the logits if the scale is known."""
+    """How likely each size is for each class; added to the logits if the scale is known.
 
-    radii_m: tuple[float, ...]  # object radii, metres, ascending, (R,)
-    log_density: tuple[tuple[float, ...], ...]  # that of their logarithm, (C, R)
-    weight: float  # beside the logits
+    Attributes:
+        radii_m: object radii, metres, ascending, (R,).
+        log_density: log density of the logarithm of the radius, (C, R).
+        weight: of the log density when it is added to the logits.
+    """
+
+    radii_m: tuple[float, ...]
+    log_density: tuple[tuple[float, ...], ...]
+    weight: float
 
     def __post_init__(self) -> None:
         radii = np.array(self.radii_m)
@@ -408,6 +430,12 @@ class Stopping:
     then divided by ``1 + threshold_decay * (views - 1)``: what is unclear after several views is
     seldom cleared up by another one. A calibrated belief whose threshold decay is its correlation
     stops where the plain sum of logits does.
+
+    Attributes:
+        threshold: belief at which an episode stops after one view, 0 to 1.
+        max_views: largest number of views.
+        threshold_decay: how fast the threshold decreases with the number of views; 0 keeps it
+            constant.
 
     Raises:
         UsageError: a threshold outside of 0 to 1, fewer than one view, or a negative threshold
@@ -487,10 +515,10 @@ class Stopping:
         if self.threshold_decay == 0 or self.max_views == 1:
             return f"threshold {self.threshold:.3g}"
         first, second = self.threshold_at(np.arange(1, 3))
-        last = f", {float(self.threshold_at(self.max_views)):.2g} at view {self.max_views}" * (
-            self.max_views > 2
-        )
-        return f"threshold {first:.3g} at the first view, {second:.2g} at the second{last}"
+        words = f"threshold {first:.3g} at the first view, {second:.2g} at the second"
+        if self.max_views > 2:
+            words += f", {float(self.threshold_at(self.max_views)):.2g} at view {self.max_views}"
+        return words
 
 
 @dataclass(frozen=True)

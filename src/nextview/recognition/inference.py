@@ -254,7 +254,9 @@ class NetworkRecogniser:
         Raises:
             ModelError: the network fails.
         """
-        names = ["logits"] + [BINS_OUTPUT] * bool(self.azimuth_bins)
+        names = ["logits"]
+        if self.azimuth_bins:
+            names.append(BINS_OUTPUT)
         outputs = dict(
             zip(names, run_onnx(self.card.path, self._session, names, inputs), strict=True)
         )

@@ -36,7 +36,13 @@ SHORT_HASH = 16  # hexadecimal digits of the SHA-256 of a memory that its file's
 
 
 class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a network was trained on, the settings of each training, and all commands."""
+    """What a network was trained on, and how.
+
+    Attributes:
+        data: what the network was trained on, in words.
+        recipes: settings of each training, in order.
+        commands: all commands that led to the network.
+    """
 
     data: str = ""
     recipes: tuple[dict[str, Any], ...] = ()
@@ -163,43 +169,65 @@ class ModelCard(
     tag_field="schema",
     tag=SCHEMA,
 ):
-    """The card of a model, a JSON file beside the file with its weights.
+    """The card of a model: a JSON file beside the file with its weights.
 
-    That is an ONNX file; of a memory of taught things, which is a recogniser too, a safetensors
-    file. ModelError: a recogniser without classes, sizes of other classes than these, a network of
-    no input, or a memory of other classes or resting poses than those of its things.
+    The weights of a network are an ONNX file, those of a memory of taught things (a recogniser too)
+    a safetensors file. ModelError is raised for a recogniser without classes, sizes of other
+    classes, a network without an input, or a memory whose classes or resting poses do not match its
+    things.
+
+    Attributes:
+        name: name of the model.
+        kind: "recogniser", or the name of the map that the network predicts ("lem").
+        input: input that the network takes.
+        sha256: of the file with the weights.
+        path: of the file with the weights; not written into the card.
+        network: architecture, in words.
+        classes: of a recogniser: unique, in the order of the logits.
+        azimuth_bins: number of azimuth bins that a recogniser predicts; 0 for none.
+        calibration: of a recogniser.
+        size: sizes of the objects of each class; None if they are not known.
+        novelty_sha256: of the novelty file beside the card; "" if there is none.
+        measure: of a map network: the measure that it predicts.
+        good: of a map network: whether high or low values mark the better views.
+        output: of a map network: the local window, or the whole sphere, of which the window is a
+            part.
+        valley_classes: classes for which the valley of the map is the better view.
+        valley_gain: by how much, for each of these classes.
+        training: how the network was trained.
+        scores: results on each set of objects.
+        largest_difference_to_torch: between the answers of this file and those of the network in
+            torch; None if it was not measured.
+        note: further remarks.
+        held_out: objects of the training split that were not used for training; () if they are not
+            known.
+        fitted_to: what calibration, size, novelty and valleys were fitted to, in words, by name.
+        memory: things that were taught to a recogniser; None for a network.
     """
 
-    name: str  # what users call it
-    kind: str  # "recogniser" or the name of the map that it predicts ("lem")
-    input: InputSpec  # what it takes of a view
-    sha256: Sha256  # of that file
-    path: Path = NOWHERE  # of that file; it does not stand in the card
-    network: str = ""  # which architecture, in words
-    classes: tuple[str, ...] = ()  # of a recogniser, unique, in the order of its logits
-    azimuth_bins: int = 0  # of an object that a recogniser discriminates; 0 for none
-    calibration: Calibration = PLAIN_SUM  # of a recogniser
-    # what a recogniser knows of the sizes of objects; None if nothing
+    name: str
+    kind: str
+    input: InputSpec
+    sha256: Sha256
+    path: Path = NOWHERE
+    network: str = ""
+    classes: tuple[str, ...] = ()
+    azimuth_bins: int = 0
+    calibration: Calibration = PLAIN_SUM
     size: SizeEvidence | None = None
-    # of the novelty score beside the card; "" if there is none
     novelty_sha256: Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")] = ""
-    measure: str = ""  # of which a map network predicts the map
-    good: Good = "peak"  # where such a map has the better views
-    # of a map network: the local window, or the whole sphere, of which the window is a part
+    measure: str = ""
+    good: Good = "peak"
     output: Literal["window", "sphere"] = "window"
-    # for which the valley of its map was found to be the better view
     valley_classes: tuple[str, ...] = ()
-    valley_gain: dict[str, float] = {}  # by how much, for each class
-    training: Training = Training()  # how it was made
-    scores: dict[str, Any] = {}  # on each set of objects
-    # of the file's answers; None if it was not measured
+    valley_gain: dict[str, float] = {}
+    training: Training = Training()
+    scores: dict[str, Any] = {}
     largest_difference_to_torch: float | None = None
-    note: str = ""  # what else is to be said
-    # objects of the training split that it was not trained on; () if it does not say
+    note: str = ""
     held_out: tuple[str, ...] = ()
-    # what calibration, size, novelty and valleys were fitted to, in words, by their names
     fitted_to: dict[str, str] = {}
-    memory: Taught | None = None  # of a recogniser that was taught things; None for a network
+    memory: Taught | None = None
 
     def __post_init__(self) -> None:
         if not self.name or not self.kind:
@@ -395,9 +423,12 @@ def find_card(model: str | Path) -> ModelCard:
 
 @dataclass(frozen=True)
 class Collection:
-    """Cards of models that belong together: maps and policies by their names.
+    """Cards of models that belong together.
 
-    Bundled policies are not among them.
+    Attributes:
+        recogniser: card of the recogniser.
+        maps: cards of the map networks, by map.
+        policies: cards of the learned policies, by name; bundled policies are not among them.
     """
 
     recogniser: Path

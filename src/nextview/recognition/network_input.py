@@ -19,10 +19,15 @@ CHANNELS_OF = {"geometry": len(CHANNELS), "image": 1}
 
 
 class InputSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a network takes of a view."""
+    """The input that a network takes of a view.
 
-    kind: InputKind  # see ``geometry_input``, ``image_input`` and ``cloud_input``
-    size: int = 0  # side of the image, pixels; 0 for a cloud
+    Attributes:
+        kind: see ``geometry_input``, ``image_input`` and ``cloud_input``.
+        size: side of the image, pixels; 0 for a point cloud.
+    """
+
+    kind: InputKind
+    size: int = 0
 
     def __post_init__(self) -> None:
         if self.size < 0 or (self.kind == "cloud") != (self.size == 0):

@@ -113,11 +113,10 @@ class Quantiles:
 
     def of_views(self, scores: Sequence[float]) -> float:
         """The p-value of one object by the scores of its views so far; 1 if there is none."""
-        return (
-            float(self.p_value(scores[-1] if self.joint else float(np.mean(scores)), len(scores)))
-            if scores
-            else 1.0
-        )
+        if not scores:
+            return 1.0
+        score = scores[-1] if self.joint else float(np.mean(scores))
+        return float(self.p_value(score, len(scores)))
 
 
 @dataclass(frozen=True)
@@ -198,10 +197,12 @@ class Novelty(Quantiles):
 class ViewScore:
     """The novelty score of one view.
 
-    Its network runs when the score is first asked for: few frames decide by it.
+    Its network runs when the score is first requested, because few frames need it.
 
     Attributes:
-        judge: scores of views, (B,); None where it is known.
+        observation: the view.
+        judge: computes scores of views, (B,); None if the score is known.
+        value: the score; NaN until it is computed.
     """
 
     observation: Observation

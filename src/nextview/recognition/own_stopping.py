@@ -51,7 +51,17 @@ Rule = Callable[[Believed, float], NDArray[np.bool_]]  # whether to stop, (...),
 
 @dataclass(frozen=True)
 class OwnStopping(Stopping):
-    """Stop where a rule says so, or after ``max_views`` views. UsageError where the rule fails."""
+    """Stop when a rule of the user says so, or after ``max_views`` views.
+
+    UsageError is raised where the rule fails.
+
+    Attributes:
+        rule: decides from the belief whether to stop.
+        name: of the rule, for messages.
+        threshold: passed to the rule.
+        max_views: largest number of views.
+        threshold_decay: see ``Stopping``; not used.
+    """
 
     rule: Rule | None = None
     name: str = "a rule of your own"

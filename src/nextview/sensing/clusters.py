@@ -61,11 +61,16 @@ those of the first frame beyond which nothing can be a part of the same object."
 
 @dataclass(frozen=True)
 class Footprint:
-    """The cells, seen from above, over which the pieces of a frame lie: K pairs of a cell and a
-    piece, each once.
+    """The cells that the pieces of a frame cover, seen from above.
 
-    ``cells`` are the indices of the cells, (K, 2), ``piece`` the labels of the pieces, (K,).
-    ``area`` is that of the surface of each pair, square metres, ``pixels`` how many show it.
+    They are K pairs of a cell and a piece; each pair occurs once.
+
+    Attributes:
+        cells: indices of the cells along x and y, (K, 2).
+        piece: label of the piece in each pair, (K,).
+        pieces: all pieces of the frame.
+        area: surface area of each pair, square metres, (K,).
+        pixels: number of pixels that show it, (K,).
     """
 
     cells: NDArray[np.int64]
@@ -76,9 +81,7 @@ class Footprint:
 
     @cached_property
     def outlines(self) -> dict[int, Float]:
-        """The convex outline of each larger piece: lines a x + b y + c <= 0 inside, in cells,
-        (K, 3).
-        """
+        """The convex outline of each larger piece, (K, 3): lines a x + b y + c <= 0, cells."""
         found = {}
         many = np.bincount(self.piece, minlength=1)
         for piece in np.flatnonzero(many >= OUTLINED):
@@ -107,7 +110,8 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Fl
     rows, columns = np.divmod(np.flatnonzero(pieces.label), pieces.label.shape[1])
     label = pieces.label[rows, columns]
     z = frame.depth[rows, columns]
-    pose, (x, y) = frame.camera_to_world, frame.rays
+    pose = frame.camera_to_world
+    x, y = frame.rays
     ij = []
 
     for axis in axes[:2]:
@@ -149,7 +153,11 @@ def clusters(
     both stand on the plane and their border comes down to it: a handle and the back of a chair are
     joined. Things that stand side by side stay apart, also where only their tops show. Pieces of
     two frames are joined where half of the smaller one lies over the other, unless a frame shows
-    both side by side. ``joins``: those that touch are "never" one, or "always".
+    both side by side.
+
+    Args:
+        footprints: of the frames.
+        joins: whether pieces that touch are joined: by their border, "never" or "always".
 
     Returns:
         The label of each pair in each footprint, (K,) int64 each: 1, 2, ... for the clusters; 0 for
@@ -193,8 +201,9 @@ def clusters(
 def _cells_over(
     cells: NDArray[np.int64], node: NDArray[np.int64], nodes: int
 ) -> tuple[Float, Float]:
-    """Which of the cells over which anything lies are over each node, and up to BESIDE from it,
-    (nodes, cells) each.
+    """Which cells are over each node, and which lie up to BESIDE from it, (nodes, cells) each.
+
+    Only cells over which anything lies are listed.
     """
     at = cells - cells.min(0) + BESIDE
     width = int(at[:, 1].max()) + 1 + BESIDE
@@ -209,8 +218,9 @@ def _cells_over(
 
 
 def _within_outlines(footprints: Sequence[Footprint], shared: Float) -> Mask:
-    """Which pieces lie within the outline, seen from above, of which other one that is the same
-    thing, (N, N) bool.
+    """Which pieces lie within the outline of which other piece of the same object, (N, N) bool.
+
+    Outlines are seen from above.
 
     Of one frame that is one which surrounds them: the sides of a bathtub its bottom, the top of a
     table its foot, and the rim of a lid its knob, with nothing but the plane between them; what
@@ -262,8 +272,9 @@ def _lie_beside(some: Float, others: Float) -> bool:
 def _links(
     footprints: Sequence[Footprint], shared: Float, beside: Mask, within: Mask, joins: Joins
 ) -> tuple[Float, Mask, Mask]:
-    """How strongly each two pieces are linked, 0 for not, which stand apart and which may, (N,
-    N) each.
+    """How strongly two pieces are linked, which stand apart, and which may; (N, N) each.
+
+    A strength of 0 is no link.
     """
     every = [f.pieces for f in footprints]
     same = block_diag(*(np.ones_like(p.touch) for p in every)) > 0
@@ -291,8 +302,9 @@ def _links(
 def _joined(
     strength: Float, apart: Mask, size: Float
 ) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
-    """Cluster of each of N pieces, of a size (N,), by links of a strength, (N, N), 0 for none,
-    strong ones first.
+    """Cluster N pieces of given sizes, (N,), by their links, strong ones first.
+
+    A strength, (N, N), of 0 is no link.
 
     A link that would join two pieces that stand apart is refused; these links are given too. A
     piece that is small beside two clusters does not join them.
@@ -314,8 +326,7 @@ def _joined(
 
 
 def on_ground(points: Float, plane: Float) -> Mask:
-    """Which points, (N, 2), lie within the hull of what was seen of the plane, (M, 2), (N,)
-    bool.
+    """Which points lie within the convex hull of what was seen of the plane, (N,) bool.
 
     Args:
         points: (N, 2), in the plane.
@@ -372,8 +383,9 @@ def central(foot: Footprint, labels: NDArray[np.int64], plane: Float, optical_ax
 def nearest(
     footprints: Sequence[Footprint], labels: Sequence[NDArray[np.int64]], point: Float
 ) -> int:
-    """The cluster nearest to a point, in cells, (2,), seen from above, in most frames; 0 if
-    there is none.
+    """Return the cluster that is nearest to a point in most frames, seen from above.
+
+    The result is 0 if there is none.
 
     Args:
         footprints: of the frames.

@@ -55,12 +55,15 @@ LOW = 2  # pixels, that low, of the border of two things that stand side by side
 class Pieces:
     """Pieces of what stands on a plane.
 
-    ``label`` is that of each pixel, (H, W) int32, 0 for none; ``grown`` with those of edges, that
-    are less sure. ``stands`` tells which pieces reach down to the plane, (pieces + 1,) bool, by
-    label. Of each two pieces ``touch`` tells whether they touch in space, ``low`` whether their
-    border comes down to the plane, and ``inside`` whether the first lies inside the outline of the
-    second, and ``hangs`` whether the first, which does not reach down to the plane, is held by the
-    second: (pieces + 1, pieces + 1) bool.
+    Attributes:
+        label: of each pixel, (H, W); 0 for no piece.
+        grown: the same, with the less certain pixels at edges, (H, W).
+        stands: whether each piece reaches down to the plane, (pieces + 1,), by label.
+        touch: whether two pieces touch in space, (pieces + 1, pieces + 1).
+        low: whether the border between two pieces reaches down to the plane, same shape.
+        inside: whether the first piece lies inside the outline of the second, same shape.
+        hangs: whether the first piece, which does not reach the plane, is held by the second, same
+            shape.
     """
 
     label: NDArray[np.int32]

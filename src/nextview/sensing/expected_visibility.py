@@ -23,7 +23,13 @@ UNSEEN, FREE, OCCLUDER, OBJECT = np.arange(4, dtype=np.uint8)
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """A cube of n x n x n voxels about a ``centre``, of side twice ``half``."""
+    """A cube of n x n x n voxels.
+
+    Attributes:
+        n: voxels along each side.
+        half: half the side, object radii.
+        centre: of the cube, object frame, (3,).
+    """
 
     n: int = 64
     half: float = 1.0
@@ -66,11 +72,14 @@ class VoxelGrid:
 
 @dataclass(frozen=True)
 class Occupancy:
-    """What is known of each voxel of a grid. Nothing changes in place: ``seen`` gives another one.
+    """What is known of each voxel of a grid. Immutable: ``seen`` returns a new one.
 
-    An occupied voxel stays occupied: a leg is thinner than a voxel, so that its middle may be free
-    though it is there. ``cells`` are UNSEEN, FREE, OCCLUDER or OBJECT, (n, n, n) uint8, axes x, y,
-    z.
+    An occupied voxel stays occupied: a leg is thinner than a voxel, so the middle of its voxel may
+    be seen to be free.
+
+    Attributes:
+        grid: the voxels.
+        cells: UNSEEN, FREE, OCCLUDER or OBJECT, (n, n, n), axes x, y, z.
     """
 
     grid: VoxelGrid
@@ -176,8 +185,11 @@ LOWEST = 0.02  # share of a frame's points that may lie below the height of the 
 class SeenScene:
     """The space around a target after some frames, in the object frame and object radii.
 
-    Table and other things are occluders; below the height ``floor`` is nothing of the target:
-    infinity at first.
+    The table and other things are occluders.
+
+    Attributes:
+        occupancy: what is known of the space.
+        floor: height below which nothing belongs to the target; infinity at first.
 
     >>> seen = SeenScene.of(observation.scene for observation in observations)  # doctest: +SKIP
     >>> expected_visibility(seen, sphere.poses[:, :3, 3]).expected              # doctest: +SKIP
@@ -281,7 +293,12 @@ def sight_lines(grid: VoxelGrid, positions: bytes) -> "SightLines":
 
 @dataclass(frozen=True)
 class SightLines:
-    """The voxels between an object's parts and cameras, (V, 3); computed once."""
+    """The voxels between the parts of an object and the cameras; computed once.
+
+    Attributes:
+        grid: the voxels.
+        positions: of the cameras, object frame, (V, 3).
+    """
 
     grid: VoxelGrid
     positions: NDArray[np.float64]

@@ -40,7 +40,13 @@ LAYER = 0.03
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviation of inverse depth, 1/metres, by depth, and its correlation length."""
+    """The noise of a depth image, as a function of depth.
+
+    Attributes:
+        depths: ascending, metres, (D,).
+        sigmas: standard deviation of inverse depth at each, 1/metres, (D,).
+        grain: distance within which pixels err together, pixels.
+    """
 
     depths: NDArray[np.float64]
     sigmas: NDArray[np.float64]
@@ -103,6 +109,8 @@ class Facets:
     Attributes:
         planes: n of each, with n . P = 1 for points P of the plane, (N, 3), 1/metres.
         rays: (x, y, 1) through the pixels' centres, (N, 3).
+        rows: of the pixels, (N,).
+        columns: of the pixels, (N,).
         pitch: distance between neighbouring rays along x and y at depth 1, (2,).
     """
 

@@ -129,7 +129,8 @@ class Frame:
     @property
     def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """x and y of the rays (x, y, 1) through the columns (W,) and the rows (H,), float32."""
-        k, (height, width) = self.intrinsics, self.shape
+        k = self.intrinsics
+        height, width = self.shape
         x = (np.arange(width) + 0.5 - k[0, 2]) / k[0, 0]
         y = (np.arange(height) + 0.5 - k[1, 2]) / k[1, 1]
         return x.astype(np.float32), y.astype(np.float32)
@@ -176,7 +177,8 @@ class Frame:
         Returns:
             Values, (H, W) float32; undefined where the depth is 0.
         """
-        (x, y), pose = self.rays, self.camera_to_world
+        x, y = self.rays
+        pose = self.camera_to_world
         a, b, c = (pose[:3, :3].T @ direction).astype(np.float32)
         towards = (a * x)[None, part[1]] + (b * y + c)[part[0], None]
         return self.depth[part] * towards + np.float32(direction @ pose[:3, 3] + offset)
@@ -300,11 +302,10 @@ def check_pose(pose: ArrayLike) -> NDArray[np.float64]:
     """Copy a rigid pose, (4, 4); ObservationError names the likely mistake."""
     pose = _matrix(pose, "the pose", (4, 4))
     if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
-        transposed = np.allclose(pose[:, 3], [0, 0, 0, 1], atol=1e-6)
-        last = np.round(pose[3], 3).tolist()
-        raise ObservationError(
-            f"the last row of a pose is 0, 0, 0, 1, not {last}" + ": transposed?" * transposed
-        )
+        sentence = f"the last row of a pose is 0, 0, 0, 1, not {np.round(pose[3], 3).tolist()}"
+        if np.allclose(pose[:, 3], [0, 0, 0, 1], atol=1e-6):
+            sentence += ": transposed?"
+        raise ObservationError(sentence)
 
     rotation = pose[:3, :3]
     gram = rotation.T @ rotation

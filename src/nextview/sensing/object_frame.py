@@ -16,13 +16,15 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ObjectFrame:
-    """The object's centre, (3,), world, metres, its radius and its axes.
+    """The centre, the radius and the axes of an object.
 
-    Positions in the object frame are in object radii.
-
-    ``radius``, metres, is that of the sphere about the centre that holds the object; the rows of
-    ``axes``, (3, 3), are the object's x, y and z (up) in the world. UsageError if they are no
+    Positions in the object frame are in object radii. UsageError is raised if the axes are no
     rotation, or the radius is not positive.
+
+    Attributes:
+        centre: (3,), world, metres.
+        radius: of the sphere about the centre that holds the object, metres.
+        axes: rows are the x, y and z (up) axes of the object in the world, (3, 3).
     """
 
     centre: Float
@@ -64,9 +66,13 @@ class ObjectFrame:
 class Box:
     """An upright box in the world that fits the object tightly.
 
-    The corners ``low`` and ``high`` are (3,), metres; the rows of ``axes``, (3, 3), are the box's
-    x, y and z (up) in the world, by default the world's own. UsageError if it has no inside, or the
-    axes are no rotation.
+    UsageError is raised if it has no volume, or the axes are no rotation.
+
+    Attributes:
+        low: lower corner, (3,), metres, along the axes.
+        high: upper corner, (3,), metres, along the axes.
+        axes: rows are the x, y and z (up) axes of the box in the world, (3, 3); by default those of
+            the world.
     """
 
     low: Float
@@ -141,7 +147,9 @@ def upright_axes(up: ArrayLike, front: ArrayLike | None = None) -> Float:
         raise UsageError("up is a direction, three numbers, not 0, 0, 0")
     z = z / np.abs(z).max()  # first, or squares of the smallest numbers would be zero
     z = z / np.linalg.norm(z)
-    x = np.eye(3)[0 if abs(z[0]) < 0.9 else 1] if front is None else np.asarray(front, np.float64)
+    x = np.eye(3)[0 if abs(z[0]) < 0.9 else 1]
+    if front is not None:
+        x = np.asarray(front, np.float64)
     x = x - (x @ z) * z
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z])

@@ -83,9 +83,15 @@ MAY_BE_TWO = ViewWarning(
 
 @dataclass(frozen=True)
 class ObjectState:
-    """All that is known of an object after some frames.
+    """What is known of an object after some frames.
 
     Attributes:
+        rng: source of all random numbers.
+        frame: the object frame; None before the object is found.
+        sightings: what each frame shows of the object.
+        observations: of the frames, in the latest object frame.
+        warnings: about the latest frame.
+        revision: how often the object frame changed.
         cell: side of a cell of the footprints, metres.
         joins: whether what touches it is a part of it.
     """
@@ -247,7 +253,8 @@ class ObservedObject:
         latest, made, revision = self._seen_as(sightings, up)
 
         warnings = self._warnings(frame, latest, made, up, two)
-        warnings += [NO_PLANE] * (self.support and plane is None and self.known is None)
+        if self.support and plane is None and self.known is None:
+            warnings.append(NO_PLANE)
         for view in made[-4:-1]:
             warnings = warnings or check_views(view, made[-1])
         warnings += plausibility.check_place(displaced)
@@ -536,8 +543,10 @@ class ObservedObject:
         )
 
     def _base(self, samples: Samples, up: Float) -> Plane | None:
-        """The level plane through the lowest that a frame shows, where the support is out of the
-        picture: the object is named by a point, and a level plane is seen, but over the point.
+        """The level plane through the lowest points of a frame whose support is out of the picture.
+
+        It is used if the object is selected by a point, and a level plane is seen, but above the
+        point.
 
         Such a plane is a part of the object, as the top is of a table; that it is level tells that
         the pose is right. None where no plane tells it.
@@ -560,8 +569,10 @@ class ObservedObject:
         samples: Samples,
         noise: Noise,
     ) -> Found:
-        """Find the object among what rises above a plane: that on which it stands, if it is seen,
-        or one that lies as low as all that is seen.
+        """Find the object among what rises above a plane.
+
+        It is the plane on which the object stands, if that is seen, or else one as low as all that
+        is seen.
         """
         earlier = self.state.sightings
         cell = self.state.cell

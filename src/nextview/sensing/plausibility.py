@@ -197,7 +197,8 @@ def _times_behind(frame: Frame, target: Float, radius: float) -> float:
     if z <= 0:
         return 0.0
 
-    k, (height, width) = frame.intrinsics, frame.shape
+    k = frame.intrinsics
+    height, width = frame.shape
     column = int(k[0, 0] * x / z + k[0, 2])
     row = int(k[1, 1] * y / z + k[1, 2])
     if not (0 <= column < width and 0 <= row < height):
@@ -236,7 +237,8 @@ def _agreeing(first: Frame, second: Frame, scale: float) -> tuple[int, float]:
     here = first.camera_to_world
     points = (points @ here[:3, :3].T + here[:3, 3] - there[:3, 3]) @ there[:3, :3]
     points = points[points[:, 2] > 1e-3]
-    k, (height, width) = second.intrinsics, second.shape
+    k = second.intrinsics
+    height, width = second.shape
     column, row = (points[:, i] / points[:, 2] * k[i, i] + k[i, 2] for i in (0, 1))
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     row = row[inside].astype(int)
@@ -251,7 +253,9 @@ def _agreeing(first: Frame, second: Frame, scale: float) -> tuple[int, float]:
 
 def check_frame(frame: Frame) -> list[ViewWarning]:
     """What is likely to be wrong with a frame though it can be right; usually nothing."""
-    found, (height, width), k = [], frame.shape, frame.intrinsics
+    found = []
+    k = frame.intrinsics
+    height, width = frame.shape
     off = max(abs(2 * k[0, 2] / width - 1), abs(2 * k[1, 2] / height - 1))
     if off > OFF_CENTRE:
         message = (

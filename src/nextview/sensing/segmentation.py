@@ -42,7 +42,15 @@ MOST_ALONE = 4.0
 
 @dataclass(frozen=True)
 class Samples:
-    """A grid of points of a frame, world, metres, with their tolerance from a plane."""
+    """A grid of points of a frame, with their tolerance from a plane.
+
+    Attributes:
+        points: (N, 3), world, metres.
+        tolerance: distance from a plane within which each point may belong to it, metres, (N,).
+        rows: of the blocks in the picture, (N,).
+        columns: of the blocks in the picture, (N,).
+        camera: position of the camera, (3,), world, metres.
+    """
 
     points: Float
     tolerance: Float
@@ -224,11 +232,8 @@ def find_plane(
     best = int(count.argmax())
     plane = refine_plane(Plane(normals[best], float(offsets[best])), samples)
     level = up is None or plane.normal @ up > TILT
-    return (
-        plane
-        if level and plane.holds(samples).mean() > (LEAST_ALONE if up is None else LEAST)
-        else None
-    )
+    least = LEAST_ALONE if up is None else LEAST
+    return plane if level and plane.holds(samples).mean() > least else None
 
 
 def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:

@@ -93,8 +93,7 @@ def _only(chosen: Index, count: int) -> Mask:
 
 
 def under_points(samples: Samples, planes: list[Plane], points: Float) -> Plane | None:
-    """The highest of some planes that is seen beside the bottom of an object, whose surface shows
-    some points, (N, 3).
+    """Return the highest plane that is seen beside the bottom of an object.
 
     None where no plane is seen there: the bottom is hidden, or the object hangs in the air.
 
@@ -174,8 +173,9 @@ def aimed_at(samples: Samples, planes: list[Plane], in_the_way: Mask, target: Ta
 
 
 def is_named(samples: Samples, plane: Plane, target: Target) -> bool:
-    """Whether a place on a level surface, or under it, names the surface itself, such as the top of
-    a table: nothing stands there, and it is no ground.
+    """Whether a point on a level surface, or below it, selects the surface itself.
+
+    A table top is selected where nothing stands on it. The ground is never selected.
 
     Args:
         samples: of the frame.
@@ -199,8 +199,9 @@ def is_named(samples: Samples, plane: Plane, target: Target) -> bool:
 
 
 def _surface_there(samples: Samples, on: Mask, off: Float) -> Mask:
-    """Which samples of a level plane, (N,) bool, are of its surface that is nearest to where the
-    object is looked for, scraps left out.
+    """Which samples of a level plane belong to its surface nearest to the target, (N,) bool.
+
+    Scraps are left out.
     """
     surface = _surfaces(samples, on, GROUND_STEP)
     size = np.bincount(surface, on)
@@ -209,9 +210,7 @@ def _surface_there(samples: Samples, on: Mask, off: Float) -> Mask:
 
 
 def _carries(samples: Samples, plane: Plane, level: Mask, free: Mask, target: Target) -> bool:
-    """Whether a plane carries what the camera is aimed at, or what stands at a place; it is no
-    part of it.
-    """
+    """Whether a plane carries the target, and is no part of it."""
     on = plane.holds(samples) & level
     if on.sum() < 3:
         return False
@@ -241,8 +240,9 @@ def _carries(samples: Samples, plane: Plane, level: Mask, free: Mask, target: Ta
 
 
 def _leaves_picture(samples: Samples, chosen: Mask) -> bool:
-    """Whether a surface, some of the samples, goes on beyond the picture: what ends in it is a
-    thing of its own.
+    """Whether a surface continues beyond the picture.
+
+    A surface that ends inside the picture is a thing of its own.
     """
     for index in (samples.rows, samples.columns):
         if index[chosen].min() <= index.min() or index[chosen].max() >= index.max():
@@ -251,9 +251,7 @@ def _leaves_picture(samples: Samples, chosen: Mask) -> bool:
 
 
 def _thing_there(samples: Samples, above: Mask, off: Float) -> Index | None:
-    """The samples of the surface above a plane that is nearest to where the object is looked
-    for; None if none is.
-    """
+    """The samples of the surface above a plane that is nearest to the target; None without one."""
     if not above.any():
         return None
     group = _surfaces(samples, above)
@@ -263,8 +261,9 @@ def _thing_there(samples: Samples, above: Mask, off: Float) -> Index | None:
 
 
 def _surfaces(samples: Samples, chosen: Mask, step: float = SURFACE_STEP) -> Index:
-    """The number of the surface of each chosen sample, (N,), 0 for others: of one are neighbours in
-    the grid.
+    """Number the surfaces of the chosen samples, (N,); 0 for the other samples.
+
+    Neighbours in the grid belong to one surface.
 
     Their depths differ by at most so large a part, and noise.
     """
@@ -284,9 +283,7 @@ def _surfaces(samples: Samples, chosen: Mask, step: float = SURFACE_STEP) -> Ind
 
 
 def _components(count: int, links: Index, nodes: Index) -> Index:
-    """The connected component of some of ``count`` nodes, (count,), 1 and more; 0 for the
-    others.
-    """
+    """The connected component of each linked node, 1 and more, (count,); 0 for other nodes."""
     graph = coo_array((np.ones(links.shape[1], bool), (links[0], links[1])), shape=(count, count))
     group = np.zeros(count, np.int64)
     group[nodes] = connected_components(graph, directed=False)[1][nodes] + 1
@@ -294,8 +291,9 @@ def _components(count: int, links: Index, nodes: Index) -> Index:
 
 
 def _stands_within(samples: Samples, plane: Plane, thing: Index, outline: ConvexHull) -> bool:
-    """Whether a thing covers a smaller part of the plane, away from its outline, or is narrow:
-    no back of a sofa on its seat.
+    """Whether a thing covers a smaller part of the plane, away from its outline, or is narrow.
+
+    The back of a sofa on its seat does neither.
     """
     shown = _in_plane(samples.points[thing], plane)
     extent = np.linalg.norm(np.ptp(outline.points[outline.vertices], axis=0))

@@ -155,8 +155,9 @@ def before_walls(frame: Frame, walls: Sequence[Plane], noise: Noise) -> Mask:
 def _largest_upright_plane(
     samples: Samples, chosen: NDArray[np.int64], up: Float, rng: Generator
 ) -> Plane | None:
-    """The upright plane with most of the chosen samples on it, its normal to the side where most
-    is seen.
+    """The upright plane through most of the chosen samples.
+
+    Its normal points to the side where most is seen.
     """
     points = samples.points[chosen]
     tolerance = samples.tolerance[chosen]
@@ -201,9 +202,7 @@ def _is_wall(
     place: Float | None,
     narrowest: float,
 ) -> bool:
-    """Whether an upright plane with some samples on it is as wide as a wall and goes on to the
-    picture's edge.
-    """
+    """Whether an upright plane is as wide as a wall and reaches the edge of the picture."""
     if place is not None and upright.height(place) < NEAREST_TO_PLACE:
         return False
     away = float(np.median(np.linalg.norm(samples.points[on] - samples.camera, axis=1)))
@@ -236,8 +235,9 @@ def _is_wall(
 
 
 def _hides_much(samples: Samples, upright: Plane, walls: Sequence[Plane], many: int) -> bool:
-    """Whether much more is seen behind an upright plane than flying pixels, walls across it left
-    out.
+    """Whether more is seen behind an upright plane than flying pixels explain.
+
+    Walls that cross it are left out.
     """
     behind = upright.height(samples.points) < -2 * samples.tolerance
     for wall in walls:

@@ -32,6 +32,7 @@ class Step:
     Attributes:
         episodes: which ones, (A,).
         views: the view taken, or the one nearest to where the camera stood, (A,).
+        evidence: of the view in each episode.
         belief: fused after it, (A, classes).
         enough: whether belief is enough to stop, (A,).
         stopped: whether the episode ended here, (A,).
@@ -64,6 +65,7 @@ class Outcome:
     Attributes:
         answer: most believed class.
         confidence: its belief.
+        n_views: number of views taken.
         confident: whether the threshold was reached; else no view was left.
         travel: over the moves between these views, grid cells.
         arc: the same in radians.
@@ -84,6 +86,7 @@ class Taken:
     """A step that is not taken in yet, and what goes with it in its A episodes.
 
     Attributes:
+        step: the step.
         counts: whether anything is seen in the view, (A,).
         visited: views that count as visited after it, (A, V).
         azimuth: of the cameras, radians, (A,).

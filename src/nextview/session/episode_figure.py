@@ -163,7 +163,8 @@ def _best_side(path: NDArray[np.float64]) -> float:
 
 def _draw_image(axis: Axes, view: View, step: int, light: SoftLight) -> None:
     """The object as this view shows it: by its picture if a camera took one, else by its depth."""
-    seen, (elevation, azimuth) = view.observation, view.angles
+    seen = view.observation
+    elevation, azimuth = view.angles
     times = (
         1
         if seen.image is not None and not seen.exact

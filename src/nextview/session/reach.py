@@ -26,7 +26,13 @@ Poses = Callable[[], Float]
 
 @dataclass(frozen=True)
 class Reach:
-    """Where the camera can go, and what that costs."""
+    """Where the camera can go, and what that costs.
+
+    Attributes:
+        failed: viewpoints that the camera failed to reach, (V,).
+        reachable: tells which poses can be reached; None if all can.
+        cost: cost of each move; None for the distance on the view sphere.
+    """
 
     failed: NDArray[np.bool_]
     reachable: Reachable | None = None

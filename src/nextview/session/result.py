@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.checks import number_of
 from nextview.geometry.ray_caster import Triangles
 from nextview.geometry.viewsphere import Viewpoints
 from nextview.recognition.belief import Stopping
@@ -306,10 +307,7 @@ class Recognition:
 
     def __repr__(self) -> str:
         """One line: ``chair (belief 0.998, 2 views, 1.41 cells of travel, confident)``."""
-        views = (
-            f"{len(self.views)} view{'s' * (len(self.views) != 1)}, {self.travel:.2f} cells of"
-            " travel"
-        )
+        views = f"{number_of(len(self.views), 'view')}, {self.travel:.2f} cells of travel"
 
         if not self.seen:
             return f"nothing is seen ({views})"

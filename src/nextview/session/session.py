@@ -472,7 +472,8 @@ class Session:
             )
             view = replace(self.views[-1], next_view=_next_of(step), values=self._values(step))
             self._episodes.keep_choice(step)
-            self._reach, self.views[-1] = reach, view
+            self._reach = reach
+            self.views[-1] = view
             for observer in self.observers:
                 observer(self)
         else:  # with frames it begins where the camera is
@@ -725,7 +726,8 @@ class Session:
         self, step: Step, observation: Observation, direction: Float, travel: tuple[float, float]
     ) -> View:
         """What a step says of its view, but for what was chosen after it."""
-        calibration, (nearest, there) = self._episodes.calibration, self.sphere.nearest(direction)
+        calibration = self._episodes.calibration
+        nearest, there = self.sphere.nearest(direction)
         azimuth = self.sphere.azimuth[[nearest]] if there else azimuth_of(direction[None])
         classes = len(self.models.classes)
         evidence = step.evidence

@@ -1,6 +1,4 @@
-"""What one frame shows beside the object: surfaces that a camera must not touch, and the walls
-of the room.
-"""
+"""What a frame shows beside the object: surfaces to keep clear of, and walls of the room."""
 
 from dataclasses import dataclass
 
@@ -70,8 +68,9 @@ class Surroundings:
         return cls(frame, sighting.noise, sighting.plane, points, tolerance, walls)
 
     def is_near(self, places: Float, around: ObjectFrame, clearance: float) -> Mask:
-        """Whether a surface was measured near places, neither the object's own nor the support
-        plane.
+        """Whether a measured surface is near each place.
+
+        The surfaces of the object and of the support plane do not count.
 
         Args:
             places: (V, 3), world, metres.
@@ -92,16 +91,13 @@ class Surroundings:
         return (apart < clearance).sum(1) >= FEWEST_POINTS
 
     def shows_behind(self, wall: Plane) -> bool:
-        """Whether the camera stood behind what another frame took for a wall, or sees something
-        there.
-        """
+        """Whether the camera stood behind the wall of another frame, or sees something there."""
         if wall.height(self.frame.camera_to_world[:3, 3]) < 0:
             return True
         return _share_behind(wall.height(self.points), self.tolerance) > MOST_BEHIND
 
     def look_at(self, places: Float, around: ObjectFrame, margin: float) -> tuple[Mask, Mask]:
-        """Which places the frame looks through, and which ones something else than the object hides
-        from it.
+        """Which places the frame looks through, and which are hidden by other things.
 
         Args:
             places: (V, 3), world, metres.
@@ -130,8 +126,9 @@ class Surroundings:
         return free, blocked & ~own & ~on_plane
 
     def _depth_towards(self, seen_at: Float) -> Float:
-        """Median depth around the pixels that points, (V, 3), camera frame, fall on; NaN where
-        there is none.
+        """Median depth around the pixels that points, (V, 3), camera frame, project to.
+
+        NaN where nothing is measured.
         """
         height, width = self.frame.shape
         k = self.frame.intrinsics

@@ -53,7 +53,11 @@ class System:
     ``load`` makes one. It is pickled as how it was loaded.
 
     Attributes:
+        models: the recogniser and the map networks.
+        policy: chooses the next view.
+        policy_name: name of the policy.
         sphere: the candidates.
+        stopping: decides when an episode ends.
         unknown: share of objects of known classes that may be called unknown.
         loaded: the arguments of ``load`` that make it.
 

@@ -19,6 +19,7 @@ class View:
     Attributes:
         index: candidate viewpoint that it was taken from, or the nearest one to where the camera
             stood.
+        observation: what was seen.
         alone: belief by this view alone, (classes,), by features where the geometry of all views is
             judged together; even if nothing is seen in it.
         belief: fused over all views so far, (classes,).

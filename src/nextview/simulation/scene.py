@@ -32,7 +32,14 @@ _AROUND = EDGE * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 
 @dataclass(frozen=True)
 class Item:
-    """A thing beside the target: vertices, (V, 3), faces, (F, 3) int32, footprint, (K, 2)."""
+    """A thing beside the target.
+
+    Attributes:
+        vertices: (V, 3), object radii of the target.
+        faces: (F, 3) vertex indices.
+        footprint: outline seen from above, (K, 2).
+        wall: whether the camera cannot be beyond it.
+    """
 
     vertices: Float
     faces: NDArray[np.int32]
@@ -42,7 +49,12 @@ class Item:
 
 @dataclass(frozen=True)
 class Scene:
-    """The object that is meant, and the other things that stand on its table."""
+    """A target, and the other things that stand on its table.
+
+    Attributes:
+        target: the object to recognise.
+        items: the other things.
+    """
 
     target: Mesh
     items: tuple[Item, ...] = ()

@@ -34,10 +34,15 @@ def below_the_meshes(path: str) -> None:
 
 
 class Placement(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """An object on the table: mesh file, its hash, and its place.
+    """An object on the table: its mesh file and its place.
 
-    x and y are those of its bounding box's centre; lengths are in object radii of the target,
-    angles in radians.
+    Attributes:
+        mesh: path of the mesh file.
+        sha256: of the mesh file.
+        x: centre of the bounding box, object radii of the target.
+        y: centre of the bounding box, object radii of the target.
+        azimuth: rotation about the vertical, radians.
+        radius: of the object, object radii of the target.
     """
 
     mesh: str
@@ -52,9 +57,16 @@ class Placement(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=T
 
 
 class Block(Struct, frozen=True, forbid_unknown_fields=True):
-    """An upright box on the table; the camera cannot be beyond a ``wall``.
+    """An upright box on the table.
 
-    Lengths are in the target's radii, angles in radians.
+    Attributes:
+        x: of its centre, object radii of the target.
+        y: of its centre, object radii of the target.
+        azimuth: rotation about the vertical, radians.
+        width: object radii of the target.
+        depth: object radii of the target.
+        height: object radii of the target.
+        wall: whether the camera cannot be beyond it.
     """
 
     x: Length
@@ -67,16 +79,26 @@ class Block(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SceneLayout(Struct, frozen=True, forbid_unknown_fields=True):
-    """A target at rest on a table, in its object frame, and the things around it."""
+    """A target at rest on a table, in its object frame, and the things around it.
 
-    name: str  # unique in its folder, "chair_0890@medium-1"
-    level: str  # one of LEVELS, or another word for scenes of one's own
-    seed: int  # with which it was drawn
-    target: Placement  # in the middle, not rotated
-    objects: Annotated[tuple[Placement, ...], MOST] = ()  # others
-    blocks: Annotated[tuple[Block, ...], MOST] = ()  # boxes and walls
-    # of the 40 views: the share of the target's picture that nothing hides, () if not measured;
-    # those out of reach
+    Attributes:
+        name: unique in its folder, "chair_0890@medium-1".
+        level: level of clutter, one of LEVELS, or a word of your own.
+        seed: seed that the scene was drawn with.
+        target: in the middle of the table, not rotated.
+        objects: the other objects.
+        blocks: boxes and walls.
+        visible: share of the picture of the target that nothing hides, from each of the 40 views;
+            () if not measured.
+        unreachable: indices of the views that no camera can reach.
+    """
+
+    name: str
+    level: str
+    seed: int
+    target: Placement
+    objects: Annotated[tuple[Placement, ...], MOST] = ()
+    blocks: Annotated[tuple[Block, ...], MOST] = ()
     visible: Annotated[tuple[Annotated[float, Meta(ge=0, le=1)], ...], Meta(max_length=VIEWS)] = ()
     unreachable: Annotated[
         tuple[Annotated[int, Meta(ge=0, lt=VIEWS)], ...], Meta(max_length=VIEWS)

@@ -181,7 +181,8 @@ class SensedCamera:
         whose = np.full(depth.shape, OBJECT, np.uint8)
         part, table = self._table(inside)
         shown = np.isfinite(table) & (depth[part] == 0)
-        depth[part][shown], whose[part][shown] = table[shown], TABLE_TOP
+        depth[part][shown] = table[shown]
+        whose[part][shown] = TABLE_TOP
         if self._around is not None:
             boxes = self._around.observe(inside).depth
             nearer = (boxes > 0) & ((depth == 0) | (boxes < depth))

@@ -51,6 +51,7 @@ class Sensor:
     sensor has.
 
     Attributes:
+        name: of the sensor.
         height: rows of its pictures.
         width: columns.
         focal: pixels, for both axes; the principal point is in the middle.
@@ -320,11 +321,13 @@ RENDER = Sensor("render", _SIDE, _SIDE, _FOCAL, distance=DISTANCE * _RADIUS, rad
 
 @dataclass(frozen=True)
 class SensorMix:
-    """Any sensor, from none to twice the known ones, in any setup, from none wrong to very wrong.
+    """Random sensors, from no errors to twice those of the known ones, in any setup.
 
-    Half of the draws look as renders do, some with noise up to 0.02 object radii or up to a quarter
-    of the pixels missing; the others are a Kinect or a stereo camera. ``strength`` multiplies every
-    error.
+    Half of the draws look like renders, some with noise up to 0.02 object radii or with up to a
+    quarter of the pixels missing. The others are a Kinect or a stereo camera.
+
+    Attributes:
+        strength: factor of every error.
     """
 
     strength: float = 1.0
@@ -473,7 +476,8 @@ def across_edges(q: Image, slope: tuple[Image, Image]) -> Image:
         beside = padded[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
         step = np.abs(beside - q - slope[0] * dx - slope[1] * dy)
         over = (step > highest) & (beside > 0) & (q > 0)
-        other[over], highest[over] = beside[over], step[over]
+        other[over] = beside[over]
+        highest[over] = step[over]
     return other
 
 
@@ -514,7 +518,9 @@ def in_shadow(q: Image, focal: float, baseline: float) -> NDArray[np.bool_]:
     for _ in range(WIDEST):
         np.maximum.at(flat, at, value)
         wider = at + 1 < end
-        at, end, value = at[wider] + 1, end[wider], value[wider]
+        at = at[wider] + 1
+        end = end[wider]
+        value = value[wider]
     narrow = NARROWEST + focal * abs(baseline) * np.abs(along)
     return seen & (flat[np.where(seen, first_index, 0)] > disparity + narrow)
 

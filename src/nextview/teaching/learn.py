@@ -100,8 +100,9 @@ class Learned:
     """What was learned.
 
     Attributes:
-        out: the folder.
-        things: how many, of so many ``classes``.
+        out: folder of the memory.
+        things: number of things.
+        classes: number of classes that they belong to.
         accuracy: share of the cases in which views are named right after 1, 2 and 3 of them, by
             geometry where it is known, with weights that were fitted to other things, else after 1,
             2, 3 and 5 held-out views by features and size; things of a class of several by the

@@ -27,10 +27,15 @@ NO_LIKENESS = -1e3
 class Fit:
     """What was fitted to a memory, with the accuracy on held-out views.
 
-    ``accuracy`` is after the numbers of views in VIEWS; ``confused`` holds (thing, thing, share).
-
     Attributes:
+        weight: of the similarity of a view to what is remembered.
+        correlation: of the evidence of two views.
+        head: weights of the linear head on the features.
+        head_bias: biases of the head.
+        quantiles: of the novelty score, see ``recognition.novelty.Quantiles``.
         usual: see ``recognition.novelty.Quantiles``.
+        accuracy: share of right answers after each number of views in VIEWS.
+        confused: pairs that are most often confused: (thing, thing, share).
     """
 
     weight: float
@@ -237,11 +242,9 @@ def size_evidence(radii: Floats, label: Index) -> SizeEvidence | None:
     for c in range(len(density)):
         own = np.log(radii[known & (label == c)])
         # Things of a class differ in size, and the fewer are known the wider their sizes may lie.
-        wide = (
-            SIZE_ERROR
-            if (label == c).sum() == 1
-            else max(SIZE_ERROR, 0.5 * own.std() if len(own) > 1 else 0.3)
-        )
+        wide = SIZE_ERROR
+        if (label == c).sum() > 1:
+            wide = max(SIZE_ERROR, 0.5 * own.std() if len(own) > 1 else 0.3)
         if len(own):
             off = (grid[:, None] - own) / wide
             density[c] = np.log(

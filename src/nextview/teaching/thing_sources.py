@@ -121,7 +121,9 @@ def _captures(folder: Path) -> list[Path]:
 
 def _counted(count: int, one: str, several: str) -> list[str]:
     """How many there are, a phrase; nothing for none."""
-    return [f"{count} {one if count == 1 else several}"] if count else []
+    if count == 0:
+        return []
+    return [f"{count} {one if count == 1 else several}"]
 
 
 def _of_frames(path: Path) -> ThingSource:

@@ -37,7 +37,14 @@ THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())
 
 @dataclass(frozen=True)
 class FittedCalibration:
-    """What ``fit_calibration`` wrote into the card."""
+    """What ``fit_calibration`` wrote into the card.
+
+    Attributes:
+        calibration: the calibration.
+        objects: number of objects that it was fitted to.
+        before: negative log-likelihood over 1 to 5 views before the fit.
+        after: the same after the fit.
+    """
 
     calibration: Calibration
     objects: int
@@ -80,7 +87,8 @@ def fit_calibration(
         risk = fit_risk(data, calibration, np.random.default_rng([seed, 1]), delta, walks=walks)
         calibration = replace(calibration, risk=risk)
         about = f"{len(table)} objects of the training split, classes weighted evenly"
-        about += ", clean and through sensors" * bool(sensed)
+        if sensed:
+            about += ", clean and through sensors"
         write("calibration", about, [table], calibration=calibration)
     before, after = (
         loss(data, c, np.random.default_rng([seed, 2]), walks=walks)
@@ -116,7 +124,8 @@ class Walks:
     """Random walks over all objects: half in the local window, half over the sphere.
 
     Attributes:
-        objects: (walks,).
+        data: predictions for the objects.
+        objects: object of each walk, (walks,).
         totals: log-evidence summed over the views so far, (walks, views, D).
     """
 
@@ -311,7 +320,15 @@ ANY_SIZE = 0.05
 
 @dataclass(frozen=True)
 class FittedSize:
-    """What ``fit_size`` wrote into the card."""
+    """What ``fit_size`` wrote into the card.
+
+    Attributes:
+        size: the sizes of each class.
+        objects: number of objects that the sizes come from.
+        weighed_on: number of other objects that the weight was fitted to.
+        before: negative log-likelihood of single views without the size.
+        after: the same with the size.
+    """
 
     size: SizeEvidence
     objects: int
@@ -435,7 +452,13 @@ def fit_weight(
 
 @dataclass(frozen=True)
 class FittedValleys:
-    """What ``fit_valleys`` wrote into the card."""
+    """What ``fit_valleys`` wrote into the card.
+
+    Attributes:
+        classes: for which the valley is the better view.
+        gains: by how much, for each class.
+        objects: number of objects that they were chosen by.
+    """
 
     classes: tuple[str, ...]
     gains: dict[str, float]

@@ -25,7 +25,13 @@ AGAIN = "delete it, and it is made again"
 
 @dataclass(frozen=True)
 class PackedViews:
-    """Views of all objects, (N, V, C, H, W) uint8, read like an array: ``views[i, 2:5]``."""
+    """Views of all objects, (N, V, C, H, W) uint8, read like an array: ``views[i, 2:5]``.
+
+    Attributes:
+        packed: compressed views, one after another, (bytes,).
+        places: start and length of each view in ``packed``, (N, V, 2); length 0 for an empty view.
+        size: C, H, W.
+    """
 
     packed: NDArray[np.uint8]
     places: NDArray[np.int64]

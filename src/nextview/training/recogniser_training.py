@@ -103,14 +103,17 @@ def augment(x: Tensor) -> tuple[Tensor, Tensor]:
 
     Which of them were mirrored is returned as well.
     """
-    (b, _, _, s), on = x.shape, {"device": x.device}
+    b, _, _, s = x.shape
+    on = {"device": x.device}
     scale = torch.empty(b, 2, **on).uniform_(0.8, 1.25)
     mirrored = torch.randint(0, 2, (b,), **on) == 0
     scale[:, 0] *= torch.where(mirrored, -1.0, 1.0)
     roll = torch.empty(b, **on).normal_(0, 0.05)
     theta = torch.zeros(b, 2, 3, **on)
-    theta[:, 0, 0], theta[:, 0, 1] = scale[:, 0] * roll.cos(), -scale[:, 0] * roll.sin()
-    theta[:, 1, 0], theta[:, 1, 1] = scale[:, 1] * roll.sin(), scale[:, 1] * roll.cos()
+    theta[:, 0, 0] = scale[:, 0] * roll.cos()
+    theta[:, 0, 1] = -scale[:, 0] * roll.sin()
+    theta[:, 1, 0] = scale[:, 1] * roll.sin()
+    theta[:, 1, 1] = scale[:, 1] * roll.cos()
     theta[:, :, 2] = torch.empty(b, 2, **on).uniform_(-0.1, 0.1)
     x = F.grid_sample(
         x, F.affine_grid(theta, list(x.shape), align_corners=False), align_corners=False

@@ -26,7 +26,12 @@ OBJECTIVES = ("belief", "log-belief", "right")
 
 @dataclass(frozen=True)
 class ReplayTable:
-    """Outputs of held-out models for N objects, calibrated, and their scenes."""
+    """Outputs of held-out models for N objects, calibrated, and their scenes.
+
+    Attributes:
+        data: the predictions.
+        scenes: scenes around the objects; None if they stand alone.
+    """
 
     data: Predictions
     scenes: SceneSight | None = None
@@ -68,7 +73,14 @@ class ReplayTable:
 
 @dataclass(frozen=True)
 class DecisionState:
-    """N episodes, one for each object, when the next view is to be chosen."""
+    """N episodes, one for each object, when the next view is to be chosen.
+
+    Attributes:
+        state: what the policy sees.
+        total: sum of the log-evidence so far, (N, D).
+        travel: so far, grid cells, (N,).
+        seen: weighted number of views in which anything was seen, (N,).
+    """
 
     state: EpisodeState
     total: Float
@@ -180,9 +192,11 @@ def candidate_values(table: ReplayTable, moment: DecisionState, kind: str) -> Fl
 
 
 class Value(NamedTuple):
-    """Mean objective and travel in cells after 2, 3, ... views, (views - 1,).
+    """Mean objective and travel after 2, 3, ... views; classes have equal weight.
 
-    Classes have equal weight.
+    Attributes:
+        mean: objective, averaged over classes, (views - 1,).
+        travel: grid cells, (views - 1,).
     """
 
     mean: Float

@@ -319,7 +319,15 @@ def is_first() -> bool:
 
 
 class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a run's folder says of it."""
+    """What a run's folder says of it.
+
+    Attributes:
+        recipe: settings of the training.
+        weights: SHA-256 of the initial weights; None for random ones.
+        held_out: names of the validation objects.
+        validation: names of the objects by which the checkpoint is selected; the same in new runs.
+        commands: commands that led to the run.
+    """
 
     recipe: dict[str, Any]
     weights: str | None
@@ -398,8 +406,10 @@ def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
                 f"another recipe ({name} was {before.recipe.get(name)}, not {recipe[name]})"
                 for name in changed
             ]
-            faults += ["other first weights"] * (before.weights != run.weights)
-            faults += ["other objects"] * (before.held_out != run.held_out)
+            if before.weights != run.weights:
+                faults.append("other first weights")
+            if before.held_out != run.held_out:
+                faults.append("other objects")
 
             if faults:
                 again = "give the same options to resume it, or another folder"

@@ -231,13 +231,15 @@ def _beliefs(walk: Walk) -> str:
     counted = sum(view.observation.seen for view in walk.views)
     # none is drawn where it is infinite
     threshold = 100 * float(walk.stopping.threshold_at(max(counted, 1)))
+    mark = f'<b style="left:{threshold:.1f}%"></b>' if np.isfinite(threshold) else ""
+
     for c in np.argsort(-highest, kind="stable")[:SHOWN_CLASSES]:
         bars = (
             '<div class="bar"><i'
             f' style="top:0;height:8px;width:{100 * view.belief[c]:.1f}%;background:{ACCENT}"></i>'
             f'<i style="top:8px;height:5px;width:{100 * view.alone[c]:.1f}%;'
             f'background:{FAINT}"></i>'
-            f"""{f'<b style="left:{threshold:.1f}%"></b>' * bool(np.isfinite(threshold))}</div>"""
+            f"{mark}</div>"
         )
         rows.append(
             (

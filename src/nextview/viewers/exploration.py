@@ -50,7 +50,13 @@ class StoredViews:
 
 @dataclass(frozen=True)
 class ShownObject:
-    """An object by its name; ``open`` reads its mesh, or a camera of its stored views."""
+    """An object that can be opened by its name.
+
+    Attributes:
+        name: of the object.
+        open: reads the mesh, or returns a camera of the stored views.
+        label: true class; None if it is not known.
+    """
 
     name: str
     open: Callable[[], Mesh | Camera]

@@ -155,7 +155,8 @@ class Page:
     def _show_choices(self) -> None:
         exploration = self.exploration
         name, _, strength = (exploration.sensor or CLEAN).partition(":")
-        self._object.value, self._sensor.value = exploration.shown.name, name
+        self._object.value = exploration.shown.name
+        self._sensor.value = name
         self._strength.value = float(strength or self._strength.value)
         self._policy.value, *second = exploration.policies
         self._second.value = second[0] if second else NOTHING

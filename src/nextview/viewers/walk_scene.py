@@ -137,10 +137,14 @@ class WalkScene:
         for view, (ball, colour) in enumerate(zip(self._balls, heat(values), strict=True)):
             visited = view in walk.visited
             asked = view == walk.next_view
-            ball.color = (
-                rgb(INK) if visited else rgb(ACCENT) if asked else tuple(int(c) for c in colour)
-            )
-            scale = 0.5 if visited else 1.5 if asked else 1.0
+            ball.color = tuple(int(c) for c in colour)
+            scale = 1.0
+            if visited:
+                ball.color = rgb(INK)
+                scale = 0.5
+            elif asked:
+                ball.color = rgb(ACCENT)
+                scale = 1.5
             if ball.scale != scale:
                 ball.scale = scale
 
