@@ -19,10 +19,12 @@ from nextview.simulation.sensor import SENSORS
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.depth_view import depth_view
 from nextview.things.expected_images import ExpectedSensor, Surroundings
+from nextview.things.expected_pose import surface_errors
 from nextview.things.expected_views import ExpectedViews, Outlook, expected_views
 from nextview.things.leading import Hypotheses
 from nextview.things.registration import RegistrationPrior, render, start
 from nextview.things.surface import Surface, SurfaceCaster
+from nextview.things.unseen_space import DepthImage, chance_of_sight
 from nextview.things.verification import PixelModel, likelihood
 from nextview.things.verifier import Verifier
 from nextview.things.weighing import EvidenceWeights
@@ -122,7 +124,8 @@ def expected(divergence, belief, things) -> ExpectedViews:
     """Views of which the divergences are known."""
     divergence = np.asarray(divergence, float)
     hypotheses = hypotheses_of(things, belief)
-    return ExpectedViews(hypotheses, divergence, np.zeros_like(divergence))
+    some = np.ones(len(divergence))
+    return ExpectedViews(hypotheses, divergence, np.zeros_like(divergence), some, 0 * some)
 
 
 @pytest.mark.parametrize("belief", [(0.5, 0.5), (0.9, 0.1)])
@@ -243,7 +246,8 @@ def test_the_policy_goes_where_the_knob_shows_and_can_be_reached():
 def test_among_views_that_are_worth_the_same_the_nearer_one_is_taken(near, monkeypatch):
     def the_same(outlook, cameras):
         divergence = np.tile(5.0 * (1 - np.eye(2)), (len(cameras), 1, 1))
-        return ExpectedViews(outlook.hypotheses, divergence, divergence)
+        some = np.ones(len(divergence))
+        return ExpectedViews(outlook.hypotheses, divergence, divergence, some, 0 * some)
 
     monkeypatch.setattr(Outlook, "expect", the_same)
     travel = np.where(np.arange(40) == near, 1.0, 9.0)[None]
@@ -361,3 +365,82 @@ def test_words_name_the_rivals_and_how_much_is_settled():
     alone = expected(np.zeros((1, 1, 1)), (1.0,), (1,))
     assert alone.words(0, names) == "there is no rival of knob"
     assert found.told_apart(best) == (0, 1)
+
+
+def half_a_wall() -> DepthImage:
+    """What a camera on -x sees: a wall 35 cm before it where y > 0, and far away the rest."""
+    pose = look_at_origin(np.zeros(1), np.full(1, np.pi))[0]
+    pose[:3, 3] *= AWAY / np.linalg.norm(pose[:3, 3])
+    x, y = np.meshgrid(np.arange(64) + 0.5, np.arange(64) + 0.5)
+    rays = np.stack([(x - 32) / 60, (y - 32) / 60, np.ones_like(x)], -1) @ pose[:3, :3].T
+    depth = np.where(rays[..., 1] > 0, 0.35, 5.0).astype(np.float32)
+    return DepthImage(depth, pose, np.array([[60.0, 0, 32], [0, 60, 32], [0, 0, 1]]))
+
+
+def lines_from(*sides: float) -> tuple[np.ndarray, np.ndarray]:
+    """Lines of sight that end at the origin, from cameras on the side of +y or -y."""
+    rays = np.array([[[0.0, -side, 0.0]] for side in sides], np.float32)
+    return np.zeros_like(rays), rays
+
+
+def test_a_line_of_sight_through_space_that_no_view_looked_into_may_be_blocked():
+    ends, rays = lines_from(1.0, -1.0, -1.0)
+    blocked = np.array([[False], [False], [True]])
+    sight = chance_of_sight([half_a_wall()], ends, rays, blocked, 0.15, 1.0)
+    assert sight[1, 0] == 1  # the camera looked through all of it
+    # One line is blocked and 15 cm are known to be free: so often it happens in the other 15 cm.
+    assert sight[0, 0] == pytest.approx(np.exp(-1), rel=0.15)
+
+
+def test_nothing_is_expected_where_nothing_stands_or_above_what_stands():
+    ends, rays = lines_from(1.0, -1.0, -1.0)
+    alone = np.zeros((3, 1), bool)
+    assert (chance_of_sight([half_a_wall()], ends, rays, alone, 0.15, 1.0) == 1).all()
+    blocked = np.array([[False], [False], [True]])
+    above = chance_of_sight([half_a_wall()], ends, rays, blocked, 0.15, -0.05)
+    assert above[0, 0] == 1
+
+
+def test_a_view_is_trusted_by_the_pixels_that_show_the_thing():
+    caster = surfaces_of(box_mesh(BODY), box_mesh(BODY, KNOB))
+    near = cameras()
+    far = cameras()
+    far[:, :3, 3] *= 4
+    hypotheses = hypotheses_of((0, 1), (0.5, 0.5))
+    many = expected_views(caster, hypotheses, near, SENSOR).found
+    few = expected_views(caster, hypotheses, far, SENSOR).found
+    # The box covers about 8 x 10 cm, 424 pixels a radian.
+    pixels = (424 / AWAY) ** 2 * 0.08 * 0.1
+    assert many.mean() == pytest.approx(pixels / (pixels + 1000), rel=0.1)
+    assert few.mean() == pytest.approx(pixels / 16 / (pixels / 16 + 1000), rel=0.25)
+
+
+def ball() -> Surface:
+    sphere = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
+    return Surface.from_mesh(make_mesh(sphere.vertices, sphere.faces, unit="m"), "ball")
+
+
+def test_a_turn_that_nothing_can_tell_is_no_error_of_the_surface():
+    turned = np.zeros((6, 6))
+    turned[:3, :3] = np.eye(3) * 0.2**2
+    moved = np.zeros((6, 6))
+    moved[3:, 3:] = np.eye(3) * 0.003**2
+    assert surface_errors(ball(), np.eye(3), turned) < 1e-4
+    assert surface_errors(ball(), np.eye(3), moved) == pytest.approx(0.003, rel=0.01)
+    box = Surface.from_mesh(box_mesh(BODY), "box")
+    assert surface_errors(box, np.eye(3), turned) > 0.003
+
+
+def test_the_pose_becomes_sharper_from_where_more_is_told():
+    loose = np.diag([1e-4, 1e-4, 1e-2, 1e-6, 1e-6, 1e-6])  # the azimuth is hardly known
+    surfaces = surfaces_of(box_mesh(BODY, HANDLE))
+    hypotheses = hypotheses_of((0,), (1.0,))
+    wall_around = Surroundings(wall(0.14))
+    found = expected_views(surfaces, hypotheses, cameras(), SENSOR, wall_around, covariance=loose)
+    hidden = found.found < 1e-6
+    towards = SPHERE.directions[:, 0]
+    assert hidden[(towards > 0.6) & (SPHERE.elevation < 0.4)].all()
+    assert found.sharper[hidden].max() < found.sharper[~hidden].min()
+    np.testing.assert_allclose(found.worth("pose")[hidden], 0, atol=1e-9)
+    assert found.worth("pose").max() > 0.5
+    np.testing.assert_allclose(found.worth("thing"), 0, atol=1e-9)

@@ -726,3 +726,22 @@ def test_of_frames_that_show_almost_nothing_there_is_no_surface(captured):
     few = replace(one, facets=one.facets.some(slice(0, 20)))
     assert fuse([few], 0.07, "block") is None
     assert fuse([replace(one, facets=one.facets.some(slice(0, 0)))], 0.07, "block") is None
+
+
+def can(knob: bool) -> Mesh:
+    """A round tin, with a small knob on its side or without."""
+    body = trimesh.creation.cylinder(radius=0.05, height=0.1, sections=96)
+    part = trimesh.creation.box((0.016, 0.012, 0.016))
+    part.apply_translation((0.054, 0.0, 0.0))
+    whole = trimesh.util.concatenate([body, part]) if knob else body
+    return make_mesh(whole.vertices, whole.faces, unit="m")
+
+
+@pytest.mark.parametrize("yaw", [10, 40, 55])
+def test_a_small_part_of_a_round_thing_is_found(yaw):
+    verifier = verifier_of(can(True), can(False))
+    observation = views_of(can(True), np.radians(yaw), [(25.0, 30.0)])
+    found = verifier(observation, even_belief(2))
+    assert found.belief.argmax() == 0
+    turned = np.degrees(np.arctan2(found.poses[0, 1, 0], found.poses[0, 0, 0]))
+    assert turned == pytest.approx(yaw, abs=3)

@@ -91,9 +91,10 @@ class FairCeiling:
             belief / belief.sum(),
         )
         cameras = outlook.cameras(SPHERE.directions)
-        gain = replace(outlook, hypotheses=hypotheses).expect(cameras).gain(0)
+        expected = replace(outlook, hypotheses=hypotheses).expect(cameras)
+        value = expected.found * expected.gain(0)
 
-        return best_view(SPHERE, state, gain[None] + 1e-9 * rng.random((1, len(SPHERE))))
+        return best_view(SPHERE, state, value[None] + 1e-9 * rng.random((1, len(SPHERE))))
 
 
 @dataclass(frozen=True, eq=False)

@@ -81,12 +81,14 @@ class DiscriminateGeometry:
             return values
 
         information = np.zeros(len(some))
+        found = np.ones(len(some))
         if outlook is not None:
-            cameras = outlook.cameras(self.viewpoints.directions[some])
-            information = outlook.expect(cameras).information(self.goal)
+            expected = outlook.expect(outlook.cameras(self.viewpoints.directions[some]))
+            information = expected.worth(self.goal)
+            found = expected.found
         best = information.max()
         if best < LEAST_INFORMATION:
-            information = self._apart(some, visited)
+            information = found * self._apart(some, visited)
             best = LEAST_INFORMATION
         way = travel[some]
         share = way / max(way.max(), 1e-12)

@@ -105,17 +105,18 @@ def rank_views(
     cameras = inside.copy()
     cameras[:, :3, 3] *= radius
     expected = outlook.expect(cameras)
+    worth = expected.worth(goal)
     information = expected.information(goal)
     most = expected.entropy(goal)
     names = [surface.name for surface in outlook.caster.surfaces]
 
     towards = np.stack([direction_of(pose) for pose in inside])
     way = angle_between(towards, outlook.towards)
-    values = information - NEAR_TIE * information.max() * way / np.pi
+    values = worth - NEAR_TIE * worth.max() * way / np.pi
     ranked = []
     for row in np.argsort(-values, kind="stable"):
-        worth = float(information[row])
-        settles = min(1.0, worth / most) if most > 0 else 0.0
+        told = float(information[row])
+        settles = min(1.0, told / most) if most > 0 else 0.0
         words = expected.words(int(row), names, goal)
-        ranked.append(RankedView(int(index[row]), given[row], worth, settles, words))
+        ranked.append(RankedView(int(index[row]), given[row], told, settles, words))
     return tuple(ranked)

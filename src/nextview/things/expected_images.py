@@ -16,6 +16,7 @@ from nextview.geometry.observation import Observation
 from nextview.things.depth_view import THING, DepthView
 from nextview.things.leading import Hypotheses
 from nextview.things.surface import SurfaceCaster
+from nextview.things.unseen_space import DepthImage, chance_of_sight
 
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -25,6 +26,8 @@ SUPPORT_NEAR = 0.01  # metres from the height of the support, within which a poi
 OWN_MARGIN = 0.005  # metres around the thing, within which a point may be its own
 OBSTACLE_REACH = 4.0  # radii of the thing, within which an obstacle may hide it
 OBSTACLE_ROWS = 120  # rows of a depth image that are looked through for obstacles
+UNSEEN_REACH = 2.0  # radii of the thing, within which something that no view shows may hide it
+UNSEEN_EVERY = 2  # every so many rows and columns of pixels, unseen space is looked up
 
 
 @dataclass(frozen=True)
@@ -68,11 +71,13 @@ class Surroundings:
         floor: height of the support, metres; minus infinity for none.
         reach: how far from the origin the support was seen, metres. There it is measured behind the
             thing; elsewhere nothing is.
+        seen: the depth images of the views so far: where they did not look, more may stand.
     """
 
     obstacles: Float
     floor: float = -np.inf
     reach: float = 0.0
+    seen: tuple[DepthImage, ...] = ()
 
     @classmethod
     def nothing(cls) -> "Surroundings":
@@ -112,7 +117,8 @@ class Surroundings:
         own = ((in_file > low) & (in_file < high)).all(1)
         near = np.linalg.norm(points, axis=1) < OBSTACLE_REACH * radius
         obstacles = points[(height > SUPPORT_NEAR) & near & ~own]
-        return cls(obstacles, floor, reach)
+        images = (DepthImage.of(observation) for observation in observations)
+        return cls(obstacles, floor, reach, tuple(image for image in images if image is not None))
 
 
 def _beside(observation: Observation) -> Float:
@@ -140,6 +146,7 @@ class HypothesisImages:
         depth: of each hypothesis, (V, H, P) float32, metres; infinity where it does not show, or
             something stands before it.
         hidden: where a hypothesis is behind something else, (V, H, P) bool.
+        clear: how likely nothing that no view has shown stands before a pixel, (V, P) float32.
         normals: towards the camera, (V, H, P, 3) float32, object frame.
         cosine: of the angle of incidence, (V, H, P) float32.
         behind: whether something is measured where no hypothesis shows, (V, P) bool.
@@ -153,6 +160,7 @@ class HypothesisImages:
     lengths: Float32
     depth: Float32
     hidden: NDArray[np.bool_]
+    clear: Float32
     normals: Float32
     cosine: Float32
     behind: NDArray[np.bool_]
@@ -160,6 +168,15 @@ class HypothesisImages:
     centre: Float32
     step: Float32
     side: int
+
+    def pixels_shown(self, pitch: float) -> Float:
+        """Expected pixels of the camera that show each hypothesis, (V, H) float64.
+
+        Args:
+            pitch: angle between neighbouring pixels of the camera, radians.
+        """
+        some = np.where(np.isfinite(self.depth), self.clear[:, None], 0).sum(2)
+        return some * (self.step / pitch).prod(1)[:, None].astype(np.float64)
 
 
 def rendered_images(
@@ -211,6 +228,8 @@ def rendered_images(
 
     before = _obstacle_depth(scene.obstacles, cameras, x, y, step)
     hidden = np.isfinite(depth) & (depth > before[:, None])
+    radius = max(caster.surfaces[thing].radius for thing in np.unique(things).tolist())
+    clear = _clear(scene, origins, rays, depth.min(1), before, radius)
     behind = np.isfinite(before) | _support_shows(scene, origins, rays)
     centre = np.mean(np.einsum("hij,hj->hi", turns, caster.centres[things]) + places, axis=0)
     return HypothesisImages(
@@ -218,6 +237,7 @@ def rendered_images(
         lengths=lengths.astype(np.float32),
         depth=np.where(hidden, np.float32(np.inf), depth),
         hidden=hidden,
+        clear=clear,
         normals=normals @ turns.swapaxes(1, 2),
         cosine=np.clip(cosine, LOWEST_COSINE, 1).astype(np.float32),
         behind=behind,
@@ -270,6 +290,35 @@ def _obstacle_depth(obstacles: Float, cameras: Float, x: Float, y: Float, step: 
     # Points may lie farther apart than pixels: gaps between them are closed.
     wider = minimum_filter(depth, (1, 3, 3))
     return maximum_filter(wider, (1, 3, 3)).reshape(views, -1)
+
+
+def _clear(
+    scene: Surroundings,
+    origins: Float,
+    rays: Float32,
+    depth: Float32,
+    before: Float32,
+    radius: float,
+) -> Float32:
+    """How likely nothing that no view has shown stands before each pixel, (V, P) float32."""
+    views, pixels = depth.shape
+    if not scene.seen or not len(scene.obstacles):
+        return np.ones((views, pixels), np.float32)
+
+    side = round(pixels**0.5)
+    some = np.arange(pixels).reshape(side, side)[::UNSEEN_EVERY, ::UNSEEN_EVERY].ravel()
+    shows = np.isfinite(depth[:, some])
+    along = np.where(shows, depth[:, some], np.nan)
+    ends = origins.astype(np.float32)[:, None] + rays[:, some] * along[..., None]
+    lengths = np.linalg.norm(rays[:, some], axis=2, keepdims=True)
+    hidden = shows & (depth[:, some] > before[:, some])
+    top = float(scene.obstacles[:, 2].max())
+    chance = chance_of_sight(
+        scene.seen, ends, rays[:, some] / lengths, hidden, UNSEEN_REACH * radius, top
+    )
+    coarse = chance.reshape(views, -(-side // UNSEEN_EVERY), -1)
+    fine = coarse.repeat(UNSEEN_EVERY, 1).repeat(UNSEEN_EVERY, 2)
+    return fine[:, :side, :side].reshape(views, pixels)
 
 
 def _support_shows(scene: Surroundings, origins: Float, rays: Float32) -> NDArray[np.bool_]:

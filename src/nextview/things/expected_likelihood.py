@@ -193,6 +193,7 @@ class _Judged:
         apart: how surely a pixel beside a hypothesis is beside it after it is aligned anew, 0 to
             1.
         behind: whether something is measured where a hypothesis does not show, (V, 1, P).
+        clear: how likely nothing that no view has shown stands before a pixel, (V, 1, P).
         area: pixels of the camera in one of these, (V, 1).
         enough: pixels of the camera from which on a view counts in full.
         matches: expected log-likelihood of a depth by its deviation, see ``_match_table``.
@@ -205,6 +206,7 @@ class _Judged:
     missing: Float32
     apart: Float32
     behind: NDArray[np.bool_]
+    clear: Float32
     area: Float
     enough: float
     outlier: float
@@ -246,6 +248,7 @@ class _Judged:
             missing=(pixels.outlier * deep).astype(np.float32),
             apart=1 - np.exp(-0.5 * beside**2),
             behind=images.behind[:, None],
+            clear=images.clear[:, None],
             area=size.prod(1)[:, None].astype(np.float64),
             enough=prior.pixels,
             outlier=pixels.outlier,
@@ -280,13 +283,16 @@ class _Judged:
         through = rival & ~shows
         seen_through = self.outlier * self.apart[:, true]
         judged += np.where(through, np.where(self.behind, seen_through, hole), 0)
-        counted = (kept + np.where(rival, lost, 0) + through).sum(2)
+        counted = (self.clear * (kept + np.where(rival, lost, 0) + through)).sum(2)
 
         best = kept * self.matches[0] + lost * self.hole[:, true]
-        own = shows.sum(2)
-        mean = judged.sum(2) / np.maximum(counted, 1) - best.sum(2) / np.maximum(own, 1)
-        union = (shows | rival).sum(2)
-        return -mean.astype(np.float64) * np.minimum(1, union * self.area / self.enough)
+        own = (self.clear * shows).sum(2)
+        judged = (self.clear * judged).sum(2) / np.maximum(counted, 1)
+        mean = judged - (self.clear * best).sum(2) / np.maximum(own, 1)
+        either = shows | rival
+        union = either.sum(2)
+        sight = (self.clear * either).sum(2) / np.maximum(union, 1)
+        return -mean.astype(np.float64) * sight * np.minimum(1, union * self.area / self.enough)
 
     def different(self, first: Index, second: Index, gaps: Float32) -> NDArray[np.bool_]:
         """Return the pixels in which two hypotheses differ by more than the noise.

@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, elevation_of, look_at_origin
-from nextview.things.depth_view import depth_view
+from nextview.things.depth_view import DepthView, depth_view
 from nextview.things.expected_images import ExpectedSensor, Surroundings, rendered_images
 from nextview.things.expected_likelihood import (
     different_pixels,
     divergences,
     gaps_after_alignment,
 )
+from nextview.things.expected_pose import sharper_poses
 from nextview.things.leading import Hypotheses
-from nextview.things.registration import RegistrationPrior
+from nextview.things.registration import RegistrationPrior, pose_covariances
 from nextview.things.surface import SurfaceCaster
 from nextview.things.verification import PixelModel
 from nextview.things.verifier import Verified, Verifier
@@ -36,6 +37,9 @@ SENSOR_SIDE = 24  # rows and columns of a view by which the camera's noise is ju
 RENDERED_SIDE = 18  # rows and columns of the rendered images
 PICTURE_SIDE = 64  # rows and columns of pictures to look at
 BHATTACHARYYA = 0.25  # of two equally wide Gaussians, as a share of their divergence
+HALF_FOUND = (
+    1000.0  # pixels of the camera that show the thing, at which half of what they tell counts
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,11 +52,17 @@ class ExpectedViews:
             is true, the mean of both directions, (V, H, H) float64, 0 or more.
         different: share of the pixels that show either of two hypotheses in which they differ by
             more than the noise, (V, H, H) float64.
+        found: share of the information that each view is trusted to give, (V,) float64, 0 to 1. The
+            fewer pixels show the thing, the sooner it is missed.
+        sharper: see ``expected_pose.sharper_poses``, (V,) float64; zeros where it is not known how
+            well the pose is known.
     """
 
     hypotheses: Hypotheses
     divergence: Float
     different: Float
+    found: Float
+    sharper: Float
 
     def information(self, goal: Goal = "thing") -> Float:
         """Expected information of each view, (V,) float64, natural units (nats).
@@ -68,7 +78,19 @@ class ExpectedViews:
         belief = self.hypotheses.belief
         possible = np.flatnonzero(belief)
         gains = np.stack([self.gain(int(row), goal) for row in possible], 1)
-        return np.maximum(gains @ belief[possible], 0)
+        return self.found * np.maximum(gains @ belief[possible], 0)
+
+    def worth(self, goal: Goal = "thing") -> Float:
+        """What each view is worth, (V,) float64, natural units.
+
+        For the pose it is the information about thing and pose, and how much better the pose of the
+        likeliest hypothesis will be known.
+
+        Args:
+            goal: what is to be told.
+        """
+        information = self.information(goal)
+        return information if goal == "thing" else information + self.found * self.sharper
 
     def gain(self, truth: int, goal: Goal = "thing") -> Float:
         """Gain of the log-belief in the right answer with each view, (V,) float64.
@@ -143,6 +165,7 @@ def expected_views(
     pixels: PixelModel = PixelModel(),
     prior: RegistrationPrior = RegistrationPrior(),
     side: int = RENDERED_SIDE,
+    covariance: Float | None = None,
 ) -> ExpectedViews:
     """Expect what candidate views would tell, with the verifier's own weights.
 
@@ -159,6 +182,7 @@ def expected_views(
         pixels: how a pixel is judged.
         prior: by how much a hypothesis and a camera may still be moved when the view is there.
         side: rows and columns of the rendered images.
+        covariance: of turn and place of the first hypothesis, (6, 6); None if it is not known.
 
     Returns:
         What each view would tell of each pair of hypotheses.
@@ -169,7 +193,14 @@ def expected_views(
     weight = weights.geometry / (1 + weights.correlation * taken)
     moved = gaps_after_alignment(rendered, sensor, prior)
     divergence, different = divergences(rendered, moved, sensor, pixels, prior)
-    return ExpectedViews(hypotheses, weight * divergence, different)
+    pixels_shown = rendered.pixels_shown(sensor.pitch) @ hypotheses.belief
+    found = pixels_shown / (pixels_shown + HALF_FOUND)
+    sharper = np.zeros(len(cameras))
+    if covariance is not None:
+        surface = caster.surfaces[hypotheses.things[0]]
+        pose = hypotheses.poses[0]
+        sharper = sharper_poses(rendered, surface, pose, covariance, sensor, prior, taken)
+    return ExpectedViews(hypotheses, weight * divergence, different, found, sharper)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,6 +237,8 @@ class Outlook:
         weights: how much geometry counts.
         pixels: how a pixel is judged.
         prior: by how much a hypothesis and a camera may still be moved.
+        covariance: of turn and place of the first hypothesis by the views so far, (6, 6); None if
+            it is not known.
     """
 
     caster: SurfaceCaster
@@ -217,6 +250,7 @@ class Outlook:
     weights: EvidenceWeights
     pixels: PixelModel
     prior: RegistrationPrior
+    covariance: Float | None = None
 
     @classmethod
     def of(
@@ -249,6 +283,7 @@ class Outlook:
             weights=verifier.weights,
             pixels=verifier.pixels,
             prior=verifier.prior,
+            covariance=_covariance(verifier, verified, [view for _, view in seen], hypotheses),
         )
 
     @property
@@ -313,4 +348,17 @@ class Outlook:
             self.weights,
             self.pixels,
             self.prior,
+            covariance=self.covariance,
         )
+
+
+def _covariance(
+    verifier: Verifier,
+    verified: Verified,
+    views: Sequence[DepthView],
+    hypotheses: Hypotheses,
+) -> Float:
+    """Covariance of turn and place of the first of the leading hypotheses, (6, 6)."""
+    row = np.flatnonzero(verified.things == hypotheses.things[0])[:1]
+    alignment = verified.alignment(row, verifier)
+    return pose_covariances(verifier.caster, alignment, views, verifier.prior)[0]

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +9,7 @@ from numpy.typing import NDArray
 from nextview.geometry.observation import Observation
 from nextview.recognition.poses import PoseCandidate, distinct
 from nextview.things.depth_view import DepthView, depth_view
-from nextview.things.registration import Alignment, pose_covariances
-from nextview.things.surface import Surface
+from nextview.things.registration import pose_covariances
 from nextview.things.taught import TaughtThings
 from nextview.things.verifier import FINE_SIDE, Verified, Verifier
 
@@ -51,7 +49,7 @@ def candidates_of(
             label=int(labels[thing]),
             pose=pose,
             probability=float(probability),
-            centre=_centroid(surface),
+            centre=surface.centroid,
             vertices=surface.vertices,
             faces=surface.faces,
             symmetry=things.symmetries[thing],
@@ -86,15 +84,6 @@ def _camera_error(
     return float(1000 * np.sqrt(variances.sum()) / len(views))
 
 
-@lru_cache(maxsize=256)
-def _centroid(surface: Surface) -> Float:
-    """The centroid of a surface, (3,) float64, metres, which its symmetries keep in its place."""
-    corners = surface.vertices[surface.faces].astype(np.float64)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    areas = np.linalg.norm(normals, axis=1)
-    return np.asarray(areas @ corners.mean(1) / areas.sum(), np.float64)
-
-
 def _deviations(
     verifier: Verifier,
     found: Verified,
@@ -102,18 +91,7 @@ def _deviations(
     rows: NDArray[np.int64],
 ) -> list[tuple[float, float]]:
     """Standard deviations of turn, degrees, and place, millimetres, of some hypotheses."""
-    things = found.things[rows]
-    rotations = found.poses[rows, :3, :3]
-    own_centres = verifier.caster.centres[things].astype(np.float64)
-    centres = np.einsum("hij,hj->hi", rotations, own_centres) + found.poses[rows, :3, 3]
-    alignment = Alignment(
-        things=things,
-        ups=verifier.rotations[found.resting[rows], 2],
-        rotations=rotations,
-        centres=centres,
-        cameras=found.cameras[rows],
-    )
-
+    alignment = found.alignment(rows, verifier)
     covariances = pose_covariances(verifier.caster, alignment, views, verifier.prior)
     turns = np.degrees(np.sqrt(np.trace(covariances[:, :3, :3], axis1=1, axis2=2)))
     places = 1000 * np.sqrt(np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2))

@@ -10,7 +10,7 @@ zero.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,6 +153,15 @@ class Alignment:
         own_centres = caster.centres[self.things].astype(np.float64)
         poses[:, :3, 3] = self.centres - np.einsum("hij,hj->hi", self.rotations, own_centres)
         return poses
+
+
+def joined(first: Alignment, second: Alignment) -> Alignment:
+    """Put the hypotheses of two alignments with the same views one after the other."""
+    parts = {
+        field.name: np.concatenate([getattr(first, field.name), getattr(second, field.name)])
+        for field in fields(Alignment)
+    }
+    return Alignment(**parts)
 
 
 def start(things: NDArray[np.integer], rotations: Float, views: int) -> Alignment:

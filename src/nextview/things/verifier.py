@@ -23,6 +23,7 @@ from nextview.things.registration import (
     camera_cost,
     centred,
     different_poses,
+    joined,
     render,
     start,
 )
@@ -38,6 +39,10 @@ TILTED_PROPOSALS = 120  # of things in any orientation, of all views together
 AGAINST_FEATURES = 0.1  # misfit for each unit of log-belief that features hold against a thing
 TINY = 1e-300  # belief that has a logarithm
 LEAST_BY_FEATURES = 0.01  # belief by features below which it does not matter
+AROUND = (Level(1, 0.05, 0.5, False),)  # steps of the alignment at azimuths all around
+AROUND_THINGS = 2  # likeliest things that are also judged at azimuths all around
+AROUND_STEPS = 24  # azimuths: a small part of a round body shows at one of them
+AROUND_PEAKS = 2  # of these azimuths that are aligned, for each thing
 
 
 @dataclass(frozen=True)
@@ -50,22 +55,29 @@ class Stage:
         most: how many hypotheses survive at most.
         hopeless: a hypothesis that is by so much less likely than the best one, as a logarithm, is
             given up.
+        around: whether the likeliest things are also tried at azimuths all around afterwards.
     """
 
     side: int
     levels: tuple[Level, ...]
     most: int
     hopeless: float
+    around: bool = False
 
 
 FINE_SIDE = 40  # rows and columns of pixels that survivors are judged by
 STAGES = (
-    Stage(16, FIRST, 24, 50.0),
+    Stage(16, FIRST, 24, 50.0, around=True),
     Stage(24, COARSE, 12, 25.0),
     Stage(FINE_SIDE, FINE, 12, np.inf),
 )
 TILTED_STAGES = tuple(
-    replace(stage, levels=tuple(replace(level, turned=True) for level in stage.levels), most=most)
+    replace(
+        stage,
+        levels=tuple(replace(level, turned=True) for level in stage.levels),
+        most=most,
+        around=False,
+    )
     for stage, most in zip(STAGES, (32, 12, 12), strict=True)
 )
 """The same for things in any orientation, which are turned about all axes from the beginning."""
@@ -114,6 +126,24 @@ class Verified:
         """The same as an example of the thing of this number, to fit weights to."""
         return JudgedEpisode(
             truth, self.things, self.mean, self.camera_costs, self.log_belief, self.by_features
+        )
+
+    def alignment(self, rows: NDArray[np.int64], verifier: "Verifier") -> Alignment:
+        """Some of the hypotheses, as they were aligned.
+
+        Args:
+            rows: which, (N,).
+            verifier: that found them.
+        """
+        things = self.things[rows]
+        rotations = self.poses[rows, :3, :3]
+        own_centres = verifier.caster.centres[things].astype(np.float64)
+        return Alignment(
+            things=things,
+            ups=verifier.rotations[self.resting[rows], 2],
+            rotations=rotations,
+            centres=np.einsum("hij,hj->hi", rotations, own_centres) + self.poses[rows, :3, 3],
+            cameras=self.cameras[rows],
         )
 
     @property
@@ -300,9 +330,61 @@ class Verifier:
             rows = order[different_poses(self.caster, alignment.select(order))][: stage.most]
             alignment = alignment.select(rows)
             proposed = proposed.select(rows)
+            if stage.around:
+                turned, source = self._around(alignment, proposed, views, prior)
+                alignment = joined(alignment, turned)
+                proposed = proposed.select(np.concatenate([np.arange(len(rows)), source]))
 
         aligned = alignment.turned(level.T)
         return self._verified(proposed, aligned, scores[rows], costs[rows], judged, rows)
+
+    def _around(
+        self,
+        alignment: Alignment,
+        proposed: _Proposed,
+        views: Sequence[DepthView],
+        prior: RegistrationPrior,
+    ) -> tuple[Alignment, NDArray[np.int64]]:
+        """The likeliest things, turned about the vertical to where they explain the views best.
+
+        A small part of a round body draws a hypothesis only from near its own azimuth.
+
+        Args:
+            alignment: hypotheses, the best ones first.
+            proposed: the same.
+            views: of the thing.
+            prior: how far off cameras may be.
+
+        Returns:
+            Hypotheses at the best azimuths, and the rows from which each was turned, (N,).
+        """
+        first = np.sort(np.unique(alignment.things, return_index=True)[1])[:AROUND_THINGS]
+        source = np.repeat(first, AROUND_STEPS)
+        azimuths = 2 * np.pi * np.arange(AROUND_STEPS) / AROUND_STEPS
+        turns = np.tile(rotation_z(azimuths), (len(first), 1, 1))
+        some = alignment.select(source)
+        # About an axis that a round body shares, however far a part of it stands out.
+        surfaces = [self.caster.surfaces[thing] for thing in some.things]
+        arms = np.stack([surface.centroid - surface.centre for surface in surfaces])
+        axes = some.centres + np.einsum("hij,hj->hi", some.rotations, arms)
+        rotations = turns @ some.rotations
+        centres = axes - np.einsum("hij,hj->hi", rotations, arms)
+        some = replace(some, rotations=rotations, centres=centres)
+        some = align(self.caster, some, views, AROUND, prior)
+
+        mean = np.stack([view.mean for view in self._judge(some, views)], 1)
+        costs = camera_cost(some, views, prior)
+        scores = self.weights.scores(mean, costs, proposed.log_belief[source])
+        circles = scores.reshape(len(first), AROUND_STEPS)
+        peak = (circles >= np.roll(circles, 1, 1)) & (circles > np.roll(circles, -1, 1))
+        peak[:, 0] = False  # as they are
+        best = np.argsort(-np.where(peak, circles, -np.inf), axis=1, kind="stable")[
+            :, :AROUND_PEAKS
+        ]
+        rows = (best + AROUND_STEPS * np.arange(len(first))[:, None])[
+            np.take_along_axis(peak, best, 1)
+        ]
+        return some.select(rows), source[rows]
 
     def _judge(self, alignment: Alignment, views: Sequence[DepthView]) -> list[ViewLikelihood]:
         return [

@@ -1,0 +1,143 @@
+"""How much better the pose of a thing is expected to be known after views that were not taken yet.
+
+What counts is how far the surface is from where it is believed, along its normals, as the next
+camera sees it: so turns of a round thing about its axis, which nothing can tell, do not count.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.things.expected_images import ExpectedSensor, HypothesisImages
+from nextview.things.registration import (
+    OUTLINE_PIXELS,
+    SCAN_ERROR,
+    RegistrationPrior,
+    inverses,
+)
+from nextview.things.surface import Surface
+
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+
+@lru_cache(maxsize=256)
+def _normal_displacements(surface: Surface) -> Float:
+    """Mean square of the surface's displacement along its normal, of turn and place, (6, 6).
+
+    Axes are those of the scan file; the turn is about the centre of the surface.
+    """
+    corners = surface.vertices[surface.faces].astype(np.float64)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(across, axis=1)
+    normals = across / np.maximum(areas, 1e-30)[:, None]
+    arms = corners.mean(1) - surface.centre
+    moved = np.concatenate([np.cross(arms, normals), normals], 1)
+    return np.asarray((moved * areas[:, None]).T @ moved / areas.sum(), np.float64)
+
+
+def surface_errors(surface: Surface, rotation: Float, covariances: Float) -> Float:
+    """Standard deviation of a surface's displacement along its normals, (...) float64, metres.
+
+    Args:
+        surface: of the thing.
+        rotation: from the axes of the scan file to the object frame, (3, 3).
+        covariances: of turn, about the centre of the surface, and place, object frame, (..., 6, 6).
+    """
+    turned = np.kron(np.eye(2), rotation)
+    displaced = turned @ _normal_displacements(surface) @ turned.T
+    return np.sqrt(np.einsum("ij,...ji->...", displaced, covariances))
+
+
+def sharper_poses(
+    images: HypothesisImages,
+    surface: Surface,
+    pose: Float,
+    covariance: Float,
+    sensor: ExpectedSensor,
+    prior: RegistrationPrior,
+    taken: int,
+) -> Float:
+    """Return the logarithm by which the surface's error is smaller after each view, (V,) float64.
+
+    A camera that sees little of the thing hardly tells how far it is displaced itself, so the
+    error can also be larger in a new view than in the last one.
+
+    Args:
+        images: what each view would show; the first hypothesis is the one that is believed.
+        surface: of its thing.
+        pose: of it, (4, 4).
+        covariance: of turn and place by the views so far, (6, 6).
+        sensor: the camera.
+        prior: how far a camera may be displaced.
+        taken: how many views there are.
+    """
+    rotation = pose[:3, :3]
+    centre = rotation @ surface.centre.astype(np.float64) + pose[:3, 3]
+    told = _information(images, centre, sensor, prior)
+
+    away = np.linalg.norm(images.origins - centre, axis=1)
+    displaced = (prior.camera**2 + (prior.aim * away) ** 2) * (1 + 1 / taken)
+    before = np.tile(covariance, (len(away), 1, 1))
+    before[:, 3:, 3:] += displaced[:, None, None] * np.eye(3)
+    after = inverses(inverses(before) + told)
+
+    now = surface_errors(surface, rotation, covariance)
+    return np.log(now / surface_errors(surface, rotation, after))
+
+
+def _information(
+    images: HypothesisImages, centre: Float, sensor: ExpectedSensor, prior: RegistrationPrior
+) -> Float:
+    """What each view tells of turn and place of the first hypothesis, (V, 6, 6)."""
+    shows = np.isfinite(images.depth[:, 0])
+    depth = np.where(shows, images.depth[:, 0], 0)
+    points = images.origins[:, None] + images.rays * depth[..., None]
+    arms = points - centre.astype(np.float32)
+    seen = images.clear * shows
+
+    noise = SCAN_ERROR**2 + (sensor.noise * depth**2) ** 2
+    area = (images.step / sensor.pitch).prod(1)[:, None]
+    weights = (seen / noise).astype(np.float32)
+    inside = _summed(arms, images.normals[:, 0], weights, seen * area, prior)
+
+    aside = _outward(images, shows)
+    rim = seen * (np.abs(aside).sum(2) > 0)
+    deviation = SCAN_ERROR**2 + (OUTLINE_PIXELS * sensor.pitch * depth) ** 2
+    width = (images.step / sensor.pitch).mean(1)[:, None]
+    weights = (rim / deviation).astype(np.float32)
+    return inside + _summed(arms, aside, weights, rim * width, prior)
+
+
+def _summed(
+    arms: Float32, directions: Float32, weights: Float32, pixels: Float32, prior: RegistrationPrior
+) -> Float:
+    """Information of pixels that hold a thing in some directions, (V, 6, 6)."""
+    moved = np.concatenate([np.cross(arms, directions), directions], 2).astype(np.float64)
+    # As in registration: neighbouring pixels err together.
+    count = np.minimum(pixels.sum(1), prior.pixels) / np.maximum((weights > 0).sum(1), 1)
+    weighted = moved * (weights * count[:, None])[..., None]
+    return np.asarray(weighted.swapaxes(1, 2) @ moved, np.float64)
+
+
+def _outward(images: HypothesisImages, shows: NDArray[np.bool_]) -> Float32:
+    """Directions out of the outline, (V, P, 3) float32: unit vectors at the rim, else zero.
+
+    Where something stands before the thing, its outline is not its own.
+    """
+    side = images.side
+    views = len(shows)
+    own = (shows | images.hidden[:, 0]).reshape(views, side, side)
+    padded = np.pad(own, ((0, 0), (1, 1), (1, 1))).astype(np.float32)
+    right = padded[:, 1:-1, :-2] - padded[:, 1:-1, 2:]
+    down = padded[:, :-2, 1:-1] - padded[:, 2:, 1:-1]
+
+    rays = images.rays.reshape(views, side, side, 3)
+    across = rays[:, 0, 1] - rays[:, 0, 0]
+    along = rays[:, 1, 0] - rays[:, 0, 0]
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    out = right[..., None] * across[:, None, None] + down[..., None] * along[:, None, None]
+    length = np.linalg.norm(out, axis=3, keepdims=True)
+    return (out / np.maximum(length, 1e-6)).reshape(views, -1, 3)
