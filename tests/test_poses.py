@@ -553,6 +553,7 @@ def test_the_next_view_is_chosen_by_geometry_and_views_are_ranked(system):
     assert np.isnan(view.values[view.index])
     assert view.values[view.next_view] == np.nanmax(view.values)
 
+    assert session.outlook.taken == 1
     ranked = session.ranked()
     left = np.flatnonzero(~np.isnan(view.values))
     assert sorted(each.index for each in ranked) == left.tolist()

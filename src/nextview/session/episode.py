@@ -441,8 +441,10 @@ class Episodes:
 
         ``counted`` leaves out those that are no evidence.
         """
+        kept = bool(self.steps) and self.steps[-1] is last
+        steps = self.steps if kept else [*self.steps, last]
         found: dict[int, list[Observation]] = {int(episode): [] for episode in episodes}
-        for step in (*self.steps, last):
+        for step in steps:
             evidence = step.evidence
             if evidence.observations is None:
                 who = "this recogniser" if counted else "this policy"
