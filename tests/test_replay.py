@@ -107,6 +107,61 @@ def test_a_stopping_rule_of_ones_own_ends_a_path_as_it_ends_the_episode(specs, t
         truncate(replay("lem", specs, 5, 0), rule)
 
 
+def settled(seen, threshold):
+    """A user's rule: two views have changed no belief by more than the threshold."""
+    return np.maximum(seen.change(1), seen.change(2)) <= threshold
+
+
+@pytest.mark.parametrize("threshold", [0.05, 0.3])
+def test_a_rule_about_the_change_of_belief_ends_live_and_replayed_episodes_alike(specs, threshold):
+    p, rule = specs.predictions, own_stopping(settled, threshold, 9)
+    policy = make_policy("lem", p.sphere, specs.valley_classes("lem"))
+    paths = replay("lem", specs, 9, 0, beliefs=True)
+
+    expected = []
+    for beliefs in paths.beliefs:
+        ends = 9
+        for k in range(2, 9):
+            moved = abs(beliefs[k] - beliefs[k - 1]).max(), abs(beliefs[k] - beliefs[k - 2]).max()
+            if max(moved) <= threshold:
+                ends = k + 1
+                break
+        expected.append(ends)
+    assert sum(n < 9 for n in expected) > 0
+    np.testing.assert_array_equal(truncate(paths, rule).n_views, expected)
+
+    observe = evidence_of(p, specs.objects)
+    rng = np.random.default_rng(0)
+    live = run_episodes(observe, p.sphere, policy, specs.starts, rule, rng).outcome
+    np.testing.assert_array_equal(live.n_views, expected)
+    with pytest.raises(UsageError, match="beliefs=True"):
+        truncate(replay("lem", specs, 9, 0), rule)
+
+
+def test_episodes_of_one_system_do_not_share_what_a_rule_compares(specs):
+    """Two episodes side by side stop as each does alone."""
+    p, rule = specs.predictions, own_stopping(settled, 0.2, 9)
+    policy = make_policy("lem", p.sphere, specs.valley_classes("lem"))
+    together = run_episodes(
+        evidence_of(p, specs.objects[:6]),
+        p.sphere,
+        policy,
+        specs.starts[:6],
+        rule,
+        np.random.default_rng(0),
+    ).outcome
+    for k in range(6):
+        alone = run_episodes(
+            evidence_of(p, specs.objects[k : k + 1]),
+            p.sphere,
+            policy,
+            specs.starts[k : k + 1],
+            rule,
+            np.random.default_rng(0),
+        ).outcome
+        assert alone.n_views[0] == together.n_views[k]
+
+
 def test_what_a_stopping_rule_does_wrong_is_one_sentence():
     belief = np.full((4, 3), 1 / 3)
     for rule, words in [

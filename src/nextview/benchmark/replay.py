@@ -202,14 +202,16 @@ def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcome:
         seen = paths.seen[:, :last]
         beliefs = paths.beliefs
         if beliefs is None:
-            if type(stopping).reached is not Stopping.reached:
+            kind = type(stopping)
+            known = (Stopping.reached, Stopping.reached_along)
+            if (kind.reached, kind.reached_along) != known:
                 raise UsageError(
                     "a stopping rule of your own needs whole beliefs: replay with beliefs=True"
                 )
             beliefs = paths.confidences[:, :, None]
 
         there = (np.diff(seen, prepend=0) > 0) & (paths.views[:, :last] >= 0)
-        reached = stopping.reached(beliefs[:, :last], np.maximum(seen, 1)) & there
+        reached = stopping.reached_along(beliefs[:, :last], np.maximum(seen, 1)) & there
         confident = np.asarray(reached.any(1))
         at = np.where(confident, reached.argmax(1), np.minimum(count, last) - 1)
 

@@ -501,6 +501,22 @@ class Stopping:
         """
         return belief.max(-1) >= self.threshold_at(n_views)
 
+    def reached_along(self, beliefs: Floats, n_views: NDArray) -> NDArray[np.bool_]:
+        """Return at which steps of episodes to stop.
+
+        A rule that compares the belief with earlier ones overrides this instead of ``reached``. A
+        step may depend on those before it, never on later ones. Nothing is stored between calls:
+        live episodes and the benchmark pass the whole path each time.
+
+        Args:
+            beliefs: after each step, (..., steps, classes).
+            n_views: number of views that each is based on, (..., steps).
+
+        Returns:
+            Whether to stop, (..., steps) bool.
+        """
+        return self.reached(beliefs, n_views)
+
     def threshold_at(self, n_views: NDArray | int) -> Float:
         """The belief at which to stop after so many views, same shape."""
         if self.threshold_decay == 0 or self.threshold in (0, 1):

@@ -20,10 +20,23 @@ class Believed:
     Attributes:
         belief: in each class, (..., classes).
         n_views: so far, in which anything was seen, (...).
+        earlier: beliefs after the views before, the previous one first, each like ``belief``; NaN
+            before the first view.
     """
 
     belief: Floats
     n_views: NDArray | int
+    earlier: tuple[Floats, ...] = ()
+
+    def before(self, views: int = 1) -> Floats:
+        """The belief so many views ago, (..., classes); NaN before the first view."""
+        if 1 <= views <= len(self.earlier):
+            return self.earlier[views - 1]
+        return np.full(self.belief.shape, np.nan)
+
+    def change(self, views: int = 1) -> NDArray[np.float64]:
+        """Largest change of the belief in a class over the last views, (...); NaN if unknown."""
+        return np.asarray(np.abs(self.belief - self.before(views)).max(-1), np.float64)
 
     @property
     def highest(self) -> NDArray[np.float64]:
@@ -79,9 +92,34 @@ class OwnStopping(Stopping):
         Raises:
             UsageError: the rule raises, or returns another type or shape.
         """
+        return self._said(Believed(belief, n_views))
+
+    def reached_along(self, beliefs: Floats, n_views: NDArray) -> NDArray[np.bool_]:
+        """Return what the rule decides at each step, with the beliefs before it.
+
+        Args:
+            beliefs: after each step, (..., steps, classes).
+            n_views: number of views that each is based on, (..., steps).
+
+        Returns:
+            Whether to stop, (..., steps) bool.
+
+        Raises:
+            UsageError: the rule raises, or returns another type or shape.
+        """
+        earlier = []
+        for k in range(1, beliefs.shape[-2]):
+            shifted = np.full(beliefs.shape, np.nan)
+            shifted[..., k:, :] = beliefs[..., :-k, :]
+            earlier.append(shifted)
+        return self._said(Believed(beliefs, n_views, tuple(earlier)))
+
+    def _said(self, believed: Believed) -> NDArray[np.bool_]:
+        """What the rule decides, checked."""
         assert self.rule is not None
+        belief = believed.belief
         with plugin_errors(lambda said: UsageError(f"the stopping rule {self.name} raised {said}")):
-            said = np.asarray(self.rule(Believed(belief, n_views), self.threshold))
+            said = np.asarray(self.rule(believed, self.threshold))
         if said.dtype != bool or said.shape != belief.shape[:-1]:
             wanted = f"bool of the shape {belief.shape[:-1]}, not {said.dtype} of {said.shape}"
             raise UsageError(f"the stopping rule {self.name} has to return {wanted}")

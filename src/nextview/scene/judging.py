@@ -153,7 +153,8 @@ class Judge:
         system = self.system
         if not result.seen or result.unknown:
             return False
-        counted = sum(view.observation.seen for view in result.views)
-        if not bool(system.stopping.reached(result.views[-1].belief, counted)):
+        counted = np.cumsum([view.observation.seen for view in result.views])
+        beliefs = np.stack([view.belief for view in result.views])
+        if not system.stopping.reached_along(beliefs, np.maximum(counted, 1))[-1]:
             return False
         return result.novelty is None or result.novelty >= SUSPICIOUS * system.unknown

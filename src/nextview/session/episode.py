@@ -208,7 +208,7 @@ class Episodes:
         taken = self._taken(evidence, directions)
         step = taken.step
         n_views = len(self.steps) + 1
-        enough = self.stopping.reached(step.belief, np.maximum(step.seen, 1)) & (step.seen > 0)
+        enough = self._reached(step) & (step.seen > 0)
         enough &= not (enough.any() and hold(step))
         stopped = enough & taken.counts
         if n_views >= min(self.stopping.max_views, len(self.sphere)):
@@ -263,6 +263,20 @@ class Episodes:
         """Go where ``next_choice`` says."""
         self.steps[-1] = step
         self._go(step)
+
+    def _reached(self, step: Step) -> NDArray[np.bool_]:
+        """Whether the stopping rule ends the episodes of a step, (A,)."""
+        if type(self.stopping).reached_along is Stopping.reached_along:
+            return self.stopping.reached(step.belief, np.maximum(step.seen, 1))
+
+        beliefs = [step.belief]
+        n_views = [step.seen]
+        for earlier in reversed(self.steps):
+            rows = np.searchsorted(earlier.episodes, step.episodes)
+            beliefs.insert(0, earlier.belief[rows])
+            n_views.insert(0, earlier.seen[rows])
+        path = np.stack(beliefs, 1)
+        return self.stopping.reached_along(path, np.maximum(np.stack(n_views, 1), 1))[:, -1]
 
     def _go(self, step: Step) -> None:
         moved = step.next_views >= 0

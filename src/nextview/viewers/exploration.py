@@ -128,12 +128,12 @@ class Walk:
     @property
     def stopped(self) -> bool:
         """Whether the stopping rule would have ended it by now."""
-        counted = 0
-        for view in self.views:
-            counted += view.observation.seen
-            if view.observation.seen and self.stopping.reached(view.belief, counted):
-                return True
-        return len(self.views) >= self.stopping.max_views
+        if not self.views:
+            return False
+        seen = np.array([view.observation.seen for view in self.views])
+        beliefs = np.stack([view.belief for view in self.views])
+        reached = self.stopping.reached_along(beliefs, np.maximum(seen.cumsum(), 1))
+        return bool((reached & seen).any()) or len(self.views) >= self.stopping.max_views
 
     @property
     def next_view(self) -> int | None:
