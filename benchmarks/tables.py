@@ -20,8 +20,9 @@ names of pieces count as wrong), the same for names that are confident, the shar
 whose ADD-S is below a tenth of their diameter, in the world and in the frame of the last camera
 that saw them, and the share of strangers that are called unknown.
 
-Where several ways are given, the paired differences of the things named right after four frames are
-printed too, with a test by random sign flips over tables.
+Where several ways are given, the paired differences of the things named right after two and after
+four frames are printed too, and of the frames until ``Scene.done`` (five where four were not
+enough), with a test by random sign flips over tables.
 """
 
 from __future__ import annotations
@@ -54,6 +55,7 @@ Float = NDArray[np.float64]
 By = Literal["fixed", "random", "target"]
 
 COUNTED = (1, 2, 4)  # frames after which is counted
+COMPARED = (2, 4)  # frames after which ways are compared
 FEWEST_THINGS = 6
 MOST_THINGS = 10
 DISTANCE = 0.6  # metres
@@ -208,8 +210,19 @@ class Looking:
 
 def look_at_table(
     system: nextview.System, table: SimulatedTable, seed: tuple[int, int], by: By
-) -> dict[str, Counts]:
-    """Look at a table from four views; what was found after each number that is counted."""
+) -> tuple[dict[str, Counts], int]:
+    """Look at a table from four views.
+
+    Args:
+        system: that knows the things.
+        table: with the things.
+        seed: of the errors and of the views.
+        by: how views are chosen.
+
+    Returns:
+        What was found after each number of frames that is counted; and after how many frames the
+        scene was done, one more than were taken where it was not.
+    """
     rng = np.random.default_rng([*seed, 1])
     looking = Looking(system, TableCamera(table, SENSORS["wrist"], rng))
     choose = np.random.default_rng([*seed, 2])
@@ -218,8 +231,11 @@ def look_at_table(
     pose = poses_around(np.array([azimuth]), elevation, DISTANCE, CENTRE)[0]
 
     found = {}
+    done = max(COUNTED) + 1
     for number in range(1, max(COUNTED) + 1):
         looking.look(pose)
+        if looking.scene.done:
+            done = min(done, number)
         if number in COUNTED:
             found[str(number)] = looking.count()
         if by == "fixed":
@@ -236,7 +252,7 @@ def look_at_table(
         else:
             target = looking.scene.target
             pose = pose if target is None else target
-    return found
+    return found, done
 
 
 def summed(lines: Iterable[dict], frames: int) -> Counts:
@@ -280,26 +296,33 @@ def table_of(lines: Sequence[dict]) -> str:
 
 
 def comparison(lines: Sequence[dict]) -> str:
-    """Things named right after four frames: target against the others, paired by table."""
-    by_table: dict[str, dict[int, int]] = {}
-    for line in lines:
-        right = line["counts"][str(COUNTED[-1])]["right"]
-        by_table.setdefault(line["by"], {})[line["table"]] = right
+    """Things named right, and frames until done: target against the others, paired by table."""
     said = []
-    target = by_table.get("target", {})
+    for frames in COMPARED:
+        right = {(one["by"], one["table"]): one["counts"][str(frames)]["right"] for one in lines}
+        said += _differences(right, f"things named right a table after {frames} frames")
+    done = {(one["by"], one["table"]): one["done"] for one in lines}
+    return "\n".join(said + _differences(done, "frames until done"))
+
+
+def _differences(values: dict[tuple[By, int], int], what: str) -> list[str]:
+    """Lines on the differences of target to the other ways, given what was counted by way and
+    table.
+    """
+    said = []
     for other in ("random", "fixed"):
-        both = sorted(set(target) & set(by_table.get(other, {})))
+        both = sorted(table for by, table in values if by == other and ("target", table) in values)
         if not both:
             continue
-        difference = np.array([target[k] - by_table[other][k] for k in both])
+        difference = np.array([values["target", k] - values[other, k] for k in both])
         signs = np.random.default_rng(0).choice([-1, 1], (FLIPS, len(both)))
         as_much = np.abs((signs * difference).sum(1)) >= abs(int(difference.sum()))
         p_value = (1 + as_much.sum()) / (1 + FLIPS)
         said.append(
-            f"target less {other}: {difference.mean():+.2f} things a table on {len(both)} tables,"
+            f"target less {other}: {difference.mean():+.2f} {what}, {len(both)} tables,"
             f" p = {p_value:.4f}"
         )
-    return "\n".join(said)
+    return said
 
 
 def main(
@@ -338,8 +361,8 @@ def main(
             drawn = np.random.default_rng([seed, number])
             table = draw_table(of_scans, of_strangers, drawn)
             for one in left:
-                counts = look_at_table(system, table, (seed, number), one)
-                line = {"seed": seed, "table": number, "by": one}
+                counts, after = look_at_table(system, table, (seed, number), one)
+                line = {"seed": seed, "table": number, "by": one, "done": after}
                 line["counts"] = {frames: asdict(found) for frames, found in counts.items()}
                 written.write(json.dumps(line, default=int) + "\n")
                 written.flush()

@@ -13,6 +13,7 @@ from rich.text import Text
 from nextview.checks import number_of
 from nextview.cli.exit_status import printable
 from nextview.cli.progress import Terminal
+from nextview.session.pose_json import pose_as_json
 from nextview.session.result import Recognition
 
 SHOWN_POSES = 5  # beside the likeliest
@@ -185,40 +186,6 @@ def episode_as_json(
     }
     whole["warnings"] = sorted(warning.name for warning in result.warnings)
     return json.dumps(plain(whole), indent=indent)
-
-
-def pose_as_json(result: Recognition) -> dict[str, Any]:
-    """Where the object is: what ``Recognition`` says of it, by the same names."""
-    off = result.pose_uncertainty
-    candidates = [
-        {
-            "thing": each.thing,
-            "probability": each.probability,
-            "pose": each.pose,
-            "degrees": each.degrees,
-            "millimetres": each.millimetres,
-        }
-        for each in result.pose_candidates
-    ]
-
-    symmetry = result.symmetry
-    axes = (
-        None
-        if symmetry is None
-        else [{"axis": each.axis, "order": each.order} for each in symmetry]
-    )
-
-    return {
-        "pose": result.pose,
-        "pose_of": result.pose_of,
-        "pose_frame": result.pose_frame,
-        "pose_uncertainty": (
-            None if off is None else {"degrees": off.degrees, "millimetres": off.millimetres}
-        ),
-        "pose_candidates": candidates,
-        "symmetry": axes,
-        "why_no_pose": result.why_no_pose,
-    }
 
 
 def plain(value: Any) -> Any:

@@ -14,18 +14,14 @@ from nextview.captured.camera import UP
 from nextview.captured.check import check_capture
 from nextview.captured.folders import Capture, read_capture
 from nextview.cli.common_options import Three, check_file
-from nextview.cli.episode_table import plain, pose_as_json
+from nextview.cli.episode_table import plain
 from nextview.cli.progress import Terminal, console, track
 from nextview.errors import ObservationError, UsageError
 from nextview.files import new_file
-from nextview.recognition.poses import place_in_words
-from nextview.scene.objects import UNKNOWN, SceneObject
+from nextview.scene.report import COLUMNS, doubts_of, row_of, scene_as_json
 from nextview.scene.scene import Look, Scene
 from nextview.sensing.object_frame import Box, upright_axes
 from nextview.session.system import load
-
-MOST_CANDIDATES = 3  # other things that are shown beside a name
-LEAST_BELIEF = 0.01  # of what is shown
 
 
 @dataclass(frozen=True)
@@ -127,6 +123,8 @@ def look(
     else:
         print_scene(scene, path.name)
     for name, one in looks.items():
+        for ended, whole in one.joined:
+            console.print(f"{name}: {ended} turned out to be a part of {whole}")
         for warning in one.warnings:
             console.print(f"{name}: warning ({warning.name}): {warning.message}", soft_wrap=True)
     for name, reason in left_out.items():
@@ -172,93 +170,11 @@ def print_scene(scene: Scene, name: str) -> None:
     table = Table(box=box.SIMPLE, pad_edge=False, padding=(0, 1, 0, 0))
     frames = len(scene.frames)
     table.title = f"On the table in {name}, {frames} frame{'s' * (frames > 1)}"
-    for column in ("", "name", "belief", "place, m", "± mm, °", "frames", "touches"):
+    for column in COLUMNS:
         table.add_column(column, justify="right" if column in ("", "frames") else "left")
     for thing in objects:
-        table.add_row(*_row(thing))
+        table.add_row(*row_of(thing))
+
     console.print(table)
-
-    unsure = [thing for thing in objects if not thing.confident and thing.name != UNKNOWN]
-    for thing in unsure:
-        beliefs = sorted(thing.result.beliefs.items(), key=lambda pair: -pair[1])
-        rest = [f"{one} {belief:.2f}" for one, belief in beliefs[:MOST_CANDIDATES]]
-        console.print(f"{thing.number} is not sure: {', '.join(rest)}")
-
-
-def _row(thing: SceneObject) -> list[str]:
-    """What is printed of an object."""
-    off = thing.pose_uncertainty
-    name = thing.name
-    belief = f"{thing.confidence:.3f}"
-    if thing.name == UNKNOWN:
-        sides = " x ".join(f"{100 * side:.0f}" for side in thing.size)
-        name = f"{UNKNOWN} ({sides} cm)"
-        belief = ""
-    elif not thing.confident:
-        name = f"{name} ?"
-
-    return [
-        str(thing.number),
-        name,
-        belief,
-        place_in_words(thing.place).removesuffix(" m"),
-        "" if off is None else f"{off.millimetres:.1f}, {off.degrees:.1f}",
-        str(len(thing.pixels)),
-        ", ".join(str(number) for number in thing.touches),
-    ]
-
-
-def scene_as_json(scene: Scene, looks: dict[str, Look], left_out: dict[str, str]) -> dict[str, Any]:
-    """All that was found, for JSON.
-
-    Args:
-        scene: what was found.
-        looks: what each frame changed, by its name.
-        left_out: why frames were not read, by their names.
-    """
-    names = [name for name, one in looks.items() if one.taken]
-    objects = []
-
-    for thing in scene.objects:
-        likely = {
-            name: belief for name, belief in thing.result.beliefs.items() if belief >= LEAST_BELIEF
-        }
-        one: dict[str, Any] = {
-            "number": thing.number,
-            "name": thing.name,
-            "confidence": thing.confidence,
-            "confident": thing.confident,
-            "most_like": thing.result.most_like,
-            "novelty": thing.result.novelty,
-            "beliefs": likely,
-            "place": thing.place,
-            "size": thing.size,
-            "touches": thing.touches,
-            "warnings": sorted({warning.name for warning in thing.warnings}),
-        }
-        one |= pose_as_json(thing.result)
-        one["frames"] = {
-            names[number]: {"pixels": int(mask.sum()), "box": _box_of(mask)}
-            for number, mask in thing.pixels.items()
-        }
-        objects.append(one)
-    frames = [
-        {
-            "name": name,
-            "taken": one.taken,
-            "appeared": one.appeared,
-            "moved": one.moved,
-            "gone": one.gone,
-            "warnings": [warning.message for warning in one.warnings],
-        }
-        for name, one in looks.items()
-    ]
-
-    return {"unit": "m", "objects": objects, "frames": frames, "left_out": left_out}
-
-
-def _box_of(mask: NDArray[np.bool_]) -> list[int]:
-    """Left, top, width and height of what a mask holds, pixels, as BOP has it."""
-    rows, columns = np.nonzero(mask)
-    left, top = int(columns.min()), int(rows.min())
-    return [left, top, int(columns.max()) - left + 1, int(rows.max()) - top + 1]
+    for line in doubts_of(scene):
+        console.print(line)

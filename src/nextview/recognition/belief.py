@@ -398,6 +398,11 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
         )
         return low, high
 
+    @property
+    def largest(self) -> float:
+        """Radius of the largest objects of any class, but for rare ones, metres."""
+        return float(np.exp(self._usual[1].max()))
+
     def impossible(self, radius: float, much: float = MUCH) -> NDArray[np.bool_]:
         """Return the classes of which an object of this radius is far too small or too large.
 

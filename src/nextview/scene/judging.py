@@ -137,6 +137,14 @@ class Judge:
 
         return views
 
+    @property
+    def widest(self) -> float | None:
+        """Diameter of the largest thing that is known, metres; None where no size is known."""
+        card = getattr(self.system.models.recogniser, "card", None)
+        if card is None or card.size is None:
+            return None
+        return 2 * float(card.size.largest)
+
     def _impossible(self, thing: ObservedObject) -> tuple[str, ...]:
         """Classes whose objects have not the size of this one."""
         recogniser = self.system.models.recogniser

@@ -34,7 +34,9 @@ FEWEST_HIDDEN = 12  # cells that nobody saw, below which nothing can hide there
 NEAR_TIE = 0.05  # of the best value: among views of nearly the same value the nearer one is taken
 LOWEST_CAMERA = 0.10  # metres above the plane
 VISITED = np.radians(15.0)  # between two views that show the same
-UNKNOWN_WORTH = 1.0  # nats that a second view of an unknown object is worth, from behind
+UNKNOWN_WORTH = 1.0  # nats that another view of an unknown object is worth, from behind
+SURE_WORTH = 0.1  # the same of one that is sure: it may be two, or hide another
+SOME_POINTS = 60  # of an object, for which it is asked whether others hide it
 ENOUGH_VIEWS = 2  # of an object that fits none of the known things
 
 
@@ -106,19 +108,48 @@ class Ground:
         Args:
             camera: where it stands, (3,), world.
         """
+        own = np.full(len(self.points), CELL / 2)
+        return self.clear(camera, self.points, (self.points @ self.axes.T)[:, 2], own)
+
+    def share_visible(self, camera: Float, track: Track) -> float:
+        """Share of what was seen of an object that a camera would see past all others.
+
+        Args:
+            camera: where it stands, (3,), world.
+            track: the object.
+        """
+        points = np.concatenate([sighting.hull for sighting in track.thing.sightings])
+        points = points[:: max(1, len(points) // SOME_POINTS)]
+        middle = points.mean(0)
+        aside = np.linalg.norm((points - middle) @ self.axes[:2].T, axis=1)
+        # its own body does not count, in whatever direction the camera stands
+        own = aside + aside.max() + CELL
+        floor = np.full(len(points), self.floor)
+        return float(self.clear(camera, points, floor, own).mean())
+
+    def clear(self, camera: Float, points: Float, floor: Float, own: Float) -> Mask:
+        """Which points a camera would see past all that is known, (N,) bool.
+
+        Args:
+            camera: where it stands, (3,), world.
+            points: that are looked at, (N, 3), world, metres.
+            floor: height of the plane below each, (N,), metres.
+            own: metres around each, to the side, within which nothing hides it, (N,).
+        """
         start = self.axes @ camera
-        ends = self.points @ self.axes.T
+        ends = points @ self.axes.T
         # Nothing stands higher than the highest, so only the last part of each ray is looked at.
         highest = float(self.top.max()) if len(self.top) else 0.0
         rise = max(start[2] - self.floor, 1e-6)
         last = min(1.0, (highest + CELL) / rise)
         shares = np.linspace(0, last, RAY_STEPS, endpoint=False)[1:]
         along = ends[:, None] + shares[:, None] * (start - ends)[:, None]
+
         cell = np.floor((along[..., :2] - self.low) / CELL).astype(np.int64)
         inside = ((cell >= 0) & (cell < self.shape)).all(-1)
         index = np.where(inside, cell[..., 0] * self.shape[1] + cell[..., 1], 0)
-        own = index == np.arange(len(ends))[:, None]
-        blocked = inside & ~own & (self.top[index] > along[..., 2] - ends[:, None, 2])
+        beyond = np.linalg.norm(along[..., :2] - ends[:, None, :2], axis=-1) > own[:, None]
+        blocked = inside & beyond & (self.top[index] > along[..., 2] - floor[:, None])
         return np.asarray(~blocked.any(1))
 
 
@@ -212,11 +243,15 @@ def values(
         views: the candidates.
     """
     worth = np.zeros(len(views.poses))
-    for track in tracks:
-        if not is_sure(track):
-            worth += _of_object(system, track, views)
-
     ground = Ground.of(tops, tracks)
+    for track in tracks:
+        told = None if is_sure(track) else _information(system, track, views)
+        if told is None:  # nothing foretells what another side shows
+            told = _from_another_side(track, tops, views)
+            for row in np.flatnonzero(views.free):
+                told[row] *= ground.share_visible(views.poses[row, :3, 3], track)
+        worth += told
+
     if ground.largest_hidden >= FEWEST_HIDDEN:
         each = len(tracks) * np.log(max(len(system.classes), 2)) / max(len(ground.hidden), 1)
         for row in np.flatnonzero(views.free):
@@ -225,29 +260,41 @@ def values(
     return worth
 
 
-def _of_object(system: System, track: Track, views: Candidates) -> Float:
-    """What each view is expected to tell of one object, nats, (V,)."""
+def _information(system: System, track: Track, views: Candidates) -> Float | None:
+    """What each view is expected to tell of a known object, behind what stands before it, nats,
+    (V,); None where no hypothesis tells.
+    """
     recogniser = system.models.recogniser
     result = track.result
     assert result is not None
     joint = result.views[-1].joint
+    if not isinstance(recogniser, LooksAhead) or joint is None or result.unknown:
+        return None
+    outlook = recogniser.outlook([one for one in track.thing.observations if one.seen], joint)
+    if outlook is None:
+        return None
+
     frame = track.thing.object_frame
     inside = frame.pose_in_object(views.poses)
-    if isinstance(recogniser, LooksAhead) and joint is not None and not result.unknown:
-        seen = [one for one in track.thing.observations if one.seen]
-        outlook = recogniser.outlook(seen, joint)
-        if outlook is not None:
-            inside[:, :3, 3] *= frame.radius
-            return np.asarray(outlook.expect(inside).information("thing"))
+    inside[:, :3, 3] *= frame.radius
+    return np.asarray(outlook.expect(inside).information("thing"))
 
-    # What nothing explains is looked at from another side.
+
+def _from_another_side(track: Track, tops: Sequence[TableTop], views: Candidates) -> Float:
+    """What each view is worth by how far it is from those that an object was seen from, nats,
+    (V,).
+    """
+    frame = track.thing.object_frame
+    inside = frame.pose_in_object(views.poses)
     towards = inside[:, :3, 3] / np.linalg.norm(inside[:, :3, 3], axis=1, keepdims=True)
     turned = np.full(len(towards), np.pi)
-    for one in track.thing.sightings:
-        before = frame.pose_in_object(one.frame.camera_to_world)[:3, 3]
+    for number in track.pixels:
+        before = frame.pose_in_object(tops[number].frame.camera_to_world)[:3, 3]
         before = before / np.linalg.norm(before)
         turned = np.minimum(turned, np.arccos(np.clip(towards @ before, -1, 1)))
-    return UNKNOWN_WORTH * turned / np.pi
+
+    known = track.result is not None and not track.result.unknown
+    return (SURE_WORTH if known else UNKNOWN_WORTH) * turned / np.pi
 
 
 def best(views: Candidates, worth: Float, here: Float) -> int | None:

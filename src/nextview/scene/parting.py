@@ -8,16 +8,18 @@ explain more of the picture.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.errors import ObservationError
+from nextview.recognition.poses import PoseCandidate
 from nextview.scene.tracks import Rendered, Track, render_track
 from nextview.sensing.observed_object import FEWEST, ObservedObject, Sighting
 from nextview.sensing.tabletop import NEAR_PLANE, TableTop
@@ -37,6 +39,7 @@ NEAR_STEP = 0.03  # metres between their depths there, at most
 MOST_GROUP = 5  # segments that touch and are tried as one object
 MOST_TRIES = 2  # frames in which an object's pixels are parted otherwise in vain
 LEAST_TAKEN = 0.15  # share of an object's pixels that another one's scan takes over
+IN_EACH_OTHER = 0.5  # radii of the smaller of two scans between their centres, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,17 +83,20 @@ class Bench:
         return self.share([track]) >= GOOD_FIT
 
 
-def part(tracks: Sequence[Track], bench: Bench) -> list[Track]:
+def part(
+    tracks: Sequence[Track], bench: Bench, before: Mapping[int, Track] = MappingProxyType({})
+) -> list[Track]:
     """Join and cut the objects of one frame where scans explain more of it then.
 
     Args:
         tracks: all objects that the frame shows, judged.
         bench: the frame.
+        before: the objects as they were before this frame, by their numbers.
 
     Returns:
         The objects, judged. Numbers of new ones are negative.
     """
-    tracks = _trimmed(tracks, bench)
+    tracks = _trimmed(tracks, bench, before)
     tracks = _joined(tracks, bench)
     tracks = _cut(tracks, bench)
     tracks = _without_rests(tracks, bench)
@@ -135,6 +141,63 @@ def taken_over(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]
     return [track for row, track in enumerate(found) if row not in changed or track.frames]
 
 
+def merged(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]:
+    """Make one of two objects whose scans stand in each other, as no two things can.
+
+    That happens where two frames show two sides of one thing. Two objects are kept where they
+    explain more of the pictures than one.
+
+    Args:
+        tracks: all objects, judged.
+        benches: all frames, in order.
+    """
+    pairs = []
+    for one, other in combinations(range(len(tracks)), 2):
+        if _in_each_other(tracks[one].posed, tracks[other].posed):
+            with suppress(ObservationError):
+                pairs.append((one, other, _union([tracks[one], tracks[other]], benches[-1])))
+
+    judged = bench_judged([union for _, _, union in pairs], benches)
+    found: dict[int, Track | None] = dict(enumerate(tracks))
+    changed: set[int] = set()
+    for (one, other, _), union in zip(pairs, judged, strict=True):
+        before = _explained([tracks[one], tracks[other]], benches)
+        if not changed & {one, other} and _explained([union], benches) >= before - LEAST_GAIN:
+            changed |= {one, other}
+            found[one], found[other] = union, None
+    return [track for track in found.values() if track is not None]
+
+
+def _in_each_other(one: PoseCandidate | None, other: PoseCandidate | None) -> bool:
+    """Whether two things, where they were found, stand in each other."""
+    first, second = _sphere_of(one), _sphere_of(other)
+    if first is None or second is None:
+        return False
+    apart = float(np.linalg.norm(first[0] - second[0]))
+    return apart < IN_EACH_OTHER * min(first[1], second[1])
+
+
+def _sphere_of(posed: PoseCandidate | None) -> tuple[NDArray[np.float64], float] | None:
+    """Middle, (3,), world, and radius of a thing that was found, metres; None without a scan."""
+    if posed is None or posed.vertices is None:
+        return None
+    low = posed.vertices.min(0)
+    high = posed.vertices.max(0)
+    middle = posed.pose[:3, :3] @ ((low + high) / 2) + posed.pose[:3, 3]
+    return middle, float(np.linalg.norm(high - low)) / 2
+
+
+def _explained(tracks: Sequence[Track], benches: Sequence[Bench]) -> float:
+    """Share of the pixels of some objects that their scans explain, over all frames."""
+    fits = [
+        bench.fit(track)
+        for bench in benches
+        for track in tracks
+        if track.mask_in(bench.number) is not None
+    ]
+    return sum(one for one, _ in fits) / max(sum(every for _, every in fits), 1)
+
+
 def bench_judged(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]:
     """Judge objects, if there is any frame.
 
@@ -169,20 +232,33 @@ def _taken(loser: Track, taker: Track, bench: Bench) -> tuple[Track, Track] | No
         left = loser.without(bench.number, bench.top.up)
     except ObservationError:
         return None
-    gone = replace(loser, frames=()) if left is None else replace(left, result=loser.result)
 
-    return gone, replace(grown, result=taker.result)
+    grown = replace(grown, result=taker.result)
+    if left is not None:
+        return replace(left, result=loser.result), grown
+    ended = (*taker.absorbed, *loser.absorbed, loser.number)
+    absorbed = tuple(number for number in ended if number >= 0)
+    return replace(loser, frames=()), replace(grown, absorbed=absorbed)
 
 
-def _trimmed(tracks: Sequence[Track], bench: Bench) -> list[Track]:
-    """Take away low pixels at the rim of objects that are explained by the plane alone."""
+def _trimmed(tracks: Sequence[Track], bench: Bench, before: Mapping[int, Track]) -> list[Track]:
+    """Take away pixels beside the outline of what objects are most like: low ones, which the plane
+    explains; and, of an object that was named before this frame, all, which may be another one's.
+    """
     changed = {}
     for row, track in enumerate(tracks):
         mask = track.mask_in(bench.number)
-        rendered = bench.render_likeliest(track)
-        if mask is None or rendered is None or bench.is_good(track):
+        if mask is None or bench.is_good(track):
             continue
-        kept = mask & (rendered.around(mask.shape) | (bench.top.height > NEAR_PLANE))
+        named = before[track.number].posed if track.number in before else None
+        rendered = render_track(track, bench.top, bench.number, named or track.likeliest)
+        if rendered is None:
+            continue
+        kept = mask & rendered.around(mask.shape)
+        if named is not None:
+            kept[rendered.part] &= ~(rendered.hidden | rendered.through)
+        else:
+            kept |= mask & (bench.top.height > NEAR_PLANE)
         lost = 1 - float(kept.sum() / max(mask.sum(), 1))
         if LEAST_TRIMMED < lost < MOST_TRIMMED:
             with suppress(ObservationError):
@@ -229,8 +305,10 @@ def _groups(tracks: Sequence[Track], bench: Bench) -> list[tuple[int, ...]]:
         first, second = masks[one], masks[other]
         if first is None or second is None or (good[one] and good[other]):
             continue
+        # what is explained well is joined only with what its own scan explains, too
+        beside = not (good[one] or good[other])
         linked[one, other] = linked[other, one] = (
-            bench.top.touching(first, second, NEAR_GAP, NEAR_STEP)
+            (beside and bench.top.touching(first, second, NEAR_GAP, NEAR_STEP))
             or _shares(tracks[one], second, bench)
             or _shares(tracks[other], first, bench)
         )
@@ -280,7 +358,15 @@ def _union(tracks: Sequence[Track], bench: Bench) -> Track:
             every = np.any([other.mask for other in seen[number]], axis=0)
             one = first.thing.sighting_of(one.frame, every, one.plane, one.noise)
         sightings.append(one)
-    return first.seen_as(sightings, frames, bench.top.up)
+
+    again = dict(pair for track in tracks for pair in track.again) | dict(first.again)
+    ended = [number for track in tracks for number in (track.number, *track.absorbed)]
+    union = replace(
+        first,
+        again=tuple(pair for pair in again.items() if pair[0] not in frames),
+        absorbed=tuple(sorted({number for number in ended if number not in (-1, first.number)})),
+    )
+    return union.seen_as(sightings, frames, bench.top.up)
 
 
 def _cut(tracks: Sequence[Track], bench: Bench) -> list[Track]:

@@ -28,7 +28,7 @@ from nextview.scene.next_view import (
     values,
 )
 from nextview.scene.objects import SceneObject
-from nextview.scene.parting import GOOD_FIT, Bench, new_track, part, taken_over
+from nextview.scene.parting import GOOD_FIT, Bench, merged, new_track, part, taken_over
 from nextview.scene.tracks import Track, render_track
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box, upright_axes
@@ -48,6 +48,11 @@ WRONG_POSE = (
     "this frame does not fit the others and is left out: most objects are not where they were, so"
     " its pose is likely to be wrong"
 )
+MOVED_OR_POSE = ViewWarning(
+    "pose",
+    "what was known is not where it was, and nothing else stands where it was: it is taken to have"
+    " moved, but the frame's pose may be wrong",
+)
 NOTHING = ViewWarning("empty", "nothing stands on the plane in this frame")
 
 
@@ -60,6 +65,8 @@ class Look:
         appeared: numbers of objects that were not known before.
         moved: numbers of objects that stand elsewhere now.
         gone: numbers of objects that are no longer there.
+        joined: number of each object that turned out to be a part of another one, and the number of
+            that one: the first is used no more.
         warnings: what is likely to be wrong with the frame; usually nothing.
     """
 
@@ -67,6 +74,7 @@ class Look:
     appeared: tuple[int, ...] = ()
     moved: tuple[int, ...] = ()
     gone: tuple[int, ...] = ()
+    joined: tuple[tuple[int, int], ...] = ()
     warnings: tuple[ViewWarning, ...] = ()
 
 
@@ -104,6 +112,7 @@ class Scene:
         self.up = None if up is None else upright_axes(up)[2]
         self.region = region
         self._judge = Judge(self.system, CORES)
+        self._widest = self._judge.widest
         self._tops: list[TableTop] = []
         self._tracks: list[Track] = []
         self._target: Float | None = None
@@ -179,7 +188,7 @@ class Scene:
         with self._lock:
             known = [_sphere(track) for track in self._tracks]
             plane = self._tops[0].plane if self._tops else None
-            top = TableTop.of(frame, self.up, plane, known, self.region)
+            top = TableTop.of(frame, self.up, plane, known, self.region, self._widest)
             found = [agreement(track, top) for track in self._tracks]
             if contradicted(found):
                 return Look(False, warnings=(ViewWarning("pose", WRONG_POSE),))
@@ -221,13 +230,15 @@ class Scene:
     def _take(self, top: TableTop, found: Sequence[Agreement]) -> Look:
         """Take in a frame that fits."""
         number = len(self._tops)
+        segments = top.segments()
+        top = top.with_things(segments)
         bench = Bench(top, number, self._judged)
         there = [
             track for track, one in zip(self._tracks, found, strict=True) if not one.contradicts
         ]
         lost = [track for track, one in zip(self._tracks, found, strict=True) if one.contradicts]
 
-        own, new = assign(top.segments(), there, top)
+        own, new = assign(segments, there, top)
         shown = []
         hidden = []
         for row, track in enumerate(there):
@@ -242,12 +253,16 @@ class Scene:
             with suppress(ObservationError):
                 shown.append(new_track(mask, bench))
 
-        shown = part(self._judged_if_new(shown), bench)
+        before = {track.number: track for track in there}
+        shown = part(self._judged_if_new(shown), bench, before)
         self._tops.append(top)
         self._target = None
         benches = [Bench(one, k, self._judged) for k, one in enumerate(self._tops)]
-        every = taken_over([*hidden, *shown], benches)
-        return self._numbered(every, lost, top, number)
+        every = merged(taken_over([*hidden, *shown], benches), benches)
+        look = self._numbered(every, lost, top, number)
+        if look.moved and not any(one.confirms for one in found):
+            return replace(look, warnings=(*look.warnings, MOVED_OR_POSE))
+        return look
 
     def _numbered(
         self,
@@ -261,6 +276,7 @@ class Scene:
         appeared = []
         moved = []
         kept = []
+        joined = []
         for track in tracks:
             if track.number < 0:
                 assert track.result is not None
@@ -272,16 +288,18 @@ class Scene:
                     track = replace(track, number=self._next_number)
                     self._next_number += 1
                     appeared.append(track.number)
-            kept.append(track)
+            joined += [(ended, track.number) for ended in track.absorbed]
+            kept.append(replace(track, absorbed=()))
         self._tracks = kept
 
         gone = tuple(track.number for track in lost if track.number not in moved)
-        self._touching = {pair for pair in self._touching if not set(pair) & {*gone, *moved}}
+        changed = {*gone, *moved, *(ended for ended, _ in joined)}
+        self._touching = {pair for pair in self._touching if not set(pair) & changed}
         self._note_touching(top, number)
         warnings = tuple(check_frame(top.frame))
         if not kept:
             warnings += (NOTHING,)
-        return Look(True, tuple(appeared), tuple(moved), gone, warnings)
+        return Look(True, tuple(appeared), tuple(moved), gone, tuple(joined), warnings)
 
     def _note_touching(self, top: TableTop, number: int) -> None:
         """Remember which objects touch in a frame."""

@@ -44,6 +44,7 @@ class Track:
         tries: in how many frames its pixels were parted otherwise in vain.
         again: frames that show it where it was known to be, with its pixels in each: they were not
             taken in as sightings.
+        absorbed: numbers of objects whose pixels all became its own since the last frame.
     """
 
     number: int
@@ -52,6 +53,7 @@ class Track:
     result: Recognition | None = None
     tries: int = 0
     again: tuple[tuple[int, Mask], ...] = ()
+    absorbed: tuple[int, ...] = ()
 
     @property
     def posed(self) -> PoseCandidate | None:
@@ -128,7 +130,7 @@ class Track:
         Raises:
             ObservationError: too little is seen of the object.
         """
-        sighting = self.thing.sighting_of(top.frame, mask, top.plane, top.noise)
+        sighting = self.thing.sighting_of(top.around(mask), mask, top.plane, top.noise)
         kept = [
             (frame, one)
             for frame, one in zip(self.frames, self.thing.sightings, strict=True)

@@ -121,6 +121,12 @@ class Frame:
         object.__setattr__(moved, "pose", pose)
         return moved
 
+    def with_depth(self, depth: NDArray[np.float32]) -> "Frame":
+        """The same frame with another depth image, (H, W) float32, metres."""
+        other = copy(self)  # what was checked is right
+        object.__setattr__(other, "depth", depth)
+        return other
+
     @property
     def camera_to_world(self) -> NDArray[np.float64]:
         """The pose, or the identity if there is none."""

@@ -52,6 +52,8 @@ BOTTOM_SHARE = 0.04  # share of a mask's points that may lie lower than its bott
 BOTTOM_MARGIN = 0.02
 # from there, to the side, to where the plane is seen, at most, as a part of the distance
 BOTTOM_ASIDE = 0.08
+# height of a level plane over the ground below it, as a part of the distance: less is noise
+GROUND_BELOW = 0.05
 
 
 def level_planes(samples: Samples, first: Plane) -> list[Plane]:
@@ -90,6 +92,33 @@ def _only(chosen: Index, count: int) -> Mask:
     mask = np.zeros(count, bool)
     mask[chosen] = True
     return mask
+
+
+def ground_of(samples: Samples, first: Plane, widest: float) -> Plane:
+    """The level plane that things of a known size stand on, not one that is a part of them.
+
+    The top of a table carries cups, but where tables and chairs are looked for it is a part of one
+    of them, and they stand on the floor, if that is seen.
+
+    Args:
+        samples: of the frame.
+        first: the level plane with most samples.
+        widest: diameter of the largest thing that may stand there, metres.
+
+    Returns:
+        The lowest level plane that is seen at most so far below the first; the first where there
+        is none, or where it is wider than such a thing.
+    """
+    surface = first.extent(samples)
+    if not len(surface) or np.linalg.norm(np.ptp(_in_plane(surface, first), axis=0)) > widest:
+        return first
+
+    away = float(np.median(np.linalg.norm(surface - samples.camera, axis=1)))
+    middle = np.median(surface, axis=0)
+    for plane in reversed(level_planes(samples, first)):
+        if GROUND_BELOW * away < plane.height(middle) < widest:
+            return plane
+    return first
 
 
 def under_points(samples: Samples, planes: list[Plane], points: Float) -> Plane | None:

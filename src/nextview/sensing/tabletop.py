@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from nextview.sensing import clusters, segmentation
+from nextview.sensing import clusters, segmentation, support
 from nextview.sensing.clusters import Joins
 from nextview.sensing.convex_pieces import STANDS, Pieces, cut
 from nextview.sensing.facets import Noise
@@ -48,6 +48,7 @@ class TableTop:
         above: pixels above the plane, before all walls and inside the region, (H, W) bool.
         free: pixels before all walls, (H, W) bool; None where there is no wall.
         height: of each pixel over the plane, (H, W) float32, metres.
+        open: pixels above the plane that are of no thing for now, (H, W) bool; None: of none.
     """
 
     frame: Frame
@@ -57,6 +58,7 @@ class TableTop:
     above: Mask
     free: Mask | None
     height: NDArray[np.float32]
+    open: Mask | None = None
 
     @classmethod
     def of(
@@ -66,6 +68,7 @@ class TableTop:
         earlier: Plane | None = None,
         known: Sequence[tuple[Float, float]] = (),
         region: Box | None = None,
+        widest: float | None = None,
     ) -> TableTop:
         """Find the support plane of a frame, and what is above it.
 
@@ -75,6 +78,8 @@ class TableTop:
             earlier: the plane as an earlier frame shows it.
             known: centres, (3,), and radii of things that stand on it, metres.
             region: what is outside of this upright box is left out.
+            widest: diameter of the largest thing that is looked for, metres: a level plane that is
+                no larger may be a part of it. None: it is not known.
 
         Raises:
             ObservationError: no support plane is seen.
@@ -83,6 +88,8 @@ class TableTop:
         samples = sample(frame, frame.depth > 0, noise)
         if earlier is None:
             plane = ObservedObject(up if frame.pose is not None else None).find_support(frame)
+            if widest is not None:
+                plane = support.ground_of(samples, plane, widest)
         else:
             plane = segmentation.find_again(earlier, samples, _near(samples, known))
 
@@ -134,6 +141,26 @@ class TableTop:
             if self.is_thing(mask):
                 found.append(mask)
         return sorted(found, key=lambda mask: -np.count_nonzero(mask))
+
+    def with_things(self, masks: Sequence[Mask]) -> TableTop:
+        """The same where things are known; what is above the plane beside them is open.
+
+        Args:
+            masks: the pixels of each thing, (H, W) bool each.
+        """
+        taken = np.any(masks, axis=0) if len(masks) else np.zeros_like(self.above)
+        return replace(self, open=self.above & ~taken)
+
+    def around(self, mask: Mask) -> Frame:
+        """The frame as it tells of a thing: open pixels beside it say nothing, for or against it.
+
+        Args:
+            mask: the pixels of the thing, (H, W) bool.
+        """
+        if self.open is None:
+            return self.frame
+        depth = np.where(self.open & ~mask, np.float32(0), self.frame.depth)
+        return self.frame.with_depth(depth)
 
     def is_thing(self, mask: Mask) -> bool:
         """Whether some pixels, (H, W) bool, are enough, and high enough, to be a thing."""

@@ -1,0 +1,120 @@
+"""What was found in a scene: rows of a table, and JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.recognition.poses import place_in_words
+from nextview.scene.objects import UNKNOWN, SceneObject
+from nextview.scene.scene import Look, Scene
+from nextview.session.pose_json import pose_as_json
+
+COLUMNS = ("", "name", "belief", "place, m", "± mm, °", "frames", "touches")
+MOST_CANDIDATES = 3  # other things that are shown beside a name
+LEAST_BELIEF = 0.01  # of what is shown
+
+
+def row_of(thing: SceneObject) -> list[str]:
+    """One row of a table, in ``COLUMNS``.
+
+    Args:
+        thing: an object of a scene.
+    """
+    off = thing.pose_uncertainty
+    name = thing.name
+    belief = f"{thing.confidence:.3f}"
+    if thing.name == UNKNOWN:
+        sides = " x ".join(f"{100 * side:.0f}" for side in thing.size)
+        name = f"{UNKNOWN} ({sides} cm)"
+        belief = ""
+    elif not thing.confident:
+        name = f"{name} ?"
+
+    return [
+        str(thing.number),
+        name,
+        belief,
+        place_in_words(thing.place).removesuffix(" m"),
+        "" if off is None else f"{off.millimetres:.1f}, {off.degrees:.1f}",
+        str(len(thing.pixels)),
+        ", ".join(str(number) for number in thing.touches),
+    ]
+
+
+def doubts_of(scene: Scene) -> list[str]:
+    """A sentence on each object whose name is not confident: what else it may be.
+
+    Args:
+        scene: what was found.
+    """
+    said = []
+    for thing in scene.objects:
+        if thing.confident or thing.name == UNKNOWN:
+            continue
+        beliefs = sorted(thing.result.beliefs.items(), key=lambda pair: -pair[1])
+        rest = [f"{one} {belief:.2f}" for one, belief in beliefs[:MOST_CANDIDATES]]
+        said.append(f"{thing.number} is not sure: {', '.join(rest)}")
+    return said
+
+
+def scene_as_json(
+    scene: Scene, looks: Mapping[str, Look], left_out: Mapping[str, str]
+) -> dict[str, Any]:
+    """All that was found, for JSON.
+
+    Args:
+        scene: what was found.
+        looks: what each frame changed, by its name.
+        left_out: why frames were not read, by their names.
+    """
+    names = [name for name, one in looks.items() if one.taken]
+    objects = []
+
+    for thing in scene.objects:
+        likely = {
+            name: belief for name, belief in thing.result.beliefs.items() if belief >= LEAST_BELIEF
+        }
+        one: dict[str, Any] = {
+            "number": thing.number,
+            "name": thing.name,
+            "confidence": thing.confidence,
+            "confident": thing.confident,
+            "most_like": thing.result.most_like,
+            "novelty": thing.result.novelty,
+            "beliefs": likely,
+            "place": thing.place,
+            "size": thing.size,
+            "touches": thing.touches,
+            "warnings": sorted({warning.name for warning in thing.warnings}),
+        }
+        one |= pose_as_json(thing.result)
+        one["frames"] = {
+            names[number]: {"pixels": int(mask.sum()), "box": _box_of(mask)}
+            for number, mask in thing.pixels.items()
+        }
+        objects.append(one)
+    frames = [
+        {
+            "name": name,
+            "taken": one.taken,
+            "appeared": one.appeared,
+            "moved": one.moved,
+            "gone": one.gone,
+            "joined": one.joined,
+            "warnings": [warning.message for warning in one.warnings],
+        }
+        for name, one in looks.items()
+    ]
+
+    return {"unit": "m", "objects": objects, "frames": frames, "left_out": left_out}
+
+
+def _box_of(mask: NDArray[np.bool_]) -> list[int]:
+    """Left, top, width and height of what a mask holds, pixels, as BOP has it."""
+    rows, columns = np.nonzero(mask)
+    left, top = int(columns.min()), int(rows.min())
+    return [left, top, int(columns.max()) - left + 1, int(rows.max()) - top + 1]

@@ -1,0 +1,154 @@
+"""Parts of a scene: pixels that nobody claims, objects that are one, the ground, what hides."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import nextview
+from nextview.geometry.mesh import make_mesh
+from nextview.scene.judging import Judge
+from nextview.scene.next_view import Ground
+from nextview.scene.parting import Bench, merged, new_track
+from nextview.scene.tracks import Track
+from nextview.sensing.tabletop import TableTop
+from nextview.simulation.sensor import SENSORS
+from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
+from nextview.things.memory import open_memory
+
+NAMES = ("cracker_box", "mug", "tomato_soup_can")
+UP = np.array([0, 0, 1.0])
+CENTRE = np.array([0, 0, 0.03])
+
+
+@pytest.fixture(scope="module")
+def system():
+    return nextview.load("ycb", threads=1)
+
+
+@pytest.fixture(scope="module")
+def meshes():
+    card, memory = open_memory("ycb")
+    names = [thing.name for thing in card.memory.things]
+
+    def mesh(name):
+        surface = memory.surfaces.surface(names.index(name), name)
+        return make_mesh(surface.vertices.astype(float), surface.faces, name, "m")
+
+    return {name: mesh(name) for name in NAMES}
+
+
+def camera_over(meshes, seed=5) -> TableCamera:
+    rng = np.random.default_rng(seed)
+    return TableCamera(SimulatedTable.draw(meshes, rng, 0.08), SENSORS["stereo"], rng)
+
+
+def view(degrees, elevation=50.0, distance=0.65) -> np.ndarray:
+    return poses_around(np.radians([degrees]), np.radians(elevation), distance, CENTRE)[0]
+
+
+def judged_by(system):
+    judge = Judge(system, 1)
+
+    def judged(tracks):
+        results = judge([track.thing for track in tracks])
+        return [replace(track, result=one) for track, one in zip(tracks, results, strict=True)]
+
+    return judged
+
+
+def test_pixels_that_nobody_claims_say_nothing_against_a_thing(system, meshes):
+    camera = camera_over([meshes["mug"]])
+    frame = camera.frame(view(20))
+    top = TableTop.of(frame, UP)
+    whole = max(top.segments(), key=np.count_nonzero)
+    columns = np.flatnonzero(whole.any(0))
+    half = whole.copy()
+    half[:, int(np.quantile(columns, 0.55)) :] = False  # the rest became nobody's
+
+    judged = judged_by(system)
+    alone = judged([new_track(half, Bench(top, 0, judged))])[0]
+    open_top = top.with_things([half])
+    opened = judged([new_track(half, Bench(open_top, 0, judged))])[0]
+    assert np.array_equal(open_top.around(half).depth > 0, (frame.depth > 0) & ~open_top.open)
+    assert open_top.open.sum() >= (whole & ~half).sum()
+    assert opened.result.answer == "mug"
+    assert alone.result.answer != "mug"  # what was seen there is not behind the mug, but of it
+
+
+def two_sides(system, camera, degrees=(20, 140)) -> tuple[list[list[Track]], list[Bench]]:
+    """The objects of each of two frames as objects of their own, judged, with their frames."""
+    judged = judged_by(system)
+    found, benches = [], []
+    for number, angle in enumerate(degrees):
+        top = TableTop.of(camera.frame(view(angle)), UP)
+        benches.append(Bench(top, number, judged))
+        of_frame = [new_track(mask, benches[-1]) for mask in top.segments()]
+        found.append(
+            [replace(one, number=10 * number + k) for k, one in enumerate(judged(of_frame))]
+        )
+    return found, benches
+
+
+def test_two_sides_of_one_thing_are_one_object_and_two_things_stay_two(system, meshes):
+    found, benches = two_sides(
+        system, camera_over([meshes["tomato_soup_can"], meshes["cracker_box"]])
+    )
+    assert [len(tracks) for tracks in found] == [2, 2]
+    every = [track for tracks in found for track in tracks]
+    one_each = merged(every, benches)
+    assert sorted(track.result.answer for track in one_each) == ["cracker_box", "tomato_soup_can"]
+    assert all(track.frames == (0, 1) for track in one_each)
+    assert sorted(number for track in one_each for number in track.absorbed) == [10, 11]
+    assert merged(found[0], benches[:1]) == found[0]
+
+
+def test_a_look_tells_which_numbers_end_in_another_object(system, meshes):
+    camera = camera_over([meshes["mug"], meshes["cracker_box"]])
+    scene = nextview.Scene(system)
+    scene.update(camera.frame(view(20)))
+    mug = next(track for track in scene._tracks if track.result.answer == "mug")
+    scene._tracks.append(replace(mug, number=7))  # as if another frame had shown it as another one
+    look = scene.update(camera.frame(view(140)))
+    assert look.joined == ((7, mug.number),)
+    assert look.appeared == look.gone == look.moved == ()
+    assert len(scene.objects) == 2
+
+
+def test_a_lone_thing_that_is_elsewhere_may_be_a_wrong_pose(system, meshes):
+    camera = camera_over([meshes["mug"]])
+    scene = nextview.Scene(system)
+    scene.update(camera.frame(view(20)))
+    frame = camera.frame(view(60))
+    pose = frame.pose.copy()
+    pose[:2, 3] += 0.2
+    look = scene.update(replace(frame, pose=pose, pixel_centre=0.5))
+    assert look.moved == (1,)
+    assert [warning.name for warning in look.warnings] == ["pose"]
+
+
+def test_the_ground_is_below_what_may_be_a_thing(meshes):
+    camera = camera_over([meshes["mug"]])
+    frame = camera.frame(view(20, elevation=35.0, distance=2.2))
+    table = np.array([0, 0, 0.0])
+    small = TableTop.of(frame, UP, widest=0.4).plane
+    assert small.height(table) == pytest.approx(0, abs=0.02)
+    large = TableTop.of(frame, UP, widest=5.0).plane  # tables are looked for, too
+    assert large.height(table) == pytest.approx(0.75, abs=0.03)
+    assert TableTop.of(frame, UP).plane.height(table) == pytest.approx(0, abs=0.02)
+
+
+def test_what_stands_behind_another_thing_is_not_seen(system, meshes):
+    camera = camera_over([meshes["cracker_box"], meshes["tomato_soup_can"]])
+    scene = nextview.Scene(system)
+    scene.update(camera.frame(view(20, elevation=65.0)))
+    tracks = {track.result.most_like: track for track in scene._tracks}
+    box, can = (
+        tracks[name].thing.object_frame.centre for name in ("cracker_box", "tomato_soup_can")
+    )
+    ground = Ground.of(scene.tops, scene._tracks)
+    away = (box - can)[:2] / np.linalg.norm((box - can)[:2])
+    behind_the_box = np.append(box[:2] + 0.5 * away, 0.08)
+    before_the_can = np.append(can[:2] - 0.5 * away, 0.08)
+    assert ground.share_visible(before_the_can, tracks["tomato_soup_can"]) == 1
+    assert ground.share_visible(behind_the_box, tracks["tomato_soup_can"]) < 0.5
