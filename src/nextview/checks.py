@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.errors import MissingExtraError, ModelError, NextviewError, UsageError
+from nextview.types import Float
 
 EXTRAS = {  # packages by the optional part of the installation that brings them
     "bags": ("rosbags",),
@@ -221,7 +221,7 @@ def check_array(
         raise ModelError(f"{what} are not all finite numbers")
 
 
-def points(value: Any, what: str) -> NDArray[np.float64]:
+def points(value: Any, what: str) -> Float:
     """Points in space, (N, 3) float64; UsageError if they are none.
 
     Args:

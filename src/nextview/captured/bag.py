@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.captured.frames import CapturedFrame, Float, Views
+from nextview.captured.frames import CapturedFrame, Views
 from nextview.captured.messages import (
     ENCODINGS,
     STEPS,
@@ -30,6 +30,7 @@ from nextview.captured.messages import (
 from nextview.captured.transforms import NoTransformError, TransformError, TransformTree
 from nextview.checks import extras, one_line
 from nextview.errors import DAMAGED, DatasetError, NextviewError, ObservationError
+from nextview.types import Float, Float32
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -201,7 +202,7 @@ class RecordedImage:
     encoding: str
     size: tuple[int, int]
 
-    def read(self) -> NDArray[np.uint16] | NDArray[np.float32]:
+    def read(self) -> NDArray[np.uint16] | Float32:
         """Read the image, (H, W), uint16 or float32.
 
         Raises:

@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nextview.captured.check import check_capture, refuse_many
-from nextview.captured.frames import Capture, CapturedFrame, Float
+from nextview.captured.frames import Capture, CapturedFrame
 from nextview.errors import DatasetError, NoViewLeftError, ObservationError
 from nextview.geometry.viewsphere import angle_between
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box, ObjectFrame, upright_axes
 from nextview.sensing.observed_object import ObservedObject
+from nextview.types import Float
 
 # the axes of a world that may be called up by name
 UP = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}

@@ -12,9 +12,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from nextview.captured.frames import MILLIMETRES, Float, pinhole_of
+from nextview.captured.frames import MILLIMETRES, pinhole_of
 from nextview.errors import DatasetError
 from nextview.files import regular_file
+from nextview.types import Float
 
 LARGEST_FILE = 2**20  # bytes
 MATRICES = ("k", "K", "cam_K", "camera_matrix", "intrinsic_matrix")

@@ -7,12 +7,10 @@ all that is seen with the camera, so that frames from different sides contradict
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from nextview.sensing.agreement import SHARP, Agreement, SurfaceView, compare
-
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 # share of the points that is contradicted from which a mistake of the camera is searched for
 LEAST_SHARE = 0.05

@@ -13,18 +13,11 @@ import numpy as np
 from PIL import Image
 
 from nextview.captured.camera_file import CameraFile, read_camera_file
-from nextview.captured.frames import (
-    CapturedFrame,
-    DepthFile,
-    Float,
-    Views,
-    numbers_of,
-    read_table,
-    rigid,
-)
+from nextview.captured.frames import CapturedFrame, DepthFile, Views, numbers_of, read_table, rigid
 from nextview.checks import did_you_mean
 from nextview.errors import DAMAGED, DatasetError
 from nextview.files import read_record
+from nextview.types import Float
 
 CAMERA_FILES = (
     "camera_info.yaml",

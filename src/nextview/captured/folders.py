@@ -23,7 +23,6 @@ from nextview.captured.frames import (
     Capture,
     CapturedFrame,
     DepthFile,
-    Float,
     Views,
     lines_of,
     numbers_of,
@@ -36,6 +35,7 @@ from nextview.errors import DatasetError, UsageError
 from nextview.files import read_record
 from nextview.geometry.mesh import FORMATS
 from nextview.sensing.object_frame import Box
+from nextview.types import Float
 
 # the pinhole matrix in a folder of TUM or 7-Scenes, as in 3DMatch
 INTRINSICS = "camera-intrinsics.txt"

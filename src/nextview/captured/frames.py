@@ -12,12 +12,12 @@ from PIL import Image
 from nextview.errors import DAMAGED, DatasetError, ObservationError
 from nextview.files import regular_file
 from nextview.sensing.frame import LARGEST_MEDIAN, NEAREST_MEDIAN, Frame, check_pose
+from nextview.types import Float, Float32
 
 NOTHING = np.iinfo(np.uint16).max  # what some sensors give for "nothing" besides 0
 DEEP = ("I;16", "I;16B", "I")  # Pillow's names of grey images of 16 bits
 LARGEST_TEXT = 2**28  # bytes of a list of images or poses
 MILLIMETRES = 0.001
-Float = NDArray[np.float64]
 
 
 class DepthImage(Protocol):
@@ -28,7 +28,7 @@ class DepthImage(Protocol):
         """Width and height, pixels, without reading the image."""
         ...
 
-    def read(self) -> NDArray[np.uint16] | NDArray[np.float32]:
+    def read(self) -> NDArray[np.uint16] | Float32:
         """Read the image, (H, W): uint16 steps, of which 0 and 65535 mean nothing, or float32.
 
         Raises:
@@ -118,7 +118,7 @@ class CapturedFrame:
         image = None if self.image is None else _as_grey(self.image, raw.shape)
         return Frame(depth, self.intrinsics, self.pose, mask, image)
 
-    def _check_scale(self, depth: NDArray[np.float32]) -> None:
+    def _check_scale(self, depth: Float32) -> None:
         """Refuse depth that no camera measures: ``Frame`` would speak of other mistakes."""
         measured = depth[depth > 0]
         middle = float(np.median(measured)) if len(measured) else NEAREST_MEDIAN

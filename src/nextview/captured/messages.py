@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from nextview.captured.frames import DEEP, MILLIMETRES, Float
+from nextview.captured.frames import DEEP, MILLIMETRES
 from nextview.errors import DAMAGED, ObservationError
+from nextview.types import Float
 
 ENCODINGS: dict[str, np.dtype[Any]] = {
     "16UC1": np.dtype(np.uint16),

@@ -4,15 +4,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from nextview.captured.shifted_poses import relative_change
 from nextview.sensing.agreement import Agreement, SurfaceView, compare
 from nextview.sensing.frame import AXES
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
+from nextview.types import Float, Index
 
 FEWEST_JUDGED = 100  # points that two frames or more have to share before anything is said
 CERTAIN_SHARE = 0.99  # share of confirmed points from which no mistake is searched for

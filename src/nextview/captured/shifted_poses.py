@@ -11,12 +11,9 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.sensing.agreement import SHARP, Agreement, SurfaceView, compare
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
+from nextview.types import Float, Index, Mask
 
 FRAME_SHIFTS = (1, -1, 2, -2)  # frames by which the poses of a part may be late
 MOST_SHIFTED = 4  # frames by which poses may be late after several parts
@@ -89,7 +86,7 @@ class Shifted:
         """Return the right poses, (N, 4, 4), if those of the capture are late."""
         return self.poses[np.clip(self.indices + late, 0, len(self.poses) - 1)]
 
-    def has_pose(self, late: Index) -> NDArray[np.bool_]:
+    def has_pose(self, late: Index) -> Mask:
         """Which frames still have a pose if those in the capture are late, (N,)."""
         where = self.indices + late
         return (where >= 0) & (where < len(self.poses))
@@ -242,7 +239,7 @@ def _is_explained(shifted: Shifted, as_read: Index, late: Index) -> bool:
     )
 
 
-def relative_change(poses: Float, others: Float) -> NDArray[np.bool_]:
+def relative_change(poses: Float, others: Float) -> Mask:
     """Of which two cameras the pose relative to each other differs, (N, N).
 
     Args:

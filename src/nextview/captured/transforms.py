@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nextview.captured.frames import Float
 from nextview.captured.messages import matrix_of
 from nextview.errors import DatasetError
+from nextview.types import Float
 
 LONGEST_GAP = 0.5  # seconds between two transforms from which a pose between them is interpolated
 BEYOND = 0.02  # seconds before the first or after the last transform that it still counts for

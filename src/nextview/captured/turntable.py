@@ -10,17 +10,11 @@ from nextview.captured.folders import (
     INTRINSICS,
     is_capture,
 )
-from nextview.captured.frames import (
-    MILLIMETRES,
-    Capture,
-    CapturedFrame,
-    DepthFile,
-    Float,
-    read_table,
-)
+from nextview.captured.frames import MILLIMETRES, Capture, CapturedFrame, DepthFile, read_table
 from nextview.errors import DatasetError, ObservationError
 from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.object_frame import smallest_circle, upright_axes
+from nextview.types import Float
 
 # of the fit; points of a frame; share of them that counts, the nearest
 ROUNDS = 40

@@ -16,6 +16,7 @@ from nextview.geometry.mesh import Mesh
 from nextview.geometry.ray_caster import RayCaster, pixel_rays
 from nextview.geometry.viewsphere import DISTANCE, ViewSphere, look_at_origin
 from nextview.simulation.scene import square
+from nextview.types import Float32
 
 # a Kinect's as ROS has it by default; first pixel's centre at 0
 PINHOLE = pinhole_of(525.0, 525.0, 319.5, 239.5)
@@ -101,7 +102,7 @@ def write_capture(
 
 
 def _write_images(
-    folder: Path, index: int, depth: NDArray[np.float32], which: NDArray[np.integer], masks: bool
+    folder: Path, index: int, depth: Float32, which: NDArray[np.integer], masks: bool
 ) -> None:
     """Write the depth of each ray, and the mask of the object, by which thing it meets."""
     steps = np.rint(np.where(which < 0, np.float32(0), depth) / STEP).astype(np.uint16)

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich import box
 from rich.table import Table
 
@@ -22,6 +21,7 @@ from nextview.scene.report import COLUMNS, doubts_of, row_of, scene_as_json
 from nextview.scene.scene import Look, Scene
 from nextview.sensing.object_frame import Box, upright_axes
 from nextview.session.system import load
+from nextview.types import Float
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def look(
             scene.plot(part, path.name)
 
 
-def _where(capture: Capture, looking: LookOptions) -> tuple[NDArray[np.float64] | None, Box | None]:
+def _where(capture: Capture, looking: LookOptions) -> tuple[Float | None, Box | None]:
     """The direction up, (3,), and the region in which is looked."""
     given = looking.up if looking.up is not None else capture.up
     if isinstance(given, str):

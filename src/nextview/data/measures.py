@@ -18,8 +18,9 @@ from nextview.errors import MeasureError
 from nextview.geometry.depth import object_depth
 from nextview.geometry.observation import depth_image
 from nextview.recognition.map_names import Good
+from nextview.types import Float, Float32, Floats, Index, Mask
 
-Made = dict[str, NDArray[np.float32]]  # the values of one object, by the names of their arrays
+Made = dict[str, Float32]  # the values of one object, by the names of their arrays
 QUANTUM = 1e-3  # depth values closer than this count as equal, object radii
 
 
@@ -35,9 +36,9 @@ class MeasuredView:
         intrinsics: pinhole matrix, (3, 3), pixels, the first pixel's centre at 0.5.
     """
 
-    depth: NDArray[np.floating]
-    pose: NDArray[np.float64]
-    intrinsics: NDArray[np.float64]
+    depth: Floats
+    pose: Float
+    intrinsics: Float
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "depth", object_depth(depth_image(self.depth)))
@@ -49,17 +50,17 @@ class MeasuredView:
         return found[0] if found else (slice(0, 0), slice(0, 0))
 
     @cached_property
-    def near(self) -> NDArray[np.floating]:
+    def near(self) -> Floats:
         """The depth in the bounding box, (H', W'), which saves work on the background."""
         return self.depth[self.box]
 
     @cached_property
-    def seen(self) -> NDArray[np.bool_]:
+    def seen(self) -> Mask:
         """Where the box shows the object, (H', W')."""
         return self.near > 0
 
     @cached_property
-    def depths(self) -> NDArray[np.floating]:
+    def depths(self) -> Floats:
         """Depth of the pixels that show the object, (n,), row by row."""
         return self.near[self.seen]
 
@@ -152,7 +153,7 @@ def names_of(names: Sequence[str], meshes: bool) -> tuple[str, ...]:
     return names
 
 
-def depth_entropy(depth: NDArray[np.floating]) -> float:
+def depth_entropy(depth: Floats) -> float:
     """Return the Shannon entropy, bits, of the values of a depth image.
 
     The image is (H, W), object radii, 0 where there is no object.
@@ -165,7 +166,7 @@ def depth_entropy(depth: NDArray[np.floating]) -> float:
     return float((share * np.log2(1 / share)).sum())
 
 
-def normalise_per_object(values: NDArray[np.floating]) -> NDArray[np.float32]:
+def normalise_per_object(values: Floats) -> Float32:
     """Scale values, (..., V), to [0, 1] over each object's views, float32.
 
     They are all 0 where the views do not differ.
@@ -176,9 +177,7 @@ def normalise_per_object(values: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.where(span > 0, (values - low) / np.where(span > 0, span, 1), 0).astype(np.float32)
 
 
-def confidence_maps(
-    logits: NDArray[np.floating], labels: NDArray[np.integer]
-) -> NDArray[np.float32]:
+def confidence_maps(logits: Floats, labels: NDArray[np.integer]) -> Float32:
     """Return the confidence in the true class of each single view.
 
     It is the highest probability where the view is right, the first of equal classes counting, else
@@ -218,7 +217,7 @@ def measure(
     names: Sequence[str] = (),
     workers: int | None = None,
     scheduler: str | None = None,
-    objects: NDArray[np.int64] | None = None,
+    objects: Index | None = None,
     overwrite: bool = False,
     views: Views = depth_views,
 ) -> Iterator[tuple[int, int]]:
@@ -280,7 +279,7 @@ def keep(
     function: Callable[[ViewStore, int], Made],
     workers: int | None = None,
     scheduler: str | None = None,
-    objects: NDArray[np.int64] | None = None,
+    objects: Index | None = None,
     overwrite: bool = False,
 ) -> Iterator[tuple[int, int]]:
     """Compute arrays for the objects that lack them and write them to the store.

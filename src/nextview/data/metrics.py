@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.types import Float
+from nextview.types import Float, Floats, Index, Mask
 
 
 def ratio(top: Float, bottom: Float, weights: Float) -> Float:
@@ -21,7 +21,7 @@ def ratio(top: Float, bottom: Float, weights: Float) -> Float:
         return (weights @ top) / (weights @ bottom)
 
 
-def class_mean(top: Float, bottom: Float, labels: NDArray[np.int64], weights: Float) -> Float:
+def class_mean(top: Float, bottom: Float, labels: Index, weights: Float) -> Float:
     """Return ratios of weighted sums in each class, averaged over the classes.
 
     Args:
@@ -44,7 +44,7 @@ def class_mean(top: Float, bottom: Float, labels: NDArray[np.int64], weights: Fl
         return total / classes
 
 
-def mean_over_classes(values: NDArray, labels: NDArray[np.int64]) -> float:
+def mean_over_classes(values: NDArray, labels: Index) -> float:
     """Average values in each class, then over the classes.
 
     Args:
@@ -58,7 +58,7 @@ def mean_over_classes(values: NDArray, labels: NDArray[np.int64]) -> float:
     return float(class_mean(top, np.ones_like(top), labels.ravel(), np.ones((1, len(top))))[0, 0])
 
 
-def accuracy(answers: NDArray[np.int64], labels: NDArray[np.int64]) -> dict[str, float]:
+def accuracy(answers: Index, labels: Index) -> dict[str, float]:
     """Return the accuracy over all answers and as the mean over classes.
 
     Args:
@@ -75,9 +75,7 @@ def accuracy(answers: NDArray[np.int64], labels: NDArray[np.int64]) -> dict[str,
     }
 
 
-def recogniser_scores(
-    logits: NDArray[np.floating], labels: NDArray[np.int64]
-) -> dict[str, dict[str, float]]:
+def recogniser_scores(logits: Floats, labels: Index) -> dict[str, dict[str, float]]:
     """Return the accuracy from single views and with the logits of all views summed.
 
     Args:
@@ -92,9 +90,7 @@ def recogniser_scores(
     return {"single_view": accuracy(logits.argmax(2), spread), "all_views_fused": fused}
 
 
-def reliability(
-    confidence: Float, right: NDArray[np.bool_], bins: int = 15
-) -> tuple[Float, Float, NDArray[np.int64]]:
+def reliability(confidence: Float, right: Mask, bins: int = 15) -> tuple[Float, Float, Index]:
     """Return the confidence and the accuracy in bins of equal width.
 
     Guo et al., On calibration of modern neural networks (2017), section 2. Empty bins are 0.
@@ -113,7 +109,7 @@ def reliability(
     return np.bincount(at, confidence, bins) / some, np.bincount(at, right, bins) / some, count
 
 
-def calibration_error(confidence: Float, right: NDArray[np.bool_]) -> float:
+def calibration_error(confidence: Float, right: Mask) -> float:
     """Return the expected calibration error.
 
     It is the mean gap between confidence and accuracy over the bins of ``reliability``.
@@ -133,9 +129,7 @@ def calibration_error(confidence: Float, right: NDArray[np.bool_]) -> float:
 MAP_DIGITS = {"mse": 5, "d0": 4, "d_le_1": 4, "d_lt_2": 4, "regret": 4}
 
 
-def map_errors(
-    predicted: NDArray[np.floating], true: NDArray[np.floating]
-) -> dict[str, NDArray[np.float64]]:
+def map_errors(predicted: Floats, true: Floats) -> dict[str, Float]:
     """Return how well local maps are predicted (thesis, section 5.3 and table 4).
 
     The errors are the mean squared error ("mse"); whether the predicted highest cell is at d = 0, d
@@ -165,7 +159,7 @@ def map_errors(
     }
 
 
-def map_scores(predicted: NDArray[np.floating], true: NDArray[np.floating]) -> dict[str, float]:
+def map_scores(predicted: Floats, true: Floats) -> dict[str, float]:
     """Return the means of ``map_errors`` over all maps, rounded for a card.
 
     Args:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.data.pool import counted
 from nextview.data.predictions import Predictions
@@ -21,6 +20,7 @@ from nextview.recognition.inference import MapNetwork, NetworkRecogniser
 from nextview.recognition.model_card import BUNDLED, ModelCard
 from nextview.recognition.network_input import from_store
 from nextview.things.recogniser import open_recogniser
+from nextview.types import Float32, Index
 
 BATCH = 8  # views a call of the networks
 Cards = dict[str, ModelCard]  # of map networks, by name
@@ -103,9 +103,7 @@ def predict(
         )
 
 
-def _plan(
-    store: ViewStore, objects: NDArray[np.int64], recogniser: ModelCard, maps: Cards
-) -> Predictions:
+def _plan(store: ViewStore, objects: Index, recogniser: ModelCard, maps: Cards) -> Predictions:
     """What store and cards say of the objects; what the networks say is still to come."""
     own = [card for card in (recogniser, *maps.values()) if card.path.parent != BUNDLED]
     made_by = [
@@ -178,7 +176,7 @@ def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> 
     aside.replace(file)
 
 
-def _together(files: Sequence[Path]) -> dict[str, NDArray[np.float32]]:
+def _together(files: Sequence[Path]) -> dict[str, Float32]:
     """Join the arrays of all objects, (N, ...), from one file for each."""
     objects = []
     for file in files:

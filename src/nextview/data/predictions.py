@@ -20,6 +20,7 @@ from nextview.geometry.observation import enough_shows
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import Evidence
 from nextview.recognition.belief import PLAIN_SUM, Calibration, log_evidence_of
+from nextview.types import Float, Float32, Index, Mask
 
 FORMAT = 1
 # a file holds at most this many times its size, and so many bytes more
@@ -54,20 +55,20 @@ class Predictions:
         commands: all that made them, in order, from the meshes on; () if that is not known.
     """
 
-    logits: NDArray[np.float32]
-    maps: dict[str, NDArray[np.float32]]
-    depth_entropy: NDArray[np.float32]
+    logits: Float32
+    maps: dict[str, Float32]
+    depth_entropy: Float32
     names: tuple[str, ...]
-    labels: NDArray[np.int64]
+    labels: Index
     classes: tuple[str, ...]
     splits: NDArray[np.str_]
-    conflicting: NDArray[np.bool_]
+    conflicting: Mask
     sphere: ViewSphere
     models: dict[str, tuple[str, str]]
     valley_classes: dict[str, tuple[str, ...]]
     calibration: Calibration = PLAIN_SUM
-    azimuth_bins: NDArray[np.float32] | None = None
-    of_size: NDArray[np.float32] | None = None
+    azimuth_bins: Float32 | None = None
+    of_size: Float32 | None = None
     store: str = ""
     commands: tuple[str, ...] = ()
 
@@ -131,7 +132,7 @@ class Predictions:
         }
 
     @cached_property
-    def log_evidence(self) -> NDArray[np.float32]:
+    def log_evidence(self) -> Float32:
         """Log-evidence of each view, (N, V, D), which can be summed over views.
 
         See ``log_evidence_of``.
@@ -139,7 +140,7 @@ class Predictions:
         return log_evidence_of(self.logits, self.azimuth_bins, self.sphere.azimuth)
 
     @cached_property
-    def seen(self) -> NDArray[np.bool_]:
+    def seen(self) -> Mask:
         """Whether enough of the object is visible in each view, (N, V).
 
         In all other views the classes are alike.
@@ -152,12 +153,12 @@ class Predictions:
         )
 
     @property
-    def weights(self) -> NDArray[np.float64]:
+    def weights(self) -> Float:
         """Of the objects, (N,), sum N: all classes that occur count the same."""
         count = np.bincount(self.labels, minlength=len(self.classes))
         return len(self) / ((count > 0).sum() * count[self.labels])
 
-    def evidence(self, objects: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
+    def evidence(self, objects: Index, views: Index) -> Evidence:
         """Return the outputs of the models for single views.
 
         Args:
@@ -192,7 +193,7 @@ class Predictions:
         """Return one object of each shape and label."""
         return self.of_objects(deduplicated(self.labels, self.depth_entropy))
 
-    def of_objects(self, kept: NDArray[np.int64]) -> "Predictions":
+    def of_objects(self, kept: Index) -> "Predictions":
         """Some of the objects, by their rows, (n,)."""
         arrays: dict[str, Any] = {name: values[kept] for name, values in self._arrays().items()}
         maps = {name: values[kept] for name, values in self.maps.items()}
@@ -254,7 +255,7 @@ class Predictions:
 
     @classmethod
     def of_objects_in(
-        cls, store: ViewStore, objects: NDArray[np.int64], classes: Sequence[str]
+        cls, store: ViewStore, objects: Index, classes: Sequence[str]
     ) -> "Predictions":
         """Create empty predictions of objects in a store; all logits are 0.
 

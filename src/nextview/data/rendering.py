@@ -48,6 +48,7 @@ from nextview.simulation.scene_layout import SUFFIX, SceneLayout
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import Sensor, SensorMix, sensor_named
 from nextview.simulation.simulated import OccludedCamera, SimulatedCamera
+from nextview.types import Float
 
 AnySensor = Sensor | SensorMix | None
 LARGEST_CHUNK = 2**31 - 2**20  # bytes that may be compressed at once, the compressor's own included
@@ -72,7 +73,7 @@ class Deform:
     stretch: float = 0.0
     rotated: bool = False
 
-    def draw(self, seed: int, name: str) -> tuple[NDArray[np.float64], float]:
+    def draw(self, seed: int, name: str) -> tuple[Float, float]:
         """Draw the deformation of an object.
 
         Args:
@@ -310,7 +311,7 @@ def listing(dataset: Path, options: RenderOptions) -> Listing:
     return replace(found, entries=select(found.entries, dataset, options.split, options.held_out))
 
 
-def rotations(store: ViewStore) -> NDArray[np.float64]:
+def rotations(store: ViewStore) -> Float:
     """Return the rotation about z of each object of a store, radians, (N,)."""
     deform = Deform(store.attributes.stretch, store.attributes.rotated)
     return np.array([deform.draw(store.attributes.seed, name)[1] for name in store.names])

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from nextview.checks import whole
 from nextview.data.folders import Entry, list_dataset, select
@@ -30,8 +29,7 @@ from nextview.simulation.room import Room, at_rest, build_room
 from nextview.simulation.room_layout import IDENTITY, RoomLayout, Slab, Standing
 from nextview.simulation.scene import footprint, mesh_hash, separation
 from nextview.simulation.scene_layout import SUFFIX
-
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 LEVEL = "room"  # in the names of rooms, where other scenes have their level of clutter
 LAYOUTS_TRIED = 60

@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.checks import whole
 from nextview.data.folders import list_dataset, select
@@ -36,6 +35,7 @@ from nextview.simulation.scene import (
 )
 from nextview.simulation.scene_layout import LEVELS, SUFFIX, Block, Placement, SceneLayout
 from nextview.simulation.simulated import SimulatedCamera, visible_shares
+from nextview.types import Mask
 
 SCENE_VIEWS = ViewSphere.named("40")
 # pixels of the pictures that tell how much of the target shows: in the end, and while drawing
@@ -308,7 +308,7 @@ class _Hiding:
         self.views = np.concatenate(views)
         self.whole = np.maximum(np.bincount(self.views, minlength=len(SCENE_VIEWS)), 1)
 
-    def by(self, item: Item, still: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def by(self, item: Item, still: Mask) -> Mask:
         """Return the rays that an item blocks.
 
         Args:
@@ -325,7 +325,7 @@ class _Hiding:
         hidden[still] = length < 1
         return hidden
 
-    def share(self, still: NDArray[np.bool_]) -> float:
+    def share(self, still: Mask) -> float:
         """Share of the target that shows, on the average over the views."""
         return float(
             (np.bincount(self.views[still], minlength=len(SCENE_VIEWS)) / self.whole).mean()

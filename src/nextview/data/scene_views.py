@@ -25,6 +25,7 @@ from nextview.session.episode import Visible, unconstrained
 from nextview.simulation.scene import Scene
 from nextview.simulation.scene_layout import clutter_level
 from nextview.simulation.simulated import TARGET, SceneCamera, visible_shares
+from nextview.types import Float, Float32, Index, Mask
 
 SCENE_SIDE = 80  # of the pictures of the whole scene, pixels
 HALF = 2.0  # they show so many object radii to each side of the target's centre
@@ -33,7 +34,7 @@ SCENE_UNIT = 2e-4  # their depth is stored as uint16 in steps of this many objec
 SHARE_SIZE = 112
 
 
-def scene_intrinsics(distance: float, side: int = SCENE_SIDE) -> NDArray[np.float64]:
+def scene_intrinsics(distance: float, side: int = SCENE_SIDE) -> Float:
     """Return the pinhole matrix of the images of a scene.
 
     Args:
@@ -88,13 +89,13 @@ class SceneViews:
         clearance: (V,), object radii.
     """
 
-    depth: NDArray[np.float32]
+    depth: Float32
     owner: NDArray[np.uint8]
-    intrinsics: NDArray[np.float64]
-    poses: NDArray[np.float64]
-    reachable: NDArray[np.bool_]
-    visible_share: NDArray[np.float32]
-    clearance: NDArray[np.float32]
+    intrinsics: Float
+    poses: Float
+    reachable: Mask
+    visible_share: Float32
+    clearance: Float32
 
     def scene_view(self, view: int) -> SceneView:
         """What a camera sees from there: things and table alike are no target."""
@@ -134,7 +135,7 @@ def scene_views(store: ViewStore, i: int) -> SceneViews:
 Constrain = Callable[[EpisodeState], EpisodeState]
 
 
-def sight_of(scenes: "SceneSight | None", objects: NDArray[np.int64]) -> tuple[Constrain, Visible]:
+def sight_of(scenes: "SceneSight | None", objects: Index) -> tuple[Constrain, Visible]:
     """Return what ``run_episodes`` needs of scenes.
 
     Args:
@@ -182,9 +183,9 @@ class SceneSight:
     """
 
     store: ViewStore
-    rows: NDArray[np.int64]
-    reachable: NDArray[np.bool_]
-    _found: dict[tuple[int, bytes], NDArray[np.float32]] = field(default_factory=dict, repr=False)
+    rows: Index
+    reachable: Mask
+    _found: dict[tuple[int, bytes], Float32] = field(default_factory=dict, repr=False)
     _frames: dict[tuple[int, int], tuple[bytes, float]] = field(default_factory=dict, repr=False)
 
     @classmethod
@@ -208,13 +209,11 @@ class SceneSight:
             raise DatasetError(f"{store.path}: holds no scene {names[int(rows.argmin())]}")
         return cls(store, rows, np.stack([store.read("scene/reachable", i) for i in rows]))
 
-    def of_scenes(self, kept: NDArray[np.int64]) -> "SceneSight":
+    def of_scenes(self, kept: Index) -> "SceneSight":
         """Some of the scenes, by their index; also the same one several times."""
         return replace(self, rows=self.rows[kept], reachable=self.reachable[kept])
 
-    def visibility(
-        self, scenes: NDArray[np.int64], visited: NDArray[np.bool_]
-    ) -> NDArray[np.float64]:
+    def visibility(self, scenes: Index, visited: Mask) -> Float:
         """Return the share of the target that is expected to be visible from each view.
 
         Args:

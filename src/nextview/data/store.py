@@ -26,6 +26,7 @@ from nextview.geometry.depth import POINTS
 from nextview.geometry.mesh import UNITS
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere
+from nextview.types import Float, Float32, Index, Mask
 
 FORMAT = 2
 DEPTH_UNIT = 1e-4  # depth is stored as uint16 in steps of this many object radii
@@ -306,7 +307,7 @@ class ViewStore:
         """
         return self._chunk(self.array(name), i).exists()
 
-    def held(self, name: str) -> NDArray[np.bool_]:
+    def held(self, name: str) -> Mask:
         """Which objects an array holds values of, (N,)."""
         array = self.array(name)
         return np.array([self._chunk(array, i).exists() for i in range(len(self))])
@@ -374,7 +375,7 @@ class ViewStore:
         """Of the objects, unique, N of them."""
         return self.attributes.names
 
-    def rows_of(self, names: Sequence[str]) -> NDArray[np.int64]:
+    def rows_of(self, names: Sequence[str]) -> Index:
         """The rows of objects by name, (n,); -1 for those that it lacks."""
         row = {name: i for i, name in enumerate(self.names)}
         return np.array([row.get(name, -1) for name in names])
@@ -385,7 +386,7 @@ class ViewStore:
         return sorted(set(self.attributes.labels))
 
     @property
-    def labels(self) -> NDArray[np.int64]:
+    def labels(self) -> Index:
         """Class of each object as an index into ``classes``, (N,) int64."""
         return np.unique(self.attributes.labels, return_inverse=True)[1]
 
@@ -412,17 +413,17 @@ class ViewStore:
         return ViewSphere(tuple(a.elevations), a.azimuths, a.distance)
 
     @property
-    def intrinsics(self) -> NDArray[np.float64]:
+    def intrinsics(self) -> Float:
         """Pinhole matrix of all views, (3, 3) float64, pixels."""
         return pinhole(self.attributes.size, self.sphere.distance)
 
     @property
-    def done(self) -> NDArray[np.bool_]:
+    def done(self) -> Mask:
         """Objects that are rendered, (N,)."""
         return self._values(self.array("status"), slice(None), "status") == DONE
 
     @property
-    def radii(self) -> NDArray[np.float64]:
+    def radii(self) -> Float:
         """Of the objects, metres, (N,) float64; NaN where it is not known."""
         unit = self.attributes.unit
         return np.full(len(self), np.nan) if unit is None else self.rows("radius") * UNITS[unit]
@@ -439,11 +440,11 @@ class ViewStore:
         """All views of object i, (V, S, S) uint8."""
         return self.read("image", i)
 
-    def depth(self, i: int) -> NDArray[np.float32]:
+    def depth(self, i: int) -> Float32:
         """Depth of all views of object i, (V, S, S) float32, object radii, 0 = no object."""
         return self.read("depth", i).astype(np.float32) * np.float32(DEPTH_UNIT)
 
-    def points(self, i: int) -> NDArray[np.float32]:
+    def points(self, i: int) -> Float32:
         """Clouds of all views of object i, (V, 1024, 3) float32, object frame."""
         return self.read("points", i).astype(np.float32) * np.float32(POINT_UNIT)
 
@@ -452,7 +453,7 @@ class ViewStore:
         """Names of the view measures it holds, sorted."""
         return sorted(file.parent.name for file in self.path.glob("measures/*/zarr.json"))
 
-    def measure(self, name: str = "depth_entropy") -> NDArray[np.float32]:
+    def measure(self, name: str = "depth_entropy") -> Float32:
         """Return a measure of all views, (N, V) float32.
 
         Values of objects that are not rendered are undefined.

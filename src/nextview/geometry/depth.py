@@ -8,6 +8,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.types import Float, Float32, Floats
+
 # object radii; what is farther is no object: depth cameras have large numbers for "nothing"
 FARTHEST = 50.0
 # brightness of a surface seen edge-on, so that it stays apart from the black background
@@ -15,7 +17,7 @@ AMBIENT = 0.15
 POINTS = 1024  # points in the partial cloud of one view (thesis, section 4.1.2)
 
 
-def object_depth(depth: NDArray[np.floating]) -> NDArray[np.floating]:
+def object_depth(depth: Floats) -> Floats:
     """Return the depth with 0 for NaN, infinity, negative and huge numbers.
 
     If there are none, the array itself is returned.
@@ -25,7 +27,7 @@ def object_depth(depth: NDArray[np.floating]) -> NDArray[np.floating]:
     return np.where((depth > 0) & (depth < FARTHEST), depth, 0)
 
 
-def slope(before: NDArray, here: NDArray, after: NDArray) -> NDArray[np.float32]:
+def slope(before: NDArray, here: NDArray, after: NDArray) -> Float32:
     """Return the change of depth per pixel along one axis of an image.
 
     Of the two one-sided differences the smaller one is taken, which is the one on the same surface.
@@ -44,7 +46,7 @@ def slope(before: NDArray, here: NDArray, after: NDArray) -> NDArray[np.float32]
     return np.where(np.isfinite(slope), slope, 0).astype(np.float32)
 
 
-def headlight(depth: NDArray[np.float32], intrinsics: NDArray[np.float64]) -> NDArray[np.uint8]:
+def headlight(depth: Float32, intrinsics: Float) -> NDArray[np.uint8]:
     """Shade a depth image as if it were lit by a lamp at the camera.
 
     Args:
@@ -82,11 +84,11 @@ def pixel_order(pixels: int, seed: int) -> NDArray[np.int32]:
 
 
 def visible_points(
-    depth: NDArray[np.float32],
-    pose: NDArray[np.float64],
-    intrinsics: NDArray[np.float64],
+    depth: Float32,
+    pose: Float,
+    intrinsics: Float,
     seed: int = 0,
-) -> NDArray[np.float32]:
+) -> Float32:
     """Draw points on the visible surface.
 
     The draw is uniform over the pixels that show the object. It depends on the seed and these

@@ -14,6 +14,7 @@ from nextview.geometry.file_content import foreign_content
 from nextview.geometry.mesh_file import READERS
 from nextview.geometry.mesh_parts import keep_largest_part, mesh_doubts, refuse_lost_shape
 from nextview.geometry.triangles import MAX_FACES, check_faces, no_faces
+from nextview.types import Float, Floats, Index
 
 BYTES_PER_FACE = 60  # how many bytes a mesh file may have for each triangle that it may have
 FORMATS = tuple(READERS)
@@ -52,9 +53,9 @@ class Mesh:
         (80, 3)
     """
 
-    vertices: NDArray[np.float64]
+    vertices: Float
     faces: NDArray[np.int32]
-    centre: NDArray[np.float64]
+    centre: Float
     radius: float
     name: str = "mesh"
     unit: str | None = None
@@ -67,7 +68,7 @@ class Mesh:
 
 
 def make_mesh(
-    vertices: NDArray[np.floating],
+    vertices: Floats,
     faces: NDArray[np.integer],
     name: str = "mesh",
     unit: str | None = None,
@@ -125,7 +126,7 @@ def make_mesh(
     radius = np.sqrt((vertices**2).sum(1).max())
     if reach > np.finfo(float).max / radius:
         raise MeshError(f"{name}: the mesh is too large, its radius is not a finite number")
-    normalised: NDArray[np.float64] = vertices / radius
+    normalised: Float = vertices / radius
     # most often the first few tell
     parts = (faces[first : first + 4096].T for first in range(0, len(faces), 4096))
     areas = (
@@ -136,7 +137,7 @@ def make_mesh(
     return Mesh(normalised, faces.astype(np.int32), centre, float(radius * reach), name, unit)
 
 
-def _first_of_equals(rows: NDArray) -> NDArray[np.int64]:
+def _first_of_equals(rows: NDArray) -> Index:
     """For each of some rows, (N, 3), the index of the first that is equal to it, (N,)."""
     order = np.lexsort(rows.T)  # stable: the first of equals comes first
     first = np.ones(len(rows), bool)

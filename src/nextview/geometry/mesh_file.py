@@ -14,13 +14,13 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.errors import DAMAGED, MeshError
 from nextview.geometry.mesh_text import lines_of_words, numbers, plain_text, whole_numbers
 from nextview.geometry.ply_file import read_ply
 from nextview.geometry.stl_file import read_stl
 from nextview.geometry.triangles import MAX_FACES, check_faces, triangulate
+from nextview.types import Float, Index
 
 # The letters before OFF announce texture coordinates, colours and normals, which follow each
 # vertex's position. Four coordinates a vertex (4OFF), any number of them (nOFF) and binary files
@@ -32,7 +32,7 @@ OFF_HEADER = re.compile(
 )
 # Of vertices, faces and edges, on one line or on three; the last is often missing.
 OFF_COUNTS = re.compile(rb"\s*(\d+)\s+(\d+)(?:\s+\d+(?=[ \t]*(?:\n|$)))?[ \t]*(?=\n|$)")
-Shape = tuple[NDArray[np.float64], NDArray[np.int64]]  # vertices, (V, 3), and triangles, (F, 3)
+Shape = tuple[Float, Index]  # vertices, (V, 3), and triangles, (F, 3)
 GLB_TRIANGLES = 4
 GLB_STRIP = 5
 GLB_FAN = 6
@@ -209,7 +209,7 @@ def read_glb(data: bytes, max_faces: int = MAX_FACES) -> Shape:
     return np.concatenate(vertices), np.concatenate(faces)
 
 
-def _glb_parts(data: bytes) -> list[tuple[NDArray[np.float64], Any]]:
+def _glb_parts(data: bytes) -> list[tuple[Float, Any]]:
     """The meshes of a GLB file, each with the matrix, (4, 4), that puts it in its place."""
     import trimesh
 

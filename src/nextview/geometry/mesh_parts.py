@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import MeshError
+from nextview.types import Float
 
 # odd, of many bits
 HASH_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
@@ -40,13 +41,13 @@ class Parts:
         areas: the surface of each part, (P,) float64.
     """
 
-    vertices: NDArray[np.float64]
+    vertices: Float
     faces: NDArray[np.integer]
     part: NDArray[np.integer]
-    areas: NDArray[np.float64]
+    areas: Float
 
     @classmethod
-    def of(cls, vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> "Parts":
+    def of(cls, vertices: Float, faces: NDArray[np.integer]) -> "Parts":
         """Find the connected parts of a mesh.
 
         Vertices in the same place count as one, as STL files require.
@@ -83,12 +84,12 @@ class Parts:
                 return int(part)
         return int(order[0])
 
-    def points_of(self, part: int) -> NDArray[np.float64]:
+    def points_of(self, part: int) -> Float:
         """The positions of a part, (n, 3)."""
         return self.vertices[np.unique(self.faces[self.part == part])]
 
 
-def _places(vertices: NDArray[np.float64]) -> NDArray[np.intp]:
+def _places(vertices: Float) -> NDArray[np.intp]:
     """A number for each vertex, (V,), the same for those in the same place."""
     bits = np.ascontiguousarray(vertices + 0.0).view(np.uint64)  # of zeros there are two
     mixed = bits ^ (bits >> np.uint64(32))
@@ -96,17 +97,17 @@ def _places(vertices: NDArray[np.float64]) -> NDArray[np.intp]:
     return places
 
 
-def _areas(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> NDArray[np.float64]:
+def _areas(vertices: Float, faces: NDArray[np.integer]) -> Float:
     a, b, c = (vertices[corner] for corner in faces.T)
     return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
 
-def _size(points: NDArray[np.float64]) -> float:
+def _size(points: Float) -> float:
     """Half the diagonal of the bounding box."""
     return float(np.linalg.norm(np.ptp(points, axis=0))) / 2 if len(points) else 0.0
 
 
-def _is_flat(points: NDArray[np.float64]) -> bool:
+def _is_flat(points: Float) -> bool:
     """Whether points lie in a plate that is much wider than thick both ways."""
     centred = points - points.mean(0)
     axes = np.linalg.eigh(centred.T @ centred)[1]
@@ -115,7 +116,7 @@ def _is_flat(points: NDArray[np.float64]) -> bool:
 
 
 def keep_largest_part(
-    vertices: NDArray[np.float64], faces: NDArray[np.int32]
+    vertices: Float, faces: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], tuple[str, ...]]:
     """Leave out what is not connected to the largest part of a mesh.
 
@@ -138,7 +139,7 @@ def keep_largest_part(
     return faces[parts.part == parts.main], (said,)
 
 
-def refuse_lost_shape(vertices: NDArray[np.float64], radius: float, name: str) -> None:
+def refuse_lost_shape(vertices: Float, radius: float, name: str) -> None:
     """Refuse an object far from the origin whose shape single precision has lost.
 
     Args:
@@ -171,7 +172,7 @@ def refuse_lost_shape(vertices: NDArray[np.float64], radius: float, name: str) -
         )
 
 
-def mesh_doubts(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> tuple[str, ...]:
+def mesh_doubts(vertices: Float, faces: NDArray[np.integer]) -> tuple[str, ...]:
     """What is likely to be wrong with the mesh of one object, a sentence each; usually nothing.
 
     Args:
@@ -199,7 +200,7 @@ def mesh_doubts(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> tu
     return tuple(doubts)
 
 
-def _plane_times(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> float:
+def _plane_times(vertices: Float, faces: NDArray[np.integer]) -> float:
     """Return how many times a plane makes a mesh larger than the rest of it.
 
     The plane has to reach beyond the rest on all sides.
@@ -238,9 +239,7 @@ def _plane_times(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> f
     return size / rest if width > rest else 1.0
 
 
-def _main_direction(
-    normals: NDArray[np.float64], areas: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _main_direction(normals: Float, areas: Float) -> Float:
     """The direction, of either sign, that most of a surface faces, (3,)."""
     upper = np.where(normals[:, 2:] < 0, -normals, normals)
     cells = np.round(upper * 4).astype(int) + 4  # directions some 15 degrees apart
@@ -254,9 +253,7 @@ def _main_direction(
     return direction
 
 
-def _mean_direction(
-    normals: NDArray[np.float64], areas: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _mean_direction(normals: Float, areas: Float) -> Float:
     mean = (normals * areas[:, None]).sum(0)
     length = float(np.linalg.norm(mean))
     return mean / length if length > 0 else normals[0]

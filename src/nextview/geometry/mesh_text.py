@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import MeshError
+from nextview.types import Float, Index
 
 MARKS = (  # that editors put before a text, the longer first: UTF-32's begins as UTF-16's
     (codecs.BOM_UTF8, "utf-8"),
@@ -77,7 +78,7 @@ def lines_of_words(text: bytes) -> Iterator[list[bytes]]:
             yield words
 
 
-def numbers(text: bytes) -> NDArray[np.float64]:
+def numbers(text: bytes) -> Float:
     """All the numbers of a text that is made of numbers and white space.
 
     Raises:
@@ -86,7 +87,7 @@ def numbers(text: bytes) -> NDArray[np.float64]:
     return _parsed(text, np.float64)
 
 
-def whole_numbers(text: bytes) -> NDArray[np.int64]:
+def whole_numbers(text: bytes) -> Index:
     """As ``numbers``, of a text of whole numbers."""
     return _parsed(text, np.int64)
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from nextview.checks import number, one_line
 from nextview.errors import ObservationError
 from nextview.geometry.depth import FARTHEST, headlight, object_depth, visible_points
+from nextview.types import Float, Float32, Mask
 
 LEAST_SHARE = 0.006
 """An object is seen if one connected part of it fills this share of the image. In the networks'
@@ -41,10 +42,10 @@ class SceneView:
             sensor may miss what is black or shiny.
     """
 
-    depth: NDArray[np.float32]
-    target: NDArray[np.bool_]
-    pose: NDArray[np.float64]
-    intrinsics: NDArray[np.float64]
+    depth: Float32
+    target: Mask
+    pose: Float
+    intrinsics: Float
     background_free: bool = False
 
     def __post_init__(self) -> None:
@@ -81,9 +82,9 @@ class Observation:
         (64, 64)
     """
 
-    depth: NDArray[np.float32]
-    pose: NDArray[np.float64]
-    intrinsics: NDArray[np.float64]
+    depth: Float32
+    pose: Float
+    intrinsics: Float
     radius: float | None = None
     image: NDArray[np.uint8] | None = None
     scene: SceneView | None = None
@@ -125,7 +126,7 @@ class Observation:
         return enough_shows(self.depth > 0)
 
     @cached_property
-    def points(self) -> NDArray[np.float32]:
+    def points(self) -> Float32:
         """Points on the visible surface, (1024, 3) float32, object frame, object radii.
 
         They are all zero if nothing is visible.
@@ -146,7 +147,7 @@ def _own(values: NDArray[Any]) -> NDArray[Any]:
     return values
 
 
-def enough_shows(mask: NDArray[np.bool_]) -> bool:
+def enough_shows(mask: Mask) -> bool:
     """Return whether enough pixels show the object, (H, W) bool; see LEAST_SHARE."""
     least = max(LEAST_PIXELS, LEAST_SHARE * mask.size)
     n = np.count_nonzero(mask)
@@ -167,11 +168,11 @@ class Camera(Protocol):
         True
     """
 
-    def observe(self, pose: NDArray[np.float64]) -> Observation:
+    def observe(self, pose: Float) -> Observation:
         """Look from a camera-to-world pose, (4, 4), OpenCV axes, object frame, object radii."""
 
 
-def checked_pose(pose: Any) -> NDArray[np.float64]:
+def checked_pose(pose: Any) -> Float:
     """Check a camera-to-world pose, (4, 4) float64, OpenCV axes, object radii.
 
     ObservationError if no camera has it.
@@ -208,7 +209,7 @@ def checked_pose(pose: Any) -> NDArray[np.float64]:
     return pose
 
 
-def checked_intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def checked_intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> Float:
     """Check the pinhole matrix of an image.
 
     Args:
@@ -296,7 +297,7 @@ def depth_image(depth: Any) -> NDArray[Any]:
     return depth
 
 
-def _check_unit(given: NDArray[np.float32], near: int) -> None:
+def _check_unit(given: Float32, near: int) -> None:
     """Refuse depth of which next to nothing is near enough to be an object.
 
     One large number is that for nothing.
@@ -328,7 +329,7 @@ def _image(image: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     return image.astype(np.uint8, copy=False)
 
 
-def pinhole(size: int, distance: float) -> NDArray[np.float64]:
+def pinhole(size: int, distance: float) -> Float:
     """Return the pinhole matrix of a square image that just contains the unit sphere.
 
     Args:

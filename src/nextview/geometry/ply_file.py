@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from nextview.errors import MeshError
 from nextview.geometry.mesh_text import encoding_of, numbers, plain_text
 from nextview.geometry.triangles import MAX_FACES, check_faces, no_faces, triangulate
+from nextview.types import Float, Index
 
 KINDS = {  # the format's names of its numbers, and those that are found in the wild
     "char": "i1",
@@ -54,10 +55,10 @@ BYTES_OF_NUMBER = 8  # of a text, all of which are read as doubles
 STRIP_END = -1  # among the vertices of a strip: here another one begins
 
 # of polygons, one after the other, and how many each has
-Corners = tuple[NDArray[np.int64], NDArray[np.int64]]
+Corners = tuple[Index, Index]
 Scalars = dict[str, NDArray]  # a number of each row, by the name of the property
 # what all the lists of a property hold, and their lengths
-Lists = dict[str, tuple[NDArray, NDArray[np.int64]]]
+Lists = dict[str, tuple[NDArray, Index]]
 
 
 @dataclass(frozen=True)
@@ -95,9 +96,7 @@ class Element:
         return tuple(column for column in self.properties if column.count is not None)
 
 
-def read_ply(
-    data: bytes, max_faces: int = MAX_FACES
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def read_ply(data: bytes, max_faces: int = MAX_FACES) -> tuple[Float, Index]:
     """Read a PLY file.
 
     Args:
@@ -135,7 +134,7 @@ def read_ply(
     return vertices, np.concatenate([faces, strips])
 
 
-def _check_rows(element: Element, there: NDArray[np.int64], wanted: NDArray[np.int64]) -> None:
+def _check_rows(element: Element, there: Index, wanted: Index) -> None:
     """Refuse rows with more or fewer numbers than the header announces."""
     wrong = np.flatnonzero(there != wanted)
     if len(wrong):
@@ -228,7 +227,7 @@ def _bad_line(words: list[str]) -> MeshError:
     return MeshError(f"its header has the line {' '.join(words)!r}, which is none of a PLY file")
 
 
-def _numbers_of_rows(body: bytes, rows: int) -> tuple[bytes, NDArray[np.int64]]:
+def _numbers_of_rows(body: bytes, rows: int) -> tuple[bytes, Index]:
     """Return the numbers of a text file's rows, and the bytes of each row, (rows,).
 
     The numbers are doubles, a line for each row.
@@ -249,9 +248,7 @@ def _numbers_of_rows(body: bytes, rows: int) -> tuple[bytes, NDArray[np.int64]]:
     return found.tobytes(), BYTES_OF_NUMBER * words
 
 
-def _read_element(
-    data: bytes, at: int, element: Element
-) -> tuple[Scalars, Lists, NDArray[np.int64]]:
+def _read_element(data: bytes, at: int, element: Element) -> tuple[Scalars, Lists, Index]:
     """Read the columns of an element, and the bytes of each row.
 
     These are (rows,), or () if all are equal.
@@ -279,7 +276,7 @@ def _read_element(
     return _columns(data, at, element)
 
 
-def _columns(data: bytes, at: int, element: Element) -> tuple[Scalars, Lists, NDArray[np.int64]]:
+def _columns(data: bytes, at: int, element: Element) -> tuple[Scalars, Lists, Index]:
     """As ``_read_element``, of rows with lists of different lengths."""
     found, ends = _walk(data, at, element, element.rows)
     scalars: Scalars = {}
@@ -301,7 +298,7 @@ def _columns(data: bytes, at: int, element: Element) -> tuple[Scalars, Lists, ND
     return scalars, lists, np.diff(ends, prepend=at)
 
 
-def _gathered(data: bytes, places: NDArray[np.int64], kind: np.dtype) -> NDArray:
+def _gathered(data: bytes, places: Index, kind: np.dtype) -> NDArray:
     """The numbers that begin at some bytes, (n,)."""
     held = np.frombuffer(data, np.uint8)
     single_bytes = np.empty((len(places), kind.itemsize), np.uint8)
@@ -313,7 +310,7 @@ def _gathered(data: bytes, places: NDArray[np.int64], kind: np.dtype) -> NDArray
 
 def _table(
     data: bytes, at: int, element: Element, lengths: dict[str, int]
-) -> tuple[Scalars, Lists, NDArray[np.int64]] | None:
+) -> tuple[Scalars, Lists, Index] | None:
     """Read an element whose lists of a column all have one length; None if they do not.
 
     This is ``_read_element`` at full speed.
@@ -347,9 +344,7 @@ def _table(
     return scalars, lists, np.array(width)
 
 
-def _walk(
-    data: bytes, at: int, element: Element, rows: int
-) -> tuple[dict[str, NDArray[np.int64]], NDArray[np.int64]]:
+def _walk(data: bytes, at: int, element: Element, rows: int) -> tuple[dict[str, Index], Index]:
     """Return start and length of each list, (rows, 2) by column, and the end of each row."""
     steps = []
     skipped = 0
@@ -389,7 +384,7 @@ def _walk(
     return {column.name: found[:, which] for which, column in enumerate(element.lists)}, ends
 
 
-def _vertices(columns: Scalars) -> NDArray[np.float64]:
+def _vertices(columns: Scalars) -> Float:
     """Positions, (V, 3)."""
     if not columns:
         return np.zeros((0, 3))
@@ -418,7 +413,7 @@ def _corners(element: str, lists: dict[str, Lists]) -> Corners:
     return corners, sizes
 
 
-def _strips(corners: NDArray[np.int64], sizes: NDArray[np.int64], max_faces: int) -> Corners:
+def _strips(corners: Index, sizes: Index, max_faces: int) -> Corners:
     """Return the triangles of strips, with every second one wound the other way."""
     check_faces(
         int(np.maximum(sizes - 2, 0).sum()) - 3 * int((corners == STRIP_END).sum()), max_faces

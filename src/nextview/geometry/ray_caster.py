@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.types import Floats
+from nextview.types import Float, Float32, Floats, Index
 
 Triangles = tuple[Floats, NDArray[np.int32]]  # vertices, (N, 3), and faces, (F, 3)
 
@@ -28,7 +28,7 @@ class RayCaster:
     def __init__(self, things: Sequence[Triangles]) -> None:
         self._scene = embree_scene(things)
 
-    def cast(self, origins: Floats, rays: Floats) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    def cast(self, origins: Floats, rays: Floats) -> tuple[Float32, Index]:
         """Find where rays first meet a surface.
 
         Args:
@@ -47,7 +47,7 @@ class RayCaster:
         )
 
 
-def pixel_rays(intrinsics: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float32]:
+def pixel_rays(intrinsics: Float, shape: tuple[int, int]) -> Float32:
     """Return the rays through the pixels of a pinhole camera.
 
     Args:

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 from scipy.spatial import QhullError, cKDTree
 
 from nextview.geometry.mesh import Mesh, make_mesh
 from nextview.geometry.viewsphere import Directions
+from nextview.types import Float
 
 LIKELY_POSE = 0.1  # resting poses less likely than this are left out
 MOST_POSES = 4  # and all but so many, the mesh's own among them
@@ -25,7 +25,6 @@ COMPARED_TURNS = np.radians(np.arange(0, 360, 10))[:, None]
 FITTING_ROUNDS = 10
 SAME_SURFACE = 0.04  # root mean square distance from one surface to the other
 
-Vectors = NDArray[np.float64]
 
 _DIRECTIONS = np.concatenate([half := Directions.fibonacci(250).directions, -half])
 _log = logging.getLogger("nextview")
@@ -35,11 +34,11 @@ _log = logging.getLogger("nextview")
 class _Pose:
     """A kind of resting pose: one direction that points up in it, and its share of all throws."""
 
-    up: Vectors
+    up: Float
     share: float = 0.0
 
 
-def resting_poses(mesh: Mesh) -> NDArray[np.float64]:
+def resting_poses(mesh: Mesh) -> Float:
     """Rotate a mesh into each of its likely resting poses.
 
     A dropped object rests on a face of its convex hull, the likelier the larger it looks from the
@@ -63,7 +62,7 @@ def resting_poses(mesh: Mesh) -> NDArray[np.float64]:
     return np.stack([_upright(pose.up) for pose in [own, *likely[: MOST_POSES - 1]]])
 
 
-def _stable_poses(mesh: Mesh) -> tuple[Vectors, Vectors]:
+def _stable_poses(mesh: Mesh) -> tuple[Float, Float]:
     """Return the up directions of all stable poses, (N, 3), and their shares of throws, (N,)."""
     from trimesh import Trimesh
     from trimesh.poses import compute_stable_poses
@@ -90,7 +89,7 @@ def _stable_poses(mesh: Mesh) -> tuple[Vectors, Vectors]:
     return transforms[:, 2, :3], shares
 
 
-def _distinct_poses(mesh: Mesh, ups: Vectors, shares: Vectors) -> list[_Pose]:
+def _distinct_poses(mesh: Mesh, ups: Float, shares: Float) -> list[_Pose]:
     """Kinds of poses that do not look alike: the mesh's own first, then in no particular order."""
     compared = _SelfComparison.of(mesh)
     near = ups @ ups.T > np.cos(SAME_TILT)
@@ -119,7 +118,7 @@ class _SelfComparison:
     """
 
     surface: cKDTree
-    few: Vectors
+    few: Float
 
     @classmethod
     def of(cls, mesh: Mesh) -> "_SelfComparison":
@@ -127,7 +126,7 @@ class _SelfComparison:
         surface = cKDTree(_points_on(mesh, SURFACE_POINTS, rng))
         return cls(surface, _points_on(mesh, COMPARED_POINTS, rng))
 
-    def look_alike(self, first_up: Vectors, second_up: Vectors) -> bool:
+    def look_alike(self, first_up: Float, second_up: Float) -> bool:
         """Return whether a rotation about the vertical maps one resting pose onto the other.
 
         The best of many rotations is refined by iterative closest points (Besl and McKay, PAMI
@@ -163,7 +162,7 @@ class _SelfComparison:
         return bool(fits and turn @ first_up @ second_up > np.cos(SAME_TILT))
 
 
-def _points_on(mesh: Mesh, count: int, rng: Generator) -> Vectors:
+def _points_on(mesh: Mesh, count: int, rng: Generator) -> Float:
     """Points drawn evenly over the surface, (count, 3)."""
     corners = mesh.vertices[mesh.faces]
     sides = corners[:, 1:] - corners[:, :1]
@@ -176,7 +175,7 @@ def _points_on(mesh: Mesh, count: int, rng: Generator) -> Vectors:
     return corners[face, 0] + (along * sides[face]).sum(1)
 
 
-def _best_rotation(points: Vectors, targets: Vectors) -> Vectors:
+def _best_rotation(points: Float, targets: Float) -> Float:
     """Return the rotation, (3, 3), that maps points closest to targets (Kabsch, 1976).
 
     Both are centred, (N, 3).
@@ -186,7 +185,7 @@ def _best_rotation(points: Vectors, targets: Vectors) -> Vectors:
     return (left @ no_mirror @ right).T
 
 
-def _upright(up: Vectors) -> Vectors:
+def _upright(up: Float) -> Float:
     """The shortest rotation that takes a direction to +z, (3, 3)."""
     from scipy.spatial.transform import Rotation
 
@@ -197,7 +196,7 @@ def _upright(up: Vectors) -> Vectors:
     return Rotation.from_rotvec(axis / length * np.arctan2(length, up[2])).as_matrix()
 
 
-def rotated(mesh: Mesh, rotation: NDArray[np.float64]) -> Mesh:
+def rotated(mesh: Mesh, rotation: Float) -> Mesh:
     """Turn a mesh about its centre, and bring it into the object frame anew.
 
     Args:

@@ -8,11 +8,11 @@ missing.
 import re
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.errors import MeshError
 from nextview.geometry.mesh_text import encoding_of, numbers, plain_text
 from nextview.geometry.triangles import MAX_FACES, check_faces, triangulate
+from nextview.types import Float, Index
 
 HEADER_BYTES = 84
 # 50 bytes
@@ -22,9 +22,7 @@ SOLID_LINE = re.compile(rb"^[ \t]*(end[ \t]*)?solid\b[^\n]*", re.MULTILINE | re.
 LOOP_WORDS = re.compile(rb"\bvertex\s++(\S++\s++\S++\s++\S++)|\bendloop\b", re.IGNORECASE)
 
 
-def read_stl(
-    data: bytes, max_faces: int = MAX_FACES
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def read_stl(data: bytes, max_faces: int = MAX_FACES) -> tuple[Float, Index]:
     """Read an STL file.
 
     Args:
@@ -68,7 +66,7 @@ def _begins_as_text(data: bytes) -> bool:
     return head.lstrip()[:5].lower() == "solid" and "\0" not in head
 
 
-def _read_text(text: bytes, max_faces: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _read_text(text: bytes, max_faces: int) -> tuple[Float, Index]:
     """A text file of one solid or of several; a loop of more than three vertices is a polygon."""
     ends = [bool(match[1]) for match in SOLID_LINE.finditer(text)]
     if 2 * sum(ends) != len(ends):

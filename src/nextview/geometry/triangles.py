@@ -1,9 +1,9 @@
 """Cut the polygons of a mesh into triangles, concave and non-planar ones too."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.errors import MeshError
+from nextview.types import Float, Index, Mask
 
 MAX_FACES = 10_000_000  # triangles that a mesh may have if nothing else is asked for
 # of polygons that are tested together: the numbers stay in the processor's cache
@@ -48,11 +48,11 @@ def no_faces(n_points: int, with_normals: bool = False) -> str:
 
 
 def triangulate(
-    vertices: NDArray[np.float64],
-    corners: NDArray[np.int64],
-    sizes: NDArray[np.int64],
+    vertices: Float,
+    corners: Index,
+    sizes: Index,
     max_faces: int = MAX_FACES,
-) -> NDArray[np.int64]:
+) -> Index:
     """Cut polygons into triangles, in the order of the polygons.
 
     A polygon becomes a fan from its first corner where the fan covers it exactly, as it does every
@@ -121,14 +121,14 @@ def triangulate(
     return faces[kept]
 
 
-def _polygons_by_size(sizes: NDArray[np.int64]) -> list[tuple[int, NDArray[np.int64]]]:
+def _polygons_by_size(sizes: Index) -> list[tuple[int, Index]]:
     """Yield the polygons of each number of corners, three or more, and their indices.
 
     Very many polygons are split into several groups.
     """
     order = np.argsort(sizes, kind="stable")
     bounds = np.flatnonzero(np.diff(sizes[order])) + 1
-    groups: list[tuple[int, NDArray[np.int64]]] = []
+    groups: list[tuple[int, Index]] = []
     for same in np.split(order, bounds):
         size = int(sizes[same[0]])
         if size < 3:
@@ -138,7 +138,7 @@ def _polygons_by_size(sizes: NDArray[np.int64]) -> list[tuple[int, NDArray[np.in
     return groups
 
 
-def _fan_is_right(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _fan_is_right(points: Float) -> Mask:
     """Whether the fan from the first corner covers each of some polygons, (N, K, 3), exactly, (N,).
 
     It does if no triangle of the fan lies the other way than the polygon. A polygon whose triangles
@@ -152,11 +152,11 @@ def _fan_is_right(points: NDArray[np.float64]) -> NDArray[np.bool_]:
         along = np.einsum("nki,ni->nk", crosses, normals)
         all_squares = crosses.shape[1] * (crosses**2).sum((1, 2))
         has_way = (squares > ROUNDING * all_squares) | (all_squares == 0)
-        right: NDArray[np.bool_] = has_way & (along >= -ROUNDING * squares[:, None]).all(1)
+        right: Mask = has_way & (along >= -ROUNDING * squares[:, None]).all(1)
     return right
 
 
-def _clip_ears(points: NDArray[np.float64]) -> NDArray[np.int64] | None:
+def _clip_ears(points: Float) -> Index | None:
     """Cut a polygon, (K, 3), into triangles, (T, 3) corner indices; None without area."""
     from mapbox_earcut import triangulate_float64
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nextview.checks import number, whole
 from nextview.errors import ModelError, RiskError, UsageError
-from nextview.types import Float, Floats
+from nextview.types import Float, Float32, Floats, Index, Mask
 
 
 def fuse(logits: Floats, temperature: float = 1.0) -> Float:
@@ -92,7 +92,7 @@ def log_evidence_of(logits: Floats, azimuth_bins: Floats | None, azimuth: Floats
     return np.concatenate([logits, pointing.reshape(*logits.shape[:-1], -1)], -1)
 
 
-def of_true_class(logs: Float, labels: NDArray[np.int64]) -> Float:
+def of_true_class(logs: Float, labels: Index) -> Float:
     """Return the log-belief in the true class.
 
     Args:
@@ -403,7 +403,7 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
         """Radius of the largest objects of any class, but for rare ones, metres."""
         return float(np.exp(self._usual[1].max()))
 
-    def impossible(self, radius: float, much: float = MUCH) -> NDArray[np.bool_]:
+    def impossible(self, radius: float, much: float = MUCH) -> Mask:
         """Return the classes of which an object of this radius is far too small or too large.
 
         Args:
@@ -416,7 +416,7 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
         low, high = self._usual
         return (np.log(radius) < low - np.log(much)) | (np.log(radius) > high + np.log(much))
 
-    def logits(self, radii: Floats) -> NDArray[np.float32]:
+    def logits(self, radii: Floats) -> Float32:
         """Return what is added to the logits, (B, C) float32; zero for NaN radii.
 
         The radii are in metres, (B,).
@@ -494,7 +494,7 @@ class Stopping:
             return cls(calibration.threshold(risk, max_views), max_views)
         return cls(threshold, max_views, calibration.threshold_decay)
 
-    def reached(self, belief: Floats, n_views: NDArray | int) -> NDArray[np.bool_]:
+    def reached(self, belief: Floats, n_views: NDArray | int) -> Mask:
         """Return whether beliefs are high enough to stop.
 
         Args:
@@ -506,7 +506,7 @@ class Stopping:
         """
         return belief.max(-1) >= self.threshold_at(n_views)
 
-    def reached_along(self, beliefs: Floats, n_views: NDArray) -> NDArray[np.bool_]:
+    def reached_along(self, beliefs: Floats, n_views: NDArray) -> Mask:
         """Return at which steps of episodes to stop.
 
         A rule that compares the belief with earlier ones overrides this instead of ``reached``. A

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.geometry.observation import Observation
 from nextview.recognition.novelty import ViewScore
+from nextview.types import Floats, Mask
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class Evidence:
         (1, 10)
     """
 
-    logits: NDArray[np.floating]
-    maps: dict[str, NDArray[np.floating]] = field(default_factory=dict)
-    azimuth_bins: NDArray[np.floating] | None = None
-    seen: NDArray[np.bool_] | None = None
+    logits: Floats
+    maps: dict[str, Floats] = field(default_factory=dict)
+    azimuth_bins: Floats | None = None
+    seen: Mask | None = None
     novelty: Sequence[ViewScore] | None = None
     observations: Sequence[Observation] | None = None
 

@@ -20,6 +20,7 @@ from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import Novelty, Quantiles, ViewScore, novelty_path, read_novelty
 from nextview.recognition.protocol import Recogniser
 from nextview.recognition.runtime import RUNTIME_FAILURES, ort
+from nextview.types import Float, Float32, Floats
 
 INPUT = "input"
 BINS_OUTPUT = "sides"
@@ -239,9 +240,7 @@ class NetworkRecogniser:
         radii = np.array([np.nan if o.radius is None else o.radius for o in observations])
         return replace(evidence, logits=evidence.logits + self.card.size.logits(radii))
 
-    def from_inputs(
-        self, inputs: NDArray[Any], elevations: NDArray[np.floating] | None = None
-    ) -> Evidence:
+    def from_inputs(self, inputs: NDArray[Any], elevations: Floats | None = None) -> Evidence:
         """Return the evidence by shape alone from prepared inputs.
 
         Args:
@@ -262,7 +261,7 @@ class NetworkRecogniser:
         )
         return Evidence(outputs["logits"], azimuth_bins=outputs.get(BINS_OUTPUT))
 
-    def novelty_scores(self, observations: Sequence[Observation]) -> NDArray[np.float64]:
+    def novelty_scores(self, observations: Sequence[Observation]) -> Float:
         """Return the novelty scores of B views, (B,).
 
         ModelError if no score was fitted.
@@ -299,7 +298,7 @@ class Features:
         ends = {end.name: end for end in self._session.get_outputs()}
         return int(ends[EMBEDDING_OUTPUT].shape[1])
 
-    def __call__(self, inputs: NDArray[Any]) -> NDArray[np.float32]:
+    def __call__(self, inputs: NDArray[Any]) -> Float32:
         """Embeddings, (B, F) float32, from what the network takes, see ``network_input``."""
         return run_onnx(self.card.path, self._session, [EMBEDDING_OUTPUT], inputs)[0]
 
@@ -321,11 +320,11 @@ class MapNetwork:
         rings = next(end.shape[1] for end in self._session.get_outputs() if end.name == "map")
         self.rings: int | None = rings if isinstance(rings, int) else None
 
-    def __call__(self, observations: Sequence[Observation]) -> dict[str, NDArray[np.float32]]:
+    def __call__(self, observations: Sequence[Observation]) -> dict[str, Float32]:
         """Maps of views from one camera, by name: see ``Evidence.maps``."""
         return self.from_inputs(from_observations(self.card.input, observations))
 
-    def from_inputs(self, inputs: NDArray[Any]) -> dict[str, NDArray[np.float32]]:
+    def from_inputs(self, inputs: NDArray[Any]) -> dict[str, Float32]:
         """The same from what the network takes, see ``network_input``."""
         ends = ["map", "sphere"][: len(self.card.maps)]
         return dict(

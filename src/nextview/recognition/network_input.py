@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from nextview.errors import ModelError, ObservationError
 from nextview.geometry.depth import object_depth, slope
 from nextview.geometry.observation import Observation
-from nextview.types import Float
+from nextview.types import Float, Float32, Index
 
 InputKind = Literal["geometry", "image", "cloud"]
 CHANNELS = ("facing", "up", "height", "nearness")
@@ -76,7 +76,7 @@ def from_observations(spec: InputSpec, observations: Sequence[Observation]) -> N
 
 
 def from_store(
-    spec: InputSpec, store: Any, i: int, chosen: NDArray[np.int64] | slice = slice(None)
+    spec: InputSpec, store: Any, i: int, chosen: Index | slice = slice(None)
 ) -> NDArray[Any]:
     """Compute the input of a network from the stored views of an object.
 
@@ -110,7 +110,7 @@ def _network_input(
     return np.concatenate(one)
 
 
-def cloud_input(points: NDArray[np.float32], poses: Float) -> NDArray[np.float32]:
+def cloud_input(points: Float32, poses: Float) -> Float32:
     """Turn point clouds to the camera's azimuth and scale each to [0, 1].
 
     In this frame the cells of the predicted map, all rings and azimuth -1, 0, +1, have the same
@@ -158,9 +158,7 @@ def image_input(images: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
     return np.rint(squares.mean((2, 4), dtype=np.float32)).astype(np.uint8)[:, None]
 
 
-def geometry_input(
-    depth: NDArray[np.float32], poses: Float, intrinsics: Float, size: int
-) -> NDArray[np.uint8]:
+def geometry_input(depth: Float32, poses: Float, intrinsics: Float, size: int) -> NDArray[np.uint8]:
     """Convert depth images to four channels in the frame of gravity and of the viewing ray.
 
     The channels do not depend on texture or lighting. "facing": cosine between the surface normal

@@ -20,7 +20,7 @@ from nextview.checks import check_array
 from nextview.errors import ModelError
 from nextview.files import arrays_in, checked_bytes, new_file
 from nextview.geometry.observation import Observation, SceneView
-from nextview.types import Floats
+from nextview.types import Float, Float32, Floats, Index, Mask
 
 ARRAYS = ("quantiles", "objects", "neighbours", "standard")  # in the file of a novelty score
 NEIGHBOUR = 10  # the distance to this one of the nearest known views counts
@@ -49,7 +49,7 @@ class Quantiles:
     """
 
     quantiles: Floats
-    objects: NDArray[np.int64]
+    objects: Index
     joint: bool = field(default=False, kw_only=True)
     usual: Floats | None = field(default=None, kw_only=True)
 
@@ -67,9 +67,7 @@ class Quantiles:
         if self.usual is not None:
             check_array("its usual", self.usual, np.floating, (None, None))
 
-    def p_value(
-        self, score: Floats | float, n_views: NDArray[np.int64] | int
-    ) -> NDArray[np.float64]:
+    def p_value(self, score: Floats | float, n_views: Index | int) -> Float:
         """Return the share of known objects that are at least as novel.
 
         This is a conformal p-value (Vovk et al., 2005): an object of a known class falls below p in
@@ -150,9 +148,7 @@ class Novelty(Quantiles):
         if (self.standard[:, 1] <= 0).any():
             raise ModelError("its standard deviations are not above zero")
 
-    def scores(
-        self, embeddings: Floats, exact: NDArray[np.bool_] | bool = False
-    ) -> NDArray[np.float64]:
+    def scores(self, embeddings: Floats, exact: Mask | bool = False) -> Float:
         """Return the novelty score of each view.
 
         Args:
@@ -260,7 +256,7 @@ def _in_eight_bits(rows: Floats) -> NDArray[np.int8]:
     return np.rint(rows / largest * np.iinfo(np.int8).max).astype(np.int8)
 
 
-def as_stored(rows: Floats) -> NDArray[np.float32]:
+def as_stored(rows: Floats) -> Float32:
     """Unit vectors, (R, F), as they are read after they were saved."""
     return unit(_in_eight_bits(rows).astype(np.float32))
 

@@ -18,6 +18,7 @@ from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.novelty import Quantiles
 from nextview.recognition.poses import check_candidate
 from nextview.recognition.protocol import JointBelief, Recogniser
+from nextview.types import Floats
 
 LEAST_BELIEF = 1e-12  # in a class, where the logarithm of a belief is taken
 SUM_ERROR = 1e-3  # by how much the sum of a belief may be off
@@ -105,7 +106,7 @@ class OwnJointRecogniser(OwnRecogniser):
         return Evidence(logits, seen=np.array([seen.seen for seen in observations]))
 
     def together(
-        self, observations: Sequence[Observation], total: NDArray[np.floating], counted: int
+        self, observations: Sequence[Observation], total: Floats, counted: int
     ) -> JointBelief:
         """What all views say together.
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from nextview.checks import one_line, plugin, plugin_errors
 from nextview.errors import UsageError
 from nextview.recognition.belief import Stopping
-from nextview.types import Floats
+from nextview.types import Float, Floats, Mask
 
 
 @dataclass(frozen=True)
@@ -34,17 +34,17 @@ class Believed:
             return self.earlier[views - 1]
         return np.full(self.belief.shape, np.nan)
 
-    def change(self, views: int = 1) -> NDArray[np.float64]:
+    def change(self, views: int = 1) -> Float:
         """Largest change of the belief in a class over the last views, (...); NaN if unknown."""
         return np.asarray(np.abs(self.belief - self.before(views)).max(-1), np.float64)
 
     @property
-    def highest(self) -> NDArray[np.float64]:
+    def highest(self) -> Float:
         """The belief in the class believed most, (...)."""
         return np.asarray(self.belief.max(-1), np.float64)
 
     @property
-    def margin(self) -> NDArray[np.float64]:
+    def margin(self) -> Float:
         """By how much it leads, (...)."""
         if self.belief.shape[-1] == 1:
             return self.highest
@@ -52,14 +52,14 @@ class Believed:
         return np.asarray(top[..., -1] - top[..., -2], np.float64)
 
     @property
-    def entropy(self) -> NDArray[np.float64]:
+    def entropy(self) -> Float:
         """Of the belief, bits, (...)."""
         return -np.asarray(
             (self.belief * np.log2(np.maximum(self.belief, 1e-300))).sum(-1), np.float64
         )
 
 
-Rule = Callable[[Believed, float], NDArray[np.bool_]]  # whether to stop, (...), by a threshold
+Rule = Callable[[Believed, float], Mask]  # whether to stop, (...), by a threshold
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class OwnStopping(Stopping):
     rule: Rule | None = None
     name: str = "a rule of your own"
 
-    def reached(self, belief: Floats, n_views: NDArray | int) -> NDArray[np.bool_]:
+    def reached(self, belief: Floats, n_views: NDArray | int) -> Mask:
         """Return what the rule decides.
 
         Args:
@@ -94,7 +94,7 @@ class OwnStopping(Stopping):
         """
         return self._said(Believed(belief, n_views))
 
-    def reached_along(self, beliefs: Floats, n_views: NDArray) -> NDArray[np.bool_]:
+    def reached_along(self, beliefs: Floats, n_views: NDArray) -> Mask:
         """Return what the rule decides at each step, with the beliefs before it.
 
         Args:
@@ -114,7 +114,7 @@ class OwnStopping(Stopping):
             earlier.append(shifted)
         return self._said(Believed(beliefs, n_views, tuple(earlier)))
 
-    def _said(self, believed: Believed) -> NDArray[np.bool_]:
+    def _said(self, believed: Believed) -> Mask:
         """What the rule decides, checked."""
         assert self.rule is not None
         belief = believed.belief
@@ -125,7 +125,7 @@ class OwnStopping(Stopping):
             raise UsageError(f"the stopping rule {self.name} has to return {wanted}")
         return said
 
-    def threshold_at(self, n_views: NDArray | int) -> NDArray[np.float64]:
+    def threshold_at(self, n_views: NDArray | int) -> Float:
         """Infinity, same shape: what the rule makes of its threshold is not known."""
         return np.full(np.shape(n_views), np.inf)
 

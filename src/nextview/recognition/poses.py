@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import ModelError
-from nextview.types import Float
+from nextview.types import Float, Float32
 
 ALIKE_TURN = 5.0  # degrees between poses that are taken for one
 ALIKE_SHIFT = 0.005  # metres between the centres of poses that are taken for one
@@ -55,7 +55,7 @@ class PoseCandidate:
     degrees: float = 0.0
     millimetres: float = 0.0
     centre: Float = field(default_factory=lambda: np.zeros(3))
-    vertices: NDArray[np.float32] | None = None
+    vertices: Float32 | None = None
     faces: NDArray[np.int32] | None = None
     symmetry: tuple[Any, ...] | None = None
     displacements: Float = field(default_factory=lambda: np.zeros((0, 3)))

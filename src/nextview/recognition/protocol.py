@@ -6,15 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
-from numpy.typing import NDArray
-
 from nextview.geometry.observation import Observation
 from nextview.recognition.belief import Calibration
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.novelty import Quantiles
 from nextview.recognition.poses import PoseCandidate
-from nextview.types import Float
+from nextview.types import Float, Floats
 
 
 @runtime_checkable
@@ -84,7 +81,7 @@ class JudgesTogether(Protocol):
     """
 
     def together(
-        self, observations: Sequence[Observation], total: NDArray[np.floating], counted: int
+        self, observations: Sequence[Observation], total: Floats, counted: int
     ) -> JointBelief:
         """What is believed of an object.
 

@@ -18,10 +18,7 @@ from scipy import ndimage
 from nextview.sensing.facets import ROWS, Noise, estimate_noise
 from nextview.sensing.frame import Frame
 from nextview.sensing.segmentation import find_plane, sample
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from nextview.types import Float, Float32, Index, Mask
 
 POINT_GRID = 160  # columns of the grid from which surface points are drawn
 SURFACE_POINTS = 200  # points of each frame that are looked up in the others
@@ -286,7 +283,7 @@ def _surface_points(frame: Frame) -> Float:
     return frame.positions_in_camera(first + side * rows, first + side * columns)
 
 
-def _is_smooth(grid: NDArray[np.float32]) -> Mask:
+def _is_smooth(grid: Float32) -> Mask:
     """Where the depth, (h, w), varies little from one grid point to all around it."""
     measured = np.where(grid > 0, grid, np.float32(np.inf))
     nearest = ndimage.minimum_filter(measured, 3, mode="nearest")
@@ -310,7 +307,7 @@ def _blockwise(image: NDArray, side: int, choose: np.ufunc) -> NDArray:
     return found
 
 
-def _in_the_middle(grid: NDArray[np.float32]) -> Mask:
+def _in_the_middle(grid: Float32) -> Mask:
     """Return the middle of a picture, (h, w), without what lies far behind it."""
     height, width = grid.shape
     middle = grid[height // 3 : height - height // 3, width // 3 : width - width // 3]

@@ -13,16 +13,14 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.linalg import block_diag
 from scipy.spatial import ConvexHull, QhullError
 
 from nextview.sensing.convex_pieces import Pieces
 from nextview.sensing.frame import Frame
+from nextview.types import Float, Index, Mask
 
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Joins = Literal["by their border", "never", "always"]  # whether things that touch are one thing
 
 CELL = 0.01  # side of a cell of the footprint, in distances of the camera from the object
@@ -73,11 +71,11 @@ class Footprint:
         pixels: number of pixels that show it, (K,).
     """
 
-    cells: NDArray[np.int64]
-    piece: NDArray[np.int64]
+    cells: Index
+    piece: Index
     pieces: Pieces
     area: Float
-    pixels: NDArray[np.int64]
+    pixels: Index
 
     @cached_property
     def outlines(self) -> dict[int, Float]:
@@ -146,7 +144,7 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Fl
 
 def clusters(
     footprints: Sequence[Footprint], joins: Joins = "by their border"
-) -> tuple[list[NDArray[np.int64]], Mask]:
+) -> tuple[list[Index], Mask]:
     """Which pieces of some frames are of one object.
 
     Pieces of one frame are joined where they overlap seen from above; and where they touch, unless
@@ -198,9 +196,7 @@ def clusters(
     return np.split(np.where(near, cluster[node] + 1, 0), np.cumsum(sizes)[:-1]), two
 
 
-def _cells_over(
-    cells: NDArray[np.int64], node: NDArray[np.int64], nodes: int
-) -> tuple[Float, Float]:
+def _cells_over(cells: Index, node: Index, nodes: int) -> tuple[Float, Float]:
     """Which cells are over each node, and which lie up to BESIDE from it, (nodes, cells) each.
 
     Only cells over which anything lies are listed.
@@ -299,9 +295,7 @@ def _links(
     )
 
 
-def _joined(
-    strength: Float, apart: Mask, size: Float
-) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
+def _joined(strength: Float, apart: Mask, size: Float) -> tuple[Index, list[tuple[int, int]]]:
     """Cluster N pieces of given sizes, (N,), by their links, strong ones first.
 
     A strength, (N, N), of 0 is no link.
@@ -341,7 +335,7 @@ def on_ground(points: Float, plane: Float) -> Mask:
     return np.asarray((points @ sides[:, :2].T + sides[:, 2] <= 0).all(1))
 
 
-def central(foot: Footprint, labels: NDArray[np.int64], plane: Float, optical_axis: Float) -> int:
+def central(foot: Footprint, labels: Index, plane: Float, optical_axis: Float) -> int:
     """The cluster on the plane at which the camera is aimed; 0 if there is none.
 
     It is the one with most pixels, each of which counts the less the farther the cluster lies from
@@ -380,9 +374,7 @@ def central(foot: Footprint, labels: NDArray[np.int64], plane: Float, optical_ax
     return int(weight.argmax()) if weight.max() > 0 else 0
 
 
-def nearest(
-    footprints: Sequence[Footprint], labels: Sequence[NDArray[np.int64]], point: Float
-) -> int:
+def nearest(footprints: Sequence[Footprint], labels: Sequence[Index], point: Float) -> int:
     """Return the cluster that is nearest to a point in most frames, seen from above.
 
     The result is 0 if there is none.

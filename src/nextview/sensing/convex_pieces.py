@@ -16,9 +16,7 @@ from scipy import ndimage
 
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import holes_of, within
-
-Mask = NDArray[np.bool_]
-Inverse = NDArray[np.float32]
+from nextview.types import Float32, Index, Mask
 
 WIDTH = 320  # columns in which edges are searched: a wider image is taken in steps
 LAG = 4  # pixels from an edge at which the surfaces to both sides of it are looked at
@@ -76,9 +74,9 @@ class Pieces:
 
 
 def cut(
-    depth: NDArray[np.float32],
+    depth: Float32,
     above: Mask,
-    height: NDArray[np.float32],
+    height: Float32,
     noise: Noise,
     before_walls: Mask | None = None,
 ) -> Pieces:
@@ -136,9 +134,7 @@ def cut(
     return Pieces(label, grown, stands, touch, at_plane, _enclosed(around), hangs)
 
 
-def _grown(
-    label: NDArray[np.int64], mask: Mask, inverse: Inverse, tolerance: Inverse
-) -> NDArray[np.int64]:
+def _grown(label: Index, mask: Mask, inverse: Float32, tolerance: Float32) -> Index:
     """Assign the pixels of edges to the adjacent piece with the most similar depth."""
     wide = np.pad(label, 1)
     deep = np.pad(inverse, 1).ravel()
@@ -165,7 +161,7 @@ def _enlarged(small: NDArray[Any], step: int, shape: tuple[int, ...]) -> NDArray
     return np.repeat(np.repeat(small, step, 0), step, 1)[: shape[0], : shape[1]]
 
 
-def _bottoms(depth: NDArray[np.float32], mask: Mask, height: NDArray[np.float32]) -> Mask:
+def _bottoms(depth: Float32, mask: Mask, height: Float32) -> Mask:
     """Return holes of the mask that lie over the plane, (H, W) bool, such as a bowl's bottom."""
     holes = holes_of(mask) & (depth > 0)
     label, count = ndimage.label(holes)
@@ -175,7 +171,7 @@ def _bottoms(depth: NDArray[np.float32], mask: Mask, height: NDArray[np.float32]
     return np.append(False, np.asarray(middle) > BOTTOM)[label]
 
 
-def _smooth(depth: NDArray[np.float32], mask: Mask) -> Inverse:
+def _smooth(depth: Float32, mask: Mask) -> Float32:
     """Return the mean inverse depth of 3 x 3 pixels of the mask, (H, W), 1/metres, else NaN."""
     weight = ndimage.uniform_filter(mask.astype(np.float32), 3, mode="constant")
     inverse = np.where(mask, 1 / np.where(mask, depth, 1), 0).astype(np.float32)
@@ -183,7 +179,7 @@ def _smooth(depth: NDArray[np.float32], mask: Mask) -> Inverse:
     return np.where(mask, total / np.maximum(weight, np.float32(1e-6)), np.float32(np.nan))
 
 
-def _concave(inverse: Inverse, tolerance: Inverse) -> Mask:
+def _concave(inverse: Float32, tolerance: Float32) -> Mask:
     """Return the pixels in concave edges, (H, W) bool.
 
     Inverse depth is linear over the image of a plane; ``tolerance`` is of its unit, (H, W). Where
@@ -204,7 +200,7 @@ def _concave(inverse: Inverse, tolerance: Inverse) -> Mask:
     return found
 
 
-def _touching(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse) -> Mask:
+def _touching(label: Index, inverse: Float32, tolerance: Float32) -> Mask:
     """Return which pieces meet in space, (pieces + 1, pieces + 1) bool."""
     # Its own pixels do not tell: where one thing hides another one, a sensor gives a slope between
     # them.
@@ -240,7 +236,7 @@ def _touching(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse) ->
     return touch
 
 
-def _enclosed(label: NDArray[np.int64]) -> Mask:
+def _enclosed(label: Index) -> Mask:
     """Which pieces have most of their border to which other one, (pieces + 1, pieces + 1) bool."""
     label = np.pad(label, 1)  # a piece has a border where the part of the picture ends, too
     count = _borders(label, [np.ones(label[a].shape, bool) for a, _ in NEXT])
@@ -249,7 +245,7 @@ def _enclosed(label: NDArray[np.int64]) -> Mask:
     return inside
 
 
-def _hanging(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse, stands: Mask) -> Mask:
+def _hanging(label: Index, inverse: Float32, tolerance: Float32, stands: Mask) -> Mask:
     """Which pieces are held by which other one, (pieces + 1, pieces + 1) bool.
 
     Nothing hangs in the air. Where the lower edge of a piece is in sight, and not on the plane, it
@@ -281,7 +277,7 @@ def _hanging(label: NDArray[np.int64], inverse: Inverse, tolerance: Inverse, sta
     return hangs
 
 
-def _borders(label: NDArray[np.int64], counted: list[Mask]) -> NDArray[np.int64]:
+def _borders(label: Index, counted: list[Mask]) -> Index:
     """Count the pairs of adjacent pixels that pieces share, (pieces + 1, pieces + 1)."""
     n = int(label.max()) + 1
     count = np.zeros((n, n), np.int64)

@@ -15,16 +15,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from nextview.sensing.facets import Facets
+from nextview.types import Float, Index, Mask
 
 if TYPE_CHECKING:
     from nextview.sensing.sighting import Sighting
 
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 CAMERA_PLACE = 0.003  # metres, standard deviation of a camera's place
 CAMERA_AIM = 0.006  # radians, standard deviation of the direction in which it looks
@@ -151,7 +149,7 @@ class _Surface:
     deviations: Float
     rays: cKDTree
     pitch: float
-    sample: NDArray[np.int64]
+    sample: Index
 
     @classmethod
     def of(cls, sighting: Sighting) -> _Surface:

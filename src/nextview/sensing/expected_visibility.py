@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from nextview.checks import number, whole
 from nextview.geometry.depth import FARTHEST
 from nextview.geometry.observation import SceneView
+from nextview.types import Float, Float32, Floats, Index, Mask
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-Floating = NDArray[np.floating]
-Float32 = NDArray[np.float32]
 # of a voxel; of several frames the largest counts
 UNSEEN, FREE, OCCLUDER, OBJECT = np.arange(4, dtype=np.uint8)
 
@@ -45,24 +44,24 @@ class VoxelGrid:
         return 2 * self.half / self.n
 
     @cached_property
-    def axes(self) -> NDArray[np.float32]:
+    def axes(self) -> Float32:
         """Where the middles of the voxels lie along x, y and z, (3, n)."""
         steps = (np.arange(self.n) + 0.5) * self.pitch - self.half
         return (np.array(self.centre)[:, None] + steps).astype(np.float32)
 
     @cached_property
-    def middles(self) -> NDArray[np.float32]:
+    def middles(self) -> Float32:
         """Centres of the voxels in the order of ``cells.ravel()``, (3, n^3)."""
         return np.stack(np.meshgrid(*self.axes, indexing="ij")).reshape(3, -1)
 
-    def within(self, radius: float) -> NDArray[np.bool_]:
+    def within(self, radius: float) -> Mask:
         """Voxels whose middle is no farther than this from that of the cube, (n, n, n) bool."""
         x, y, z = (
             (axis - middle) ** 2 for axis, middle in zip(self.axes, self.centre, strict=True)
         )
         return x[:, None, None] + y[:, None] + z <= radius**2
 
-    def cell_of(self, points: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def cell_of(self, points: Floats) -> tuple[Index, Mask]:
         """Return the index of the voxel of each point, (P, 3), and whether there is one."""
         at = np.floor((points - np.array(self.centre) + self.half) / self.pitch).astype(np.int64)
         inside = ((at >= 0) & (at < self.n)).all(1)
@@ -86,7 +85,7 @@ class Occupancy:
     cells: NDArray[np.uint8]
 
     @classmethod
-    def unseen(cls, grid: VoxelGrid, region: NDArray[np.bool_] | None = None) -> "Occupancy":
+    def unseen(cls, grid: VoxelGrid, region: Mask | None = None) -> "Occupancy":
         """Return the occupancy before the first frame.
 
         Args:
@@ -103,10 +102,10 @@ class Occupancy:
 
     def seen(
         self,
-        depth: Floating,
-        pose: Floating,
-        intrinsics: Floating,
-        object_mask: NDArray[np.bool_] | None = None,
+        depth: Floats,
+        pose: Floats,
+        intrinsics: Floats,
+        object_mask: Mask | None = None,
         background_free: bool = True,
     ) -> "Occupancy":
         """Return the occupancy after one more depth frame.
@@ -153,9 +152,7 @@ class Occupancy:
         return Occupancy(self.grid, np.maximum(self.cells, other.cells))
 
 
-def _in_front(
-    points: Float32, reach: Float32, pose: Floating, intrinsics: Floating
-) -> NDArray[np.bool_]:
+def _in_front(points: Float32, reach: Float32, pose: Floats, intrinsics: Floats) -> Mask:
     """Which points, (3, P), fall on a pixel and are nearer than its reach, (H, W)."""
     height, width = reach.shape
     to_image = (intrinsics @ pose[:3, :3].T).astype(np.float32)
@@ -247,14 +244,14 @@ class Visibility:
         most: all of it free.
     """
 
-    least: NDArray[np.float64]
-    expected: NDArray[np.float64]
-    most: NDArray[np.float64]
+    least: Float
+    expected: Float
+    most: Float
 
 
 def expected_visibility(
     seen: SeenScene,
-    positions: NDArray[np.floating],
+    positions: Floats,
     density: float = DENSITY,
     unseen_part: float = UNSEEN_PART,
 ) -> Visibility:
@@ -301,21 +298,21 @@ class SightLines:
     """
 
     grid: VoxelGrid
-    positions: NDArray[np.float64]
+    positions: Float
 
     @cached_property
-    def own(self) -> NDArray[np.bool_]:
+    def own(self) -> Mask:
         """Voxels where the object can be, (n, n, n)."""
         return self.grid.within(1.0)
 
     @cached_property
-    def blocks(self) -> NDArray[np.int64]:
+    def blocks(self) -> Index:
         """The block of each of these (Q,), as an index of all blocks."""
         m = self.grid.n // BLOCK
         return np.ravel_multi_index(tuple(np.stack(self.own.nonzero()) // BLOCK), (m, m, m))
 
     @cached_property
-    def parts(self) -> NDArray[np.int64]:
+    def parts(self) -> Index:
         """The blocks that the object can have a part in, (P,)."""
         return np.unique(self.blocks)
 
@@ -348,7 +345,7 @@ class SightLines:
         )
 
     @cached_property
-    def asked(self) -> NDArray[np.bool_]:
+    def asked(self) -> Mask:
         """The voxels that the answer depends on, (n, n, n)."""
         found = self.own.copy()
         found.reshape(-1)[self.passed.indices] = True

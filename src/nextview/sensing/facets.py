@@ -16,10 +16,8 @@ from scipy import ndimage
 
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import DISTANCE
+from nextview.types import Float, Float32, Floats, Index, Mask
 
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Index = NDArray[np.int64]
 CLOSE_ENOUGH = 1.5  # standard deviations of noise that a window may deviate from its plane
 STEEPEST_ERROR = 0.1  # error of the slope (tangent) that noise may leave: six degrees of the normal
 FINEST = 2e-4  # relative noise of depth that even the best frame is taken to have
@@ -48,16 +46,16 @@ class Noise:
         grain: distance within which pixels err together, pixels.
     """
 
-    depths: NDArray[np.float64]
-    sigmas: NDArray[np.float64]
+    depths: Float
+    sigmas: Float
     grain: int = 1
 
-    def at(self, depth: NDArray[np.floating] | float) -> NDArray[np.float64]:
+    def at(self, depth: Floats | float) -> Float:
         """Standard deviation of inverse depth at some depths, same shape, 1/metres."""
         return np.asarray(np.interp(depth, self.depths, self.sigmas))
 
 
-def estimate_noise(depth: NDArray[np.float32], usable: NDArray[np.bool_]) -> Noise:
+def estimate_noise(depth: Float32, usable: Mask) -> Noise:
     """Measure the noise of a depth image.
 
     On a plane the second difference of inverse depth along a row is pure noise, with the variance 6
@@ -95,7 +93,7 @@ def estimate_noise(depth: NDArray[np.float32], usable: NDArray[np.bool_]) -> Noi
     return Noise(depths, np.array([_sigma(second[part]) for part in parts]), grain)
 
 
-def _sigma(second: NDArray[np.floating]) -> float:
+def _sigma(second: Floats) -> float:
     """Standard deviation of the noise from the sizes of second differences."""
     middle = (len(second) - 1) // 2, len(second) // 2
     median = np.partition(second, middle)[list(middle)].mean()  # there is no NaN to look for
@@ -132,7 +130,7 @@ class Facets:
         )
 
 
-def drop_flying(depth: NDArray[np.float32], usable: Mask, noise: float, pitch: float) -> Mask:
+def drop_flying(depth: Float32, usable: Mask, noise: float, pitch: float) -> Mask:
     """Return the usable pixels without flying pixels.
 
     Pixels stay if at least three of their eight neighbours are on their surface: as close in depth
@@ -151,7 +149,7 @@ def drop_flying(depth: NDArray[np.float32], usable: Mask, noise: float, pitch: f
     return usable & (count_beside(depth, tolerance) >= 3)
 
 
-def count_beside(picture: NDArray[np.float32], limit: NDArray[np.floating]) -> NDArray[np.uint8]:
+def count_beside(picture: Float32, limit: Floats) -> NDArray[np.uint8]:
     """Count the neighbours of each pixel that differ from it by less than its limit.
 
     Args:
@@ -173,7 +171,7 @@ def count_beside(picture: NDArray[np.float32], limit: NDArray[np.floating]) -> N
 
 
 def fit_facets(
-    depth: NDArray[np.float32],
+    depth: Float32,
     mask: Mask,
     intrinsics: Float,
     corner: tuple[int, int] = (0, 0),
@@ -251,9 +249,7 @@ def fit_facets(
     return facets if good.all() else facets.some(np.flatnonzero(good))
 
 
-def _typical_noise(
-    depth: NDArray[np.float32], usable: Mask, frame_noise: Noise | None
-) -> tuple[float, int]:
+def _typical_noise(depth: Float32, usable: Mask, frame_noise: Noise | None) -> tuple[float, int]:
     """Return the noise at the object's median depth, and its grain."""
     few = slice(None, None, max(1, len(depth) // ROWS))
     typical = float(np.median(depth[usable]))
@@ -414,9 +410,7 @@ def virtual_pose(pose: Float) -> Float:
     return virtual
 
 
-def look_again(
-    facets: Facets, pose: Float, radius: float, size: int
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+def look_again(facets: Facets, pose: Float, radius: float, size: int) -> tuple[Float32, Index]:
     """Render facets from the virtual pose.
 
     Each facet is drawn where the virtual camera sees it. A pixel shows the nearest surface, at the

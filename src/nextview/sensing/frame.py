@@ -11,6 +11,7 @@ from nextview.checks import one_line
 from nextview.errors import ObservationError
 from nextview.geometry.observation import LARGEST, array_of, numbers
 from nextview.sensing.holes import fill_regular_gaps, filled_mask
+from nextview.types import Float, Float32, Floats, Index, Mask
 
 Part = tuple[slice, slice]  # rows and columns of a picture
 WHOLE = slice(None), slice(None)
@@ -55,10 +56,10 @@ class Frame:
             OpenGL and for nextview's own ``Observation``.
     """
 
-    depth: NDArray[np.float32]
-    intrinsics: NDArray[np.float64]
-    pose: NDArray[np.float64] | None = None
-    mask: NDArray[np.bool_] | None = None
+    depth: Float32
+    intrinsics: Float
+    pose: Float | None = None
+    mask: Mask | None = None
     image: NDArray[np.uint8] | None = None
     counted: bool = field(init=False, default=False)
     axes: InitVar[str] = "opencv"
@@ -113,7 +114,7 @@ class Frame:
         """Height and width, pixels."""
         return self.depth.shape[0], self.depth.shape[1]
 
-    def shifted(self, shift: NDArray[np.float64]) -> "Frame":
+    def shifted(self, shift: Float) -> "Frame":
         """The same frame from a place that is shifted in the world, (3,), metres; it has a pose."""
         pose = self.camera_to_world.copy()
         pose[:3, 3] += shift
@@ -121,19 +122,19 @@ class Frame:
         object.__setattr__(moved, "pose", pose)
         return moved
 
-    def with_depth(self, depth: NDArray[np.float32]) -> "Frame":
+    def with_depth(self, depth: Float32) -> "Frame":
         """The same frame with another depth image, (H, W) float32, metres."""
         other = copy(self)  # what was checked is right
         object.__setattr__(other, "depth", depth)
         return other
 
     @property
-    def camera_to_world(self) -> NDArray[np.float64]:
+    def camera_to_world(self) -> Float:
         """The pose, or the identity if there is none."""
         return np.eye(4) if self.pose is None else self.pose
 
     @property
-    def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def rays(self) -> tuple[Float32, Float32]:
         """x and y of the rays (x, y, 1) through the columns (W,) and the rows (H,), float32."""
         k = self.intrinsics
         height, width = self.shape
@@ -141,7 +142,7 @@ class Frame:
         y = (np.arange(height) + 0.5 - k[1, 2]) / k[1, 1]
         return x.astype(np.float32), y.astype(np.float32)
 
-    def positions(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
+    def positions(self, rows: Index, columns: Index) -> Float:
         """Return the positions that pixels show in the world.
 
         Args:
@@ -154,9 +155,7 @@ class Frame:
         pose = self.camera_to_world
         return self.positions_in_camera(rows, columns) @ pose[:3, :3].T + pose[:3, 3]
 
-    def positions_in_camera(
-        self, rows: NDArray[np.int64], columns: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
+    def positions_in_camera(self, rows: Index, columns: Index) -> Float:
         """Return the positions that pixels show in the camera frame.
 
         Args:
@@ -170,9 +169,7 @@ class Frame:
         z = self.depth[rows, columns].astype(np.float64)
         return np.stack([x[columns], y[rows], np.ones(len(z))], 1) * z[:, None]
 
-    def along(
-        self, direction: NDArray[np.float64], offset: float = 0.0, part: Part = WHOLE
-    ) -> NDArray[np.float32]:
+    def along(self, direction: Float, offset: float = 0.0, part: Part = WHOLE) -> Float32:
         """Return ``direction @ position + offset`` of what every pixel shows.
 
         Args:
@@ -205,7 +202,7 @@ def within(shown: NDArray[np.float32 | np.bool_], margin: int = 0) -> Part:
     return spans(np.array(low) - margin, np.array(high) + margin * bool(high[0]), shown.shape)
 
 
-def holes_of(shown: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def holes_of(shown: Mask) -> Mask:
     """The pixels that a mask, (H, W), surrounds and does not hold, (H, W) bool."""
     beside, _ = ndimage.label(np.pad(~shown, 1, constant_values=True))
     around = beside[0, 0]
@@ -213,7 +210,7 @@ def holes_of(shown: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray((beside > 0) & (beside != around))
 
 
-def spans(low: NDArray[np.floating], high: NDArray[np.floating], shape: tuple[int, ...]) -> Part:
+def spans(low: Floats, high: Floats, shape: tuple[int, ...]) -> Part:
     """Return the rows and columns of a rectangle, clipped to the picture.
 
     Args:
@@ -228,7 +225,7 @@ def spans(low: NDArray[np.floating], high: NDArray[np.floating], shape: tuple[in
     return slice(first[0], last[0]), slice(first[1], last[1])
 
 
-def _metres(depth: NDArray) -> NDArray[np.float32]:
+def _metres(depth: NDArray) -> Float32:
     if depth.ndim != 2 or min(depth.shape) < 2:
         raise ObservationError(f"a depth image is (H, W), not {depth.shape}")
     if depth.dtype == np.uint16:
@@ -258,7 +255,7 @@ def _metres(depth: NDArray) -> NDArray[np.float32]:
     return metres
 
 
-def _matrix(values: ArrayLike, what: str, shape: tuple[int, int]) -> NDArray[np.float64]:
+def _matrix(values: ArrayLike, what: str, shape: tuple[int, int]) -> Float:
     matrix = numbers(values, what).astype(np.float64)
     if matrix.shape != shape or not (np.abs(matrix) < LARGEST).all():
         given = (
@@ -270,7 +267,7 @@ def _matrix(values: ArrayLike, what: str, shape: tuple[int, int]) -> NDArray[np.
     return matrix
 
 
-def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> Float:
     k = _matrix(intrinsics, "the matrix of intrinsics", (3, 3))
     if not np.array_equal(k[2], [0, 0, 1]) or k[1, 0] != 0 or abs(k[0, 1]) > 1e-3 * abs(k[0, 0]):
         raise ObservationError(
@@ -304,7 +301,7 @@ def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> NDArray[
     return k
 
 
-def check_pose(pose: ArrayLike) -> NDArray[np.float64]:
+def check_pose(pose: ArrayLike) -> Float:
     """Copy a rigid pose, (4, 4); ObservationError names the likely mistake."""
     pose = _matrix(pose, "the pose", (4, 4))
     if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):

@@ -5,10 +5,8 @@ are: what a sensor could not measure says something.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-Depth = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from nextview.types import Float32, Index, Mask
 
 LONGEST_PERIOD = 8  # pixels after which gaps come again, at most
 FEWEST_GAPS = 0.01  # so many gaps begin in a row or a column for each measured pixel, at least
@@ -18,7 +16,7 @@ ONE_SURFACE = 0.015  # part by which inverse depth may change from pixel to pixe
 PASSES = 2  # first between two measured pixels, then between rows or columns that were filled
 
 
-def fill_regular_gaps(depth: Depth) -> tuple[Depth, NDArray[np.int64] | None]:
+def fill_regular_gaps(depth: Float32) -> tuple[Float32, Index | None]:
     """Fill gaps that come again every few pixels; an image without any is given back as it is.
 
     Between two pixels of one surface inverse depth is interpolated. Between two surfaces the gap
@@ -46,7 +44,7 @@ def fill_regular_gaps(depth: Depth) -> tuple[Depth, NDArray[np.int64] | None]:
     return np.where(measured, depth, filled), source
 
 
-def filled_mask(mask: Mask, source: NDArray[np.int64]) -> Mask:
+def filled_mask(mask: Mask, source: Index) -> Mask:
     """Fill the gaps of a mask where the image had the same gaps.
 
     Args:
@@ -72,7 +70,7 @@ def _period(measured: Mask) -> int:
     return lags[best] if regular else 0
 
 
-def _fill_once(inverse: Depth, source: NDArray[np.int64], widest: int) -> None:
+def _fill_once(inverse: Float32, source: Index, widest: int) -> None:
     """Fill holes in rows and columns in place, at most ``widest`` pixels wide."""
     best_span = np.full(inverse.size, np.iinfo(np.int32).max, np.int32)
     best_value = inverse.ravel().copy()
@@ -101,7 +99,7 @@ def _fill_once(inverse: Depth, source: NDArray[np.int64], widest: int) -> None:
     source[:] = best_source.reshape(inverse.shape)
 
 
-def _gaps(inverse: Depth, widest: int, along_rows: bool) -> tuple[NDArray[np.int64], ...]:
+def _gaps(inverse: Float32, widest: int, along_rows: bool) -> tuple[Index, ...]:
     """Holes with a measured pixel before and after them in their row, or their column.
 
     Returns:

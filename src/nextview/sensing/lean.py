@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.sensing.segmentation import Plane
-
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 DEPTH_LEAN = np.radians(2.0)
 """By how much errors of a depth camera lean a plane, standard deviation, always the same way as

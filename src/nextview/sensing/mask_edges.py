@@ -1,11 +1,11 @@
 """Remove pixels at the edge of a mask that belong to the background."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion, label, minimum_filter, uniform_filter
 
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import holes_of, within
+from nextview.types import Float32, Mask
 
 EDGE = 6  # a segmenter's edge may be off by so many pixels
 # neighbouring pixels of one surface differ by at most this part of their depth, and THICK
@@ -13,10 +13,9 @@ STEP = 0.01
 THICK = 0.004  # metres
 NOISE_STEP = 2.5  # standard deviations by which a pixel may differ from the mean of its neighbours
 AROUND = 5  # pixels across the square of these
-Mask = NDArray[np.bool_]
 
 
-def trimmed(depth: NDArray[np.float32], mask: Mask, noise: Noise, high: Mask | None = None) -> Mask:
+def trimmed(depth: Float32, mask: Mask, noise: Noise, high: Mask | None = None) -> Mask:
     """The pixels of a mask that hang together with its inside without a step in depth, (H, W) bool.
 
     Up to EDGE pixels at the edge of a mask may show the background, or hang in the air before it.

@@ -5,13 +5,12 @@ from itertools import chain, combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from nextview.checks import number, points
 from nextview.errors import ObservationError, UsageError
 from nextview.geometry.observation import LARGEST
-
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 
 @dataclass(frozen=True)

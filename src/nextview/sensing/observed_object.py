@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull, QhullError
 
 from nextview.checks import one_line
@@ -22,7 +22,6 @@ from nextview.sensing.convex_pieces import STANDS, cut
 from nextview.sensing.displacement import Displacement, displacement
 from nextview.sensing.facets import (
     ROWS,
-    Index,
     Noise,
     estimate_noise,
     fit_facets,
@@ -38,9 +37,8 @@ from nextview.sensing.plausibility import ViewWarning, check_frame, check_observ
 from nextview.sensing.segmentation import Plane, Samples, find_plane, sample
 from nextview.sensing.sighting import Sighting
 from nextview.sensing.walls import before_walls, find_walls
+from nextview.types import Float, Index, Mask
 
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 # earlier and new, the side of a cell, whether it may be two things
 Found = tuple[list["Sighting"], float, bool]
 

@@ -8,14 +8,10 @@ away from all others. Neighbours in space are looked for among the neighbours in
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.sensing.facets import Facets, Noise, count_beside
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from nextview.types import Float, Index, Mask
 
 WINDOW = 2  # pixels to each side among which the neighbours of a point are looked for
 FEWEST_NEIGHBOURS = 5  # of 24: at the tip of a thing that is two pixels thin there are as many

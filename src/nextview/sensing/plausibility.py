@@ -3,15 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.errors import ObservationError
 from nextview.geometry.observation import Observation
 from nextview.sensing.displacement import Displacement
 from nextview.sensing.frame import AXES, Frame
 from nextview.sensing.lean import Lean
+from nextview.types import Float, Index
 
-Float = NDArray[np.float64]
 SAMPLE = 500  # pixels that are looked at
 FEWEST = 20  # pixels with a depth below which nothing is seen
 # how far from the origin a surface may be, object radii: centre and radius are estimates
@@ -404,7 +403,7 @@ def check_observation(observation: Observation) -> list[ViewWarning]:
     return [] if _plausible(points, pose) else [ViewWarning(*_diagnose(points, pose))]
 
 
-def _surface(observation: Observation, seen: NDArray[np.int64]) -> Float:
+def _surface(observation: Observation, seen: Index) -> Float:
     """Some of the surface that pixels, by index, show, (N, 3), camera frame."""
     rows, columns = np.divmod(seen[:: max(1, len(seen) // SAMPLE)], observation.depth.shape[1])
     k = observation.intrinsics

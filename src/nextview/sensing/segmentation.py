@@ -5,15 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import AXES, WHOLE, Frame, Part
 from nextview.sensing.object_frame import Box
+from nextview.types import Float, Floats, Index, Mask
 
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 # planes that are tried: with one point in ten on the plane, 0.8 of all draws hit it at least once
 TRIALS = 200
 # cosine of the lean of a support plane, at most: errors of a calibration
@@ -54,11 +52,11 @@ class Samples:
 
     points: Float
     tolerance: Float
-    rows: NDArray[np.int64]
-    columns: NDArray[np.int64]
+    rows: Index
+    columns: Index
     camera: Float
 
-    def some(self, which: NDArray[np.bool_]) -> "Samples":
+    def some(self, which: Mask) -> "Samples":
         """Those of a choice, (N,) bool."""
         return Samples(
             self.points[which],
@@ -69,7 +67,7 @@ class Samples:
         )
 
 
-def sample(frame: Frame, pixels: NDArray[np.bool_], noise: Noise) -> Samples:
+def sample(frame: Frame, pixels: Mask, noise: Noise) -> Samples:
     """Return the means over blocks of pixels.
 
     The mean inverse depth of pixels of a plane is that at the mean of their places in the picture,
@@ -110,14 +108,14 @@ def sample(frame: Frame, pixels: NDArray[np.bool_], noise: Noise) -> Samples:
     return Samples(points, 3 * noise.at(z) * z**2 / alone + 0.003 * z, rows, columns, pose[:3, 3])
 
 
-def _block_sums(values: NDArray[np.floating], side: int) -> Float:
+def _block_sums(values: Floats, side: int) -> Float:
     """Return sums over squares of pixels; incomplete squares are left out."""
     height, width = (n // side for n in values.shape)
     of_rows = _sums_along(values[: height * side], side)
     return np.asarray(_sums_along(of_rows[:, : width * side].T, side).T, np.float64)
 
 
-def _sums_along(values: NDArray[np.floating], side: int) -> NDArray[np.floating]:
+def _sums_along(values: Floats, side: int) -> Floats:
     """Sums of each ``side`` rows that follow each other: faster than a reduction over an axis."""
     sums = values[::side].copy()
     for first in range(1, side):
@@ -144,7 +142,7 @@ class Plane:
         """Of points (..., 3) above the plane, metres."""
         return points @ self.normal + self.offset
 
-    def holds(self, samples: Samples) -> NDArray[np.bool_]:
+    def holds(self, samples: Samples) -> Mask:
         """Which samples are on it, (N,) bool."""
         return np.abs(self.height(samples.points)) < samples.tolerance
 
@@ -344,7 +342,7 @@ def lies_better_as_range(
     return held > RANGE * share
 
 
-def _share_held(samples: Samples, on: NDArray[np.bool_], normal: Float) -> float:
+def _share_held(samples: Samples, on: Mask, normal: Float) -> float:
     """Share of the samples on the plane that fits some of them, (N,) bool, best."""
     middle = np.median(samples.points[on] @ normal)
     plane = refine_plane(Plane(normal, -float(middle)), samples, loose=2)

@@ -5,15 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.sensing.clusters import Footprint
 from nextview.sensing.facets import Facets, Noise
 from nextview.sensing.frame import Frame
 from nextview.sensing.segmentation import Plane
-
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from nextview.types import Float, Mask
 
 
 @dataclass(frozen=True)

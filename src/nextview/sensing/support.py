@@ -11,16 +11,12 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 from nextview.sensing.segmentation import Plane, Samples, refine_plane, steep
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from nextview.types import Float, Index, Mask
 
 LEAST_SHARE = 0.03  # share of all samples on a further level plane, at least
 MOST_PLANES = 5

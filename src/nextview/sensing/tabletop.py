@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.sensing import clusters, segmentation, support
@@ -19,9 +18,7 @@ from nextview.sensing.object_frame import Box, upright_axes
 from nextview.sensing.observed_object import FEWEST, ObservedObject, noise_of
 from nextview.sensing.segmentation import Plane, Samples, sample
 from nextview.sensing.walls import before_walls, find_walls
-
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from nextview.types import Float, Float32, Index, Mask
 
 LOWEST_TOP = 0.008  # metres above the plane that a thing reaches, at least: else it is a stain
 LOWEST_SHARE = 0.012  # the same as a part of its distance, where the depth is less exact
@@ -57,7 +54,7 @@ class TableTop:
     up: Float
     above: Mask
     free: Mask | None
-    height: NDArray[np.float32]
+    height: Float32
     open: Mask | None = None
 
     @classmethod
@@ -217,7 +214,7 @@ class TableTop:
         return bool(len(apart)) and float(np.median(apart)) < step
 
 
-def _unevenness(frame: Frame, height: NDArray[np.float32]) -> float:
+def _unevenness(frame: Frame, height: Float32) -> float:
     """How far the plane's own pixels deviate from it, metres: noise that they have in common."""
     few = (slice(None, None, 4), slice(None, None, 4))
     seen = height[few][(frame.depth[few] > 0) & (np.abs(height[few]) < NEAR_PLANE)]
@@ -232,9 +229,7 @@ def _near(samples: Samples, known: Sequence[tuple[Float, float]]) -> Mask:
     return near
 
 
-def _clusters_of_pieces(
-    piece: NDArray[np.int64], labels: NDArray[np.int64], pieces: Pieces
-) -> NDArray[np.int64]:
+def _clusters_of_pieces(piece: Index, labels: Index, pieces: Pieces) -> Index:
     """The cluster of each piece, (pieces + 1,), 0 for none."""
     found = np.zeros(len(pieces.stands), np.int64)
     found[piece] = labels

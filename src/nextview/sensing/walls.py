@@ -12,15 +12,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
 from nextview.sensing.segmentation import Plane, Samples, steep
-
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from nextview.types import Float, Index, Mask
 
 LINE_TRIALS = 150  # lines that are tried for each wall
 MOST_LINES = 6  # upright planes that are looked at, the largest first
@@ -153,7 +150,7 @@ def before_walls(frame: Frame, walls: Sequence[Plane], noise: Noise) -> Mask:
 
 
 def _largest_upright_plane(
-    samples: Samples, chosen: NDArray[np.int64], up: Float, rng: Generator
+    samples: Samples, chosen: Index, up: Float, rng: Generator
 ) -> Plane | None:
     """The upright plane through most of the chosen samples.
 
@@ -196,7 +193,7 @@ def _refined(points: Float, tolerance: Float, normal: Float, on: Mask, up: Float
 def _is_wall(
     samples: Samples,
     upright: Plane,
-    on: NDArray[np.int64],
+    on: Index,
     up: Float,
     walls: Sequence[Plane],
     place: Float | None,

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.checks import plugin_errors
 from nextview.errors import PolicyError, SessionError, UsageError
@@ -19,8 +18,8 @@ from nextview.policies.off_grid import OffGrid
 from nextview.recognition.belief import PLAIN_SUM, Calibration, Stopping, log_evidence_of
 from nextview.recognition.protocol import JointBelief
 from nextview.sensing.expected_visibility import SeenScene, expected_visibility
+from nextview.types import Float, Floats, Index, Mask
 
-Float = NDArray[np.float64]
 # views within this angle of where a camera stood count as visited: it saw what they show
 VISITED = np.radians(6.0)
 
@@ -45,13 +44,13 @@ class Step:
             is seen; () where views are judged one by one.
     """
 
-    episodes: NDArray[np.int64]
-    views: NDArray[np.int64]
+    episodes: Index
+    views: Index
     evidence: Evidence
     belief: Float
-    enough: NDArray[np.bool_]
-    stopped: NDArray[np.bool_]
-    next_views: NDArray[np.int64]
+    enough: Mask
+    stopped: Mask
+    next_views: Index
     total: Float
     seen: Float
     state: EpisodeState | None = None
@@ -72,13 +71,13 @@ class Outcome:
         views: in order, (B, max views), -1 after the end.
     """
 
-    answer: NDArray[np.int64]
+    answer: Index
     confidence: Float
-    n_views: NDArray[np.int64]
-    confident: NDArray[np.bool_]
+    n_views: Index
+    confident: Mask
     travel: Float
     arc: Float
-    views: NDArray[np.int64]
+    views: Index
 
 
 @dataclass(frozen=True)
@@ -94,8 +93,8 @@ class Taken:
     """
 
     step: Step
-    counts: NDArray[np.bool_]
-    visited: NDArray[np.bool_]
+    counts: Mask
+    visited: Mask
     azimuth: Float
     places: Float | None
 
@@ -124,7 +123,7 @@ class Episodes:
         self,
         sphere: Viewpoints,
         policy: Policy,  # chooses where to go
-        starts: NDArray[np.int64],  # first view of each episode, (B,)
+        starts: Index,  # first view of each episode, (B,)
         # when an episode ends; a sphere with fewer views than ``max_views`` ends it too
         stopping: Stopping,
         rng: np.random.Generator,  # for policies that draw
@@ -264,7 +263,7 @@ class Episodes:
         self.steps[-1] = step
         self._go(step)
 
-    def _reached(self, step: Step) -> NDArray[np.bool_]:
+    def _reached(self, step: Step) -> Mask:
         """Whether the stopping rule ends the episodes of a step, (A,)."""
         if type(self.stopping).reached_along is Stopping.reached_along:
             return self.stopping.reached(step.belief, np.maximum(step.seen, 1))
@@ -283,7 +282,7 @@ class Episodes:
         self.current[step.episodes[moved]] = step.next_views[moved]
         self.running = step.episodes[~step.stopped]
 
-    def _state(self, taken: Taken, going: NDArray[np.bool_]) -> EpisodeState:
+    def _state(self, taken: Taken, going: Mask) -> EpisodeState:
         """What the policy may see of the episodes that go on."""
         step = taken.step
         needs = self.policy.needs
@@ -322,7 +321,7 @@ class Episodes:
             else state
         )
 
-    def outlooks(self, step: Step, some: NDArray[np.bool_]) -> list[Any]:
+    def outlooks(self, step: Step, some: Mask) -> list[Any]:
         """Return what can be foreseen after a step in some of its episodes.
 
         Args:
@@ -394,9 +393,7 @@ class Episodes:
             step = self._judged(step, seen, joint or (None,) * len(now))
         return Taken(step, seen, visited, azimuth, places)
 
-    def _judged(
-        self, step: Step, seen: NDArray[np.bool_], known: tuple[JointBelief | None, ...]
-    ) -> Step:
+    def _judged(self, step: Step, seen: Mask, known: tuple[JointBelief | None, ...]) -> Step:
         """The step with what all views so far say together, and the belief that follows.
 
         ``seen`` says in which episodes anything is seen in this view, (A,), and ``known`` what is
@@ -449,7 +446,7 @@ class Episodes:
         return seen
 
     def _observations(
-        self, last: Step, episodes: NDArray[np.int64], counted: bool = False
+        self, last: Step, episodes: Index, counted: bool = False
     ) -> list[list[Observation]]:
         """Return all views of some episodes, the last step included.
 
@@ -474,9 +471,7 @@ class Episodes:
                     found[int(episode)].append(view)
         return list(found.values())
 
-    def _move(
-        self, state: EpisodeState, constrain: Constrain
-    ) -> tuple[EpisodeState, NDArray[np.int64]]:
+    def _move(self, state: EpisodeState, constrain: Constrain) -> tuple[EpisodeState, Index]:
         """What the policy is shown, and where it goes, -1 where no view is free."""
         state = constrain(replace(state, reachable=None, travel=self._travel(state)))
         chosen = np.full(len(state.current), -1)
@@ -498,7 +493,7 @@ class Episodes:
         cells = self.sphere.travel_between(here[:, None], self.sphere.directions[None])
         return np.where(there[:, None], self.sphere.travel[state.current], cells)
 
-    def _choose(self, state: EpisodeState) -> NDArray[np.int64]:
+    def _choose(self, state: EpisodeState) -> Index:
         """What the policy chooses, checked.
 
         If a view is out of reach it is asked again, as if it had been there.
@@ -522,7 +517,7 @@ class Episodes:
             raise PolicyError(f"policy {name} chose view {view}, which {why}", where)
         return chosen
 
-    def _ask(self, state: EpisodeState) -> NDArray[np.int64]:
+    def _ask(self, state: EpisodeState) -> Index:
         """What the policy answers: views of the sphere, whichever."""
         name = self._name
         with plugin_errors(
@@ -586,13 +581,13 @@ class Episodes:
         return Outcome(answer, confidence, n_views, confident, travel, arc, views)
 
 
-def _without_unseen(evidence: Evidence) -> tuple[Evidence, NDArray[np.bool_]]:
+def _without_unseen(evidence: Evidence) -> tuple[Evidence, Mask]:
     """The evidence with zeros where nothing was seen, and where anything was, (B,) bool."""
     seen = evidence.seen
     if seen is None or seen.all():
         return evidence, np.ones(len(evidence.logits), bool)
 
-    def kept(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    def kept(values: Floats) -> Floats:
         return np.where(seen.reshape(-1, *[1] * (values.ndim - 1)), values, 0)
 
     maps = {name: kept(values) for name, values in evidence.maps.items()}
@@ -602,10 +597,10 @@ def _without_unseen(evidence: Evidence) -> tuple[Evidence, NDArray[np.bool_]]:
 
 
 def run_episodes(
-    observe: Callable[[NDArray[np.int64], NDArray[np.int64]], Evidence],
+    observe: Callable[[Index, Index], Evidence],
     sphere: Viewpoints,
     policy: Policy,
-    starts: NDArray[np.int64],
+    starts: Index,
     stopping: Stopping,
     rng: np.random.Generator,
     calibration: Calibration = PLAIN_SUM,

@@ -13,7 +13,6 @@ from matplotlib.colors import LinearSegmentedColormap, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Wedge
 from matplotlib.patheffects import withStroke
-from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from nextview.errors import UsageError
@@ -24,6 +23,7 @@ from nextview.recognition.belief import Stopping
 from nextview.session.soft_light import SoftLight
 from nextview.session.style import ACCENT, BLUE, FAINT, GREY, INK, PAPER, STYLE, PlainFigure
 from nextview.session.view import View
+from nextview.types import Float, Floats, Index, Mask
 
 # inches: of a column, between two, and of the large picture at most
 WIDE = 2.2
@@ -78,7 +78,7 @@ def draw_episode(
     stopping: Stopping,
     heading: str,
     posed: Triangles | None = None,
-    displaced: NDArray[np.float64] | None = None,
+    displaced: Float | None = None,
 ) -> Figure:
     """Draw a column for each view, and beside them the object and the path.
 
@@ -149,7 +149,7 @@ def draw_episode(
     return figure
 
 
-def _best_side(path: NDArray[np.float64]) -> float:
+def _best_side(path: Float) -> float:
     """Return the azimuth, radians, from which the path is seen best."""
     found = []
     for azimuth in np.radians(np.arange(20, 380, 45)):
@@ -198,9 +198,7 @@ def _draw_image(axis: Axes, view: View, step: int, light: SoftLight) -> None:
     axis.text(0.04, 0.03, "\n".join(said), va="bottom", color=ACCENT, **inside)
 
 
-def _draw_outline(
-    axis: Axes, view: View, caster: RayCaster, displacement: NDArray[np.float64]
-) -> None:
+def _draw_outline(axis: Axes, view: View, caster: RayCaster, displacement: Float) -> None:
     """The outline of a surface, displaced, as a view sees it, over the image of that view."""
     seen = view.observation
     height, width = axis.get_images()[0].get_size()
@@ -217,7 +215,7 @@ def _draw_outline(
         drawn.set_path_effects([withStroke(linewidth=2.8, foreground=PAPER)])
 
 
-def without_specks(silhouette: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def without_specks(silhouette: Mask) -> Mask:
     """A silhouette, (H, W), without its tiny parts, and with its tiny holes filled."""
     least = SPECK_SHARE * silhouette.sum()
     cleaned = silhouette.copy()
@@ -230,7 +228,7 @@ def without_specks(silhouette: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _draw_belief(
-    axis: Axes, view: View, threshold: float, classes: Sequence[str], shown: NDArray[np.int64]
+    axis: Axes, view: View, threshold: float, classes: Sequence[str], shown: Index
 ) -> None:
     """Bars of the classes shown, with a mark where belief is enough."""
     best = int(view.belief.argmax())
@@ -319,9 +317,7 @@ def _draw_values(axis: Axes, views: Sequence[View], sphere: Viewpoints, seen_fro
         )
 
 
-def _draw_cells(
-    axis: Axes, sphere: ViewSphere, angles: NDArray[np.floating], colours: NDArray[np.floating]
-) -> float:
+def _draw_cells(axis: Axes, sphere: ViewSphere, angles: Floats, colours: Floats) -> float:
     """Draw a coloured cell around each view of a grid.
 
     It returns how far out the cells reach, degrees from the zenith.
@@ -358,7 +354,7 @@ def _draw_scale(axis: Axes) -> None:
 
 
 def _draw_path(
-    axis: Axes, path: NDArray[np.float64], sphere: Viewpoints, light: SoftLight, seen_from: float
+    axis: Axes, path: Float, sphere: Viewpoints, light: SoftLight, seen_from: float
 ) -> None:
     """Draw the visible part of the object, the candidate views, and the path."""
     figure = axis.figure
@@ -372,7 +368,7 @@ def _draw_path(
     pixels, far = light.picture(light.surfaces, pose, intrinsics, shape)
     axis.imshow(pixels, interpolation="antialiased", aspect="auto")
 
-    def place(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def place(points: Float) -> tuple[Float, Float]:
         """Return the pixels of points of the dome, and their opacity.
 
         It is lower behind the object and at the back.
@@ -384,7 +380,7 @@ def _draw_path(
             far[row, column] < inside[:, 2], 0.15, np.where(points @ pose[:3, 3] < 0, 0.45, 1.0)
         )
 
-    def line(points: NDArray[np.float64], colour: str, width: float) -> None:
+    def line(points: Float, colour: str, width: float) -> None:
         flat, plain = place(points)
         for share in np.unique(plain):
             part = (plain == share) | np.append(False, plain[:-1] == share)

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from nextview.checks import number
 from nextview.session.surroundings import Surroundings
+from nextview.types import Float, Mask
 
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject
 
-Float = NDArray[np.float64]
 LOWEST = 0.08
 """Metres above the support plane: a camera on a wrist, its mount and the fingers beside it do
 not touch it.
@@ -108,7 +108,7 @@ class Limits:
 
     def _occupied(
         self, places: Float, object: "ObservedObject", surroundings: Sequence[Surroundings]
-    ) -> list[tuple[str, NDArray[np.bool_]]]:
+    ) -> list[tuple[str, Mask]]:
         """Return reasons by what the frames show, with their places; the last one counts most."""
         clearance = self.clearance
         if clearance is None:

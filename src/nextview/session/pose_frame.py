@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+
+from nextview.types import Float
 
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject
@@ -31,7 +32,7 @@ class PoseFrame:
     """
 
     name: PoseFrameName = "object"
-    from_object: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    from_object: Float = field(default_factory=lambda: np.eye(4))
 
     def __str__(self) -> str:
         return IN_WORDS[self.name]

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from nextview.checks import one_line
 from nextview.errors import ObservationError, UsageError
@@ -12,8 +12,7 @@ from nextview.geometry.observation import checked_pose
 from nextview.geometry.viewsphere import angle_between, direction_of
 from nextview.policies.discriminate_geometry import NEAR_TIE
 from nextview.things.expected_views import Goal, Outlook
-
-Float = NDArray[np.float64]
+from nextview.types import Float, Index
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +77,7 @@ def rank_views(
     inside: Float,
     radius: float,
     given: Float,
-    index: NDArray[np.int64],
+    index: Index,
     goal: Goal,
 ) -> tuple[RankedView, ...]:
     """Rank candidate poses.

@@ -5,15 +5,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from nextview.checks import one_line
 from nextview.errors import UsageError
 from nextview.geometry.viewsphere import Viewpoints
 from nextview.policies.base import EpisodeState, travel_from
+from nextview.types import Float, Index, Mask
 
-Float = NDArray[np.float64]
-Reachable = NDArray[np.bool_] | Callable[[Float], bool]
+Reachable = Mask | Callable[[Float], bool]
 """Which candidate views the camera can be brought to: (V,) bool; or a function of a pose of
 ``Session.poses``. What a masked array hides cannot be reached."""
 TravelCost = Float | Callable[[Float, Float], float]
@@ -34,11 +34,11 @@ class Reach:
         cost: cost of each move; None for the distance on the view sphere.
     """
 
-    failed: NDArray[np.bool_]
+    failed: Mask
     reachable: Reachable | None = None
     cost: TravelCost | None = None
 
-    def can_reach(self, views: NDArray[np.int64], poses: Poses) -> NDArray[np.bool_]:
+    def can_reach(self, views: Index, poses: Poses) -> Mask:
         """Return which views have not failed and can be reached.
 
         Args:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.checks import number_of
 from nextview.geometry.ray_caster import Triangles
@@ -23,6 +22,7 @@ from nextview.recognition.protocol import JointBelief
 from nextview.sensing.plausibility import ViewWarning
 from nextview.session.pose_frame import PoseFrame, PoseFrameName
 from nextview.session.view import View
+from nextview.types import Float
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -161,7 +161,7 @@ class Recognition:
         return self.views[-1].observation.radius if self.views else None
 
     @property
-    def pose(self) -> NDArray[np.float64] | None:
+    def pose(self) -> Float | None:
         """Transform from the frame of the scan file to ``pose_frame``, (4, 4), metres.
 
         A point p of the scan, in metres, is at ``(pose @ [*p, 1])[:3]``. None where there is no
@@ -177,7 +177,7 @@ class Recognition:
         return found[0].thing if found else None
 
     @property
-    def place(self) -> NDArray[np.float64] | None:
+    def place(self) -> Float | None:
         """Centroid of the thing's surface in ``pose_frame``, (3,), metres; None without a pose."""
         found = self._candidates_of_answer
         return found[0].place if found else None
@@ -239,7 +239,7 @@ class Recognition:
         return in_metres / radius, found.faces
 
     @property
-    def _displacements(self) -> NDArray[np.float64]:
+    def _displacements(self) -> Float:
         """Displacement of ``posed_surface`` in each view, (views, 3), object radii.
 
         It comes from the errors of the camera positions, in the object frame; 0 where it is not

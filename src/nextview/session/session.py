@@ -37,11 +37,11 @@ from nextview.session.result import SUSPICIOUS, Recognition
 from nextview.session.surroundings import Surroundings
 from nextview.session.view import View
 from nextview.things.expected_views import Goal, Outlook
+from nextview.types import Float, Mask
 
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject
 
-Float = NDArray[np.float64]
 THING_SIZE = 1.3  # times that the size of a taught thing is off, half hidden say, which none has
 FARTHEST_TARGET = 60.0
 """Object radii: a camera looks at a thing of 0.01 m radius from 0.6 m; in millimetres it would
@@ -292,7 +292,7 @@ class Session:
             found = self._episodes.outlooks(self._episodes.steps[-1], np.ones(1, bool))[0]
             return found if isinstance(found, Outlook) else None
 
-    def _left(self) -> NDArray[np.bool_]:
+    def _left(self) -> Mask:
         """Which candidates may still be chosen, (V,) bool."""
         state = self._episodes.steps[-1].state
         if state is not None:

@@ -9,8 +9,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates, median_filter
 from nextview.geometry.observation import Observation
 from nextview.geometry.ray_caster import RayCaster, Triangles, embree_scene, pixel_rays
 from nextview.session.style import GROUND, WOOD, rgb
-
-Float = NDArray[np.floating]
+from nextview.types import Floats
 
 TORN = 0.08  # a surface ends where depth jumps by more from pixel to pixel, object radii
 # half a side of the ground that may lie in shadow, object radii, and its points along it
@@ -55,7 +54,7 @@ class SoftLight:
     """The light on an object, as far as it was seen, and on the ground below it."""
 
     def __init__(self, observations: Sequence[Observation]) -> None:
-        seen: list[Float] = [np.zeros((1, 3)), *(o.points for o in observations if o.seen)]
+        seen: list[Floats] = [np.zeros((1, 3)), *(o.points for o in observations if o.seen)]
         self.surfaces = [surface(o) for o in observations]
         self._caster = RayCaster(self.surfaces)
         # sensors see one surface at several places
@@ -68,7 +67,7 @@ class SoftLight:
         )
         self._ground = gaussian_filter(light, 1.2, mode="nearest")
 
-    def _sky(self, points: Float, normals: Float, balls: Float) -> Float:
+    def _sky(self, points: Floats, normals: Floats, balls: Floats) -> Floats:
         """The share of the sky that each point sees."""
         free = np.zeros(len(points))
         for ball in balls / np.linalg.norm(balls, axis=1, keepdims=True):
@@ -78,8 +77,12 @@ class SoftLight:
         return free / len(balls)
 
     def picture(
-        self, surfaces: Sequence[Triangles], pose: Float, intrinsics: Float, shape: tuple[int, int]
-    ) -> tuple[NDArray[np.uint8], Float]:
+        self,
+        surfaces: Sequence[Triangles],
+        pose: Floats,
+        intrinsics: Floats,
+        shape: tuple[int, int],
+    ) -> tuple[NDArray[np.uint8], Floats]:
         """Render surfaces on the ground.
 
         Args:

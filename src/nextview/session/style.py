@@ -15,6 +15,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from nextview.session.fonts import fit_fonts
+from nextview.types import Floats
 
 INK = "#1f2933"
 GREY = "#8a949e"
@@ -110,7 +111,7 @@ def rgb(colour: str) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def heat(values: NDArray[np.floating]) -> NDArray[np.uint8]:
+def heat(values: Floats) -> NDArray[np.uint8]:
     """Values in the colours of viridis, lowest to highest, (...) to (..., 3); NaN is grey."""
     known = np.isfinite(values)
     low, high = (values[known].min(), values[known].max()) if known.any() else (0.0, 1.0)

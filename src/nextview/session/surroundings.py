@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
@@ -11,9 +10,7 @@ from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.segmentation import Plane, sample
 from nextview.sensing.sighting import Sighting
 from nextview.sensing.walls import find_walls
-
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from nextview.types import Float, Index, Mask
 
 MOST_POINTS = 6000  # of a frame that are looked at
 # parts of the depth between neighbouring pixels, at an edge, where a sensor makes up points
@@ -165,7 +162,7 @@ def _tolerance(noise: Noise, depth: Float) -> Float:
     return 3 * noise.at(depth) * depth**2 + 0.003 * depth
 
 
-def _smooth_pixels(frame: Frame) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _smooth_pixels(frame: Frame) -> tuple[Index, Index]:
     """Rows and columns of a grid of pixels with a depth, but for those at an edge."""
     height, width = frame.shape
     step = max(1, int(np.sqrt(height * width / MOST_POINTS)))

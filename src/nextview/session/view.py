@@ -3,13 +3,13 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, elevation_of
 from nextview.recognition.novelty import ViewScore, values_of
 from nextview.recognition.protocol import JointBelief
 from nextview.sensing.plausibility import ViewWarning
+from nextview.types import Float, Floats
 
 
 @dataclass(frozen=True)
@@ -48,15 +48,15 @@ class View:
 
     index: int
     observation: Observation = field(repr=False)
-    alone: NDArray[np.float64] = field(repr=False)
-    belief: NDArray[np.float64] = field(repr=False)
-    maps: dict[str, NDArray[np.floating]] = field(repr=False)
+    alone: Float = field(repr=False)
+    belief: Float = field(repr=False)
+    maps: dict[str, Floats] = field(repr=False)
     next_view: int | None
     travel: float
     arc: float
-    direction: NDArray[np.float64]
-    azimuth_bins: NDArray[np.float64] | None = field(default=None, repr=False)
-    values: NDArray[np.float64] | None = field(default=None, repr=False)
+    direction: Float
+    azimuth_bins: Float | None = field(default=None, repr=False)
+    values: Float | None = field(default=None, repr=False)
     score: ViewScore | None = field(default=None, repr=False)
     warnings: tuple[ViewWarning, ...] = ()
     degrees_off: float = 0.0

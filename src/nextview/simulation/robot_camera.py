@@ -4,7 +4,6 @@ from dataclasses import replace
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.checks import one_line
 from nextview.errors import NoViewLeftError, ObservationError, UsageError
@@ -20,8 +19,8 @@ from nextview.sensing.object_frame import Box, ObjectFrame
 from nextview.simulation.scene import TABLE, Scene
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import Sensor, SensorMix, sensor_named
+from nextview.types import Float
 
-Float = NDArray[np.float64]
 Named = Literal["point", "box", "known", "mask"]
 SAME = 1e-6  # radians between directions that are the same
 

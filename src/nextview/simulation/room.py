@@ -6,7 +6,6 @@ from pathlib import Path
 from zlib import crc32
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.errors import DatasetError, MeshError
 from nextview.geometry.mesh import MAX_FACES
@@ -16,9 +15,7 @@ from nextview.sensing import Frame
 from nextview.simulation.room_layout import RoomLayout, Slab, Standing
 from nextview.simulation.scene import cached_mesh, mesh_hash, upright_boxes
 from nextview.simulation.sensor import Sensor
-
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from nextview.types import Float, Mask
 
 UNEVEN = 0.001  # metres, standard deviation of the height of a floor or a table top
 WAVES = 12  # that an uneven top is made of

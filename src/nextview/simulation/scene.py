@@ -14,8 +14,8 @@ from nextview.files import regular_file, sha256_of
 from nextview.geometry.mesh import MAX_FACES, Mesh, load_mesh
 from nextview.geometry.viewsphere import rotation_z
 from nextview.simulation.scene_layout import Block, Placement, SceneLayout
+from nextview.types import Float, Mask
 
-Float = NDArray[np.float64]
 # half the side of the square table, object radii: what stands around the target stands on it
 TABLE = 3.4
 CLEARANCE = 0.2  # what a camera needs to each side, object radii
@@ -92,7 +92,7 @@ class Scene:
             found = np.minimum(found, np.hypot(distances(item.footprint, positions[:, :2]), above))
         return found
 
-    def reachable(self, positions: Float) -> NDArray[np.bool_]:
+    def reachable(self, positions: Float) -> Mask:
         """Return whether a camera can be at each position, (V, 3), object radii; (V,) bool.
 
         Not nearer than CLEARANCE to an item or the table, nor to where a wall stands before the

@@ -18,9 +18,8 @@ from nextview.sensing.segmentation import inside_sphere
 from nextview.simulation.scene import boxes_around
 from nextview.simulation.sensor import Sensor, SensorMix, sensor_named, uniform_field
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.types import Float, Float32, Mask
 
-Float = NDArray[np.float64]
-Depth = NDArray[np.float32]
 TABLE = 1.5  # radius of the table that the object stands on, if nothing else is said, object radii
 # the object is looked for in a sphere so many radii large: with a wrong pose it sticks out of its
 # own
@@ -174,7 +173,7 @@ class SensedCamera:
         hidden = shown & (boxes > 0) & (boxes < depth)
         return 1 - np.count_nonzero(hidden) / count
 
-    def _scene(self, pose: Float) -> tuple[Depth, NDArray[np.uint8]]:
+    def _scene(self, pose: Float) -> tuple[Float32, NDArray[np.uint8]]:
         """True depth of object, boxes and table, metres, and what each pixel shows."""
         inside = self._truth.pose_in_object(pose)
         depth = self._camera.observe(inside).depth.copy()
@@ -217,7 +216,7 @@ class SensedCamera:
             ]
             return part, np.where(across[0] ** 2 + across[1] ** 2 < self._reach**2, along, np.inf)
 
-    def _cropped(self, depth: Depth, mask: NDArray[np.bool_], rng: np.random.Generator) -> Depth:
+    def _cropped(self, depth: Float32, mask: Mask, rng: np.random.Generator) -> Float32:
         """Return the picture without what is beyond a line across the object."""
         side = int(rng.integers(4))
         share = float(rng.uniform(0, self.sensor.crop))

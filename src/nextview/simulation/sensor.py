@@ -8,7 +8,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.special import ndtr
 
@@ -17,9 +16,7 @@ from nextview.errors import UsageError
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import DISTANCE
 from nextview.sensing.frame import Part, within
-
-Index = NDArray[np.int64]
-Image = NDArray[np.float64]
+from nextview.types import Float, Float32, Floats, Index, Mask
 
 # two surfaces differ so much from pixel to pixel, as a part of q, beyond the surface's own slope
 EDGE = 0.02
@@ -146,7 +143,7 @@ class Sensor:
         return self.height, self.width
 
     @property
-    def intrinsics(self) -> Image:
+    def intrinsics(self) -> Float:
         """Pinhole matrix, (3, 3) float64, pixels; the first pixel's centre is at 0.5."""
         return np.array(
             [[self.focal, 0, self.width / 2], [0, self.focal, self.height / 2], [0, 0, 1.0]]
@@ -177,9 +174,7 @@ class Sensor:
         """Itself: what ``SensorMix`` draws anew for every object."""
         return self
 
-    def measure(
-        self, depth: NDArray[np.float32], rng: np.random.Generator
-    ) -> tuple[NDArray[np.float32], Index]:
+    def measure(self, depth: Float32, rng: np.random.Generator) -> tuple[Float32, Index]:
         """Return what the sensor measures of a true depth image.
 
         Errors of strength 0 change nothing, to the bit. Each error draws from a generator of its
@@ -249,7 +244,7 @@ class Sensor:
 
         return measured, sources
 
-    def _noisy(self, q: Image, angle: Image, rng: np.random.Generator) -> Image:
+    def _noisy(self, q: Float, angle: Float, rng: np.random.Generator) -> Float:
         """Inverse depth with the noise of depth and of disparity."""
         z = np.where(q > 0, 1 / np.where(q > 0, q, 1), 1.0)
         along = (self.axial * kinect_axial(z, angle)) ** 2 + self.noise**2
@@ -392,7 +387,7 @@ def sensor_named(text: str | Sensor | SensorMix) -> Sensor | SensorMix:
 # What the errors are made of: all on inverse depth q = 1/z, (H, W), which changes evenly on a plane
 
 
-def slopes(q: Image) -> tuple[Image, Image]:
+def slopes(q: Float) -> tuple[Float, Float]:
     """Return the change per pixel along x and y, on the side where it is smaller.
 
     It is 0 for a pixel alone.
@@ -400,7 +395,7 @@ def slopes(q: Image) -> tuple[Image, Image]:
     return _slope(q), _slope(q.T).T
 
 
-def _slope(q: Image) -> Image:
+def _slope(q: Float) -> Float:
     here = q > 0
     nothing = np.full((len(q), 1), np.inf)
     difference = np.where(here[:, 1:] & here[:, :-1], q[:, 1:] - q[:, :-1], np.inf)
@@ -410,7 +405,7 @@ def _slope(q: Image) -> Image:
     return np.where(np.isfinite(smaller), smaller, 0.0)
 
 
-def shifted(q: Image, slope: tuple[Image, Image], right: Index, down: Index) -> tuple[Image, Index]:
+def shifted(q: Float, slope: tuple[Float, Float], right: Index, down: Index) -> tuple[Float, Index]:
     """Show in each pixel the surface of a neighbour, where the pixel's own ray meets it.
 
     Edges move, and planes stay.
@@ -436,7 +431,7 @@ def shifted(q: Image, slope: tuple[Image, Image], right: Index, down: Index) -> 
     return np.where(there > 0, moved, 0), at
 
 
-def incidence(q: Image, slope: tuple[Image, Image], intrinsics: NDArray[np.float64]) -> Image:
+def incidence(q: Float, slope: tuple[Float, Float], intrinsics: Float) -> Float:
     """Return the angle between each pixel's ray and the surface normal.
 
     Args:
@@ -458,7 +453,7 @@ def incidence(q: Image, slope: tuple[Image, Image], intrinsics: NDArray[np.float
     return np.where(q > 0, np.arccos(np.clip(q / np.where(length > 0, length, 1), 0, 1)), 0.0)
 
 
-def across_edges(q: Image, slope: tuple[Image, Image]) -> Image:
+def across_edges(q: Float, slope: tuple[Float, Float]) -> Float:
     """Return the inverse depth on the other side of the highest step to a neighbour.
 
     Args:
@@ -481,7 +476,7 @@ def across_edges(q: Image, slope: tuple[Image, Image]) -> Image:
     return other
 
 
-def in_shadow(q: Image, focal: float, baseline: float) -> NDArray[np.bool_]:
+def in_shadow(q: Float, focal: float, baseline: float) -> Mask:
     """Return the pixels that a projector does not reach because of something nearer.
 
     The pixel of column u is lit from the projector's column u - focal * baseline * q, which lights
@@ -525,7 +520,7 @@ def in_shadow(q: Image, focal: float, baseline: float) -> NDArray[np.bool_]:
     return seen & (flat[np.where(seen, first_index, 0)] > disparity + narrow)
 
 
-def kinect_axial(depth: NDArray[np.floating], angle: NDArray[np.floating]) -> Image:
+def kinect_axial(depth: Floats, angle: Floats) -> Float:
     """Return the standard deviation of the depth of a Kinect (v1), metres.
 
     0.0012 + 0.0019 (z - 0.4)^2 + 0.0001 / sqrt(z) (angle / (pi/2 - angle))^2, from Nguyen, Izadi
@@ -547,7 +542,7 @@ def kinect_axial(depth: NDArray[np.floating], angle: NDArray[np.floating]) -> Im
     )
 
 
-def kinect_lateral(angle: NDArray[np.floating]) -> Image:
+def kinect_lateral(angle: Floats) -> Float:
     """Standard deviation of where a Kinect (v1) sees an edge, pixels; same source."""
     angle = np.minimum(angle, STEEPEST)
     return 0.8 + 0.035 * angle / (np.pi / 2 - angle)
@@ -555,7 +550,7 @@ def kinect_lateral(angle: NDArray[np.floating]) -> Image:
 
 def normal_field(
     rng: np.random.Generator, shape: tuple[int, int], grain: float, part: Part | None = None
-) -> Image:
+) -> Float:
     """Draw white noise of variance 1 under a Gaussian window.
 
     Args:
@@ -596,7 +591,7 @@ def _power(grain: float) -> float:
 
 def uniform_field(
     rng: np.random.Generator, shape: tuple[int, int], grain: float, part: Part | None = None
-) -> Image:
+) -> Float:
     """Draw numbers between 0 and 1 with correlated neighbours, as in ``normal_field``.
 
     Args:

@@ -12,6 +12,7 @@ from nextview.geometry.mesh import Mesh
 from nextview.geometry.observation import Observation, checked_intrinsics, checked_pose, pinhole
 from nextview.geometry.ray_caster import RayCaster, embree_scene, pixel_rays
 from nextview.geometry.viewsphere import DISTANCE
+from nextview.types import Float, Float32, Mask
 
 if TYPE_CHECKING:
     from nextview.simulation.scene import Scene
@@ -25,7 +26,7 @@ if it is no farther than the third, object radii, from the triangle's bounding b
 axes."""
 
 
-def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+def _dot(a: Float32, b: Float32) -> Float32:
     """Of rows of three; einsum takes three times as long."""
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
@@ -59,7 +60,7 @@ class SimulatedCamera:
         mesh: Mesh,
         size: int = 224,
         distance: float = DISTANCE,
-        intrinsics: NDArray[np.float64] | None = None,
+        intrinsics: Float | None = None,
         shape: tuple[int, int] | None = None,
     ) -> None:
         height, width = shape or (size, size)
@@ -85,7 +86,7 @@ class SimulatedCamera:
         self._rays[..., 1] = (y + np.float32(0.5 - cy)) / np.float32(fy)
         self._ray_length = np.linalg.norm(self._rays, axis=-1)
 
-    def observe(self, pose: NDArray[np.float64]) -> Observation:
+    def observe(self, pose: Float) -> Observation:
         """Look from a camera-to-world pose, (4, 4), OpenCV axes, object radii."""
         pose = checked_pose(pose)
         rotation = pose[:3, :3].astype(np.float32)
@@ -118,9 +119,7 @@ class SimulatedCamera:
             depth[bound] = np.where(hit, hits["tfar"], 0).reshape(height, width)
         return Observation(depth, pose, self.intrinsics, self.radius, image, exact=True)
 
-    def _bound(
-        self, rotation: NDArray[np.float32], origin: NDArray[np.float32]
-    ) -> tuple[slice, slice]:
+    def _bound(self, rotation: Float32, origin: Float32) -> tuple[slice, slice]:
         """Return rows and columns that hold all vertices; the whole image if one is behind."""
         x, y, z = rotation.T @ self._corners - (rotation.T @ origin)[:, None]
         height, width = self.shape
@@ -146,7 +145,7 @@ class OccludedCamera:
         )
         self._rays = pixel_rays(pinhole(size, distance), (size, size))
 
-    def observe(self, pose: NDArray[np.float64]) -> Observation:
+    def observe(self, pose: Float) -> Observation:
         """Look from a camera-to-world pose, (4, 4), OpenCV axes, object frame, object radii."""
         seen = self._target.observe(pose)
         hidden = self._hidden(seen)
@@ -157,12 +156,12 @@ class OccludedCamera:
             image=np.where(hidden, np.uint8(0), seen.image),
         )
 
-    def visible_share(self, pose: NDArray[np.float64]) -> float:
+    def visible_share(self, pose: Float) -> float:
         """Return the visible share of the target's picture from a pose, (4, 4)."""
         seen = self._target.observe(pose)
         return 1 - np.count_nonzero(self._hidden(seen)) / seen.visible if seen.visible else 0.0
 
-    def _hidden(self, seen: Observation) -> NDArray[np.bool_]:
+    def _hidden(self, seen: Observation) -> Mask:
         """Pixels of the target alone before which something stands, (H, W)."""
         there = seen.depth > 0
         rays = self._rays[there] @ seen.pose[:3, :3].T.astype(np.float32)
@@ -175,15 +174,13 @@ class OccludedCamera:
 class SceneCamera:
     """Shows a whole scene through a pinhole, (3, 3), pixels, first pixel's centre at 0.5."""
 
-    def __init__(
-        self, scene: "Scene", intrinsics: NDArray[np.float64], shape: tuple[int, int]
-    ) -> None:
+    def __init__(self, scene: "Scene", intrinsics: Float, shape: tuple[int, int]) -> None:
         meshes = (scene.target, scene.table, scene.around)
         self._caster = RayCaster([(mesh.vertices, mesh.faces) for mesh in meshes if mesh])
         self._rays = pixel_rays(checked_intrinsics(intrinsics, shape), shape)
         self._owners = np.array([TARGET, TABLE_TOP, OTHER, NOTHING])
 
-    def look(self, pose: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    def look(self, pose: Float) -> tuple[Float32, NDArray[np.uint8]]:
         """Render the scene from a camera-to-world pose, (4, 4), object frame and radii.
 
         Depth, (H, W) float32, object radii, 0 = nothing; and NOTHING, TARGET, OTHER or TABLE_TOP,
@@ -198,9 +195,7 @@ class SceneCamera:
         ].reshape(shape)
 
 
-def visible_shares(
-    scene: "Scene", poses: NDArray[np.float64], size: int, distance: float
-) -> NDArray[np.float64]:
+def visible_shares(scene: "Scene", poses: Float, size: int, distance: float) -> Float:
     """Return the share of the target's picture that nothing hides, from each pose.
 
     Args:

@@ -22,8 +22,7 @@ from nextview.geometry.viewsphere import look_at_origin, rotation_z
 from nextview.sensing.frame import Frame
 from nextview.simulation.scene import footprint, separation, upright_boxes
 from nextview.simulation.sensor import Sensor
-
-Float = NDArray[np.float64]
+from nextview.types import Float, Floats
 
 WIDEST_GAP = 0.10  # metres between neighbours, at most
 TABLE_SIDES = (1.5, 1.1)  # metres
@@ -209,9 +208,7 @@ class TableCamera:
         return Frame(measured, self.sensor.intrinsics, pose, pixel_centre=0.5)
 
 
-def poses_around(
-    azimuths: NDArray[np.floating], elevation: float, distance: float, centre: Float
-) -> Float:
+def poses_around(azimuths: Floats, elevation: float, distance: float, centre: Float) -> Float:
     """Level cameras around a place, that look at it.
 
     Args:

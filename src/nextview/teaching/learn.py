@@ -12,7 +12,6 @@ from typing import Any, Literal, TypedDict, Unpack
 
 import numpy as np
 from msgspec.structs import replace as replace_record
-from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save_file
 
@@ -64,6 +63,7 @@ from nextview.things.memory import AZIMUTHS, Memory, TaughtRecogniser, check_fea
 from nextview.things.stored_surfaces import StoredSurfaces
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
+from nextview.types import Index
 
 MEMORY_NAME = "memory"  # of the card in a folder of taught things, and of the file beside it
 CARD = f"{MEMORY_NAME}.json"
@@ -606,7 +606,7 @@ def _by_views(shares: Sequence[float]) -> dict[str, float]:
     return {str(k): round(share, 4) for k, share in zip(VIEWS, shares, strict=False)}
 
 
-def _fitted(taught: Sequence[Pair], label: NDArray[np.int64]) -> tuple[Memory, Fit]:
+def _fitted(taught: Sequence[Pair], label: Index) -> tuple[Memory, Fit]:
     """Return the memory of all things, and what is fitted to them together.
 
     ``label`` is the class of each thing.
@@ -637,7 +637,7 @@ def _surface_of(source: ThingSource, arrays: Arrays) -> Surface | None:
 def _card(
     taught: Sequence[Pair],
     classes: tuple[str, ...],
-    label: NDArray[np.int64],
+    label: Index,
     memory: Memory,
     fit: Fit,
     commands: tuple[str, ...],

@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.recognition.belief import Calibration, SizeEvidence, log_evidence_of, of_true_class
 from nextview.things.memory import AZIMUTHS, by_ring, similarities
-from nextview.types import Floats, Index
+from nextview.types import Float, Float32, Floats, Index, Mask
 
 WEIGHTS = (20.0, 30.0, 40.0, 60.0, 90.0)  # of a cosine, as a log-likelihood
 CORRELATIONS = (0.1, 0.3, 0.6)  # of two views, see ``Calibration.bin_correlation``
@@ -130,7 +129,7 @@ def _usual(logs: Floats, truth: Index) -> Floats:
     return found
 
 
-def _judged(views: Floats, thing: Index, held_out: Floats, where: Floats) -> NDArray[np.float32]:
+def _judged(views: Floats, thing: Index, held_out: Floats, where: Floats) -> Float32:
     """How alike each held-out view is to each resting pose and azimuth, (T, K, H, azimuths)."""
     flat = similarities(
         by_ring(views), held_out.reshape(-1, held_out.shape[-1]), where[..., 0].ravel()
@@ -142,11 +141,11 @@ def _heads(
     views: Floats,
     thing: Index,
     label: Index,
-    several: NDArray[np.bool_],
+    several: Mask,
     fold: Index,
     held_out: Floats,
     judged: Index,
-) -> tuple[NDArray[np.float32], tuple[Floats, Floats]]:
+) -> tuple[Float32, tuple[Floats, Floats]]:
     """Return the logits of held-out views by heads that have not seen the thing, (T, K, C).
 
     The head of all things is returned as well.
@@ -196,7 +195,7 @@ def _sums(
 
 def _belief(
     sums: dict[int, Floats], classes: int, hypotheses: Index, correlation: float
-) -> list[NDArray[np.float64]]:
+) -> list[Float]:
     """Return the log-belief from sums of log-evidence, (T, draws, classes), up to a constant."""
     calibration = Calibration(1.0, 1.0, None, correlation, tuple(hypotheses.tolist()))
     return [calibration.log_belief(total, k, classes) for k, total in sums.items()]

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.errors import DatasetError
 from nextview.geometry.mesh import UNITS
+from nextview.types import Floats
 
 # a thing so many times larger or smaller than the median of the others is asked about
 ODD_SIZE = 300
@@ -16,7 +16,7 @@ SMALLEST_RADIUS = 0.001  # and at smaller ones no depth camera
 USUAL_RADII = (0.01, 3.0)  # metres, of things of which one takes views
 
 
-def check_sizes(paths: Sequence[Path], radii: NDArray[np.floating], unit: str | None) -> None:
+def check_sizes(paths: Sequence[Path], radii: Floats, unit: str | None) -> None:
     """Ask about things whose size says that their files are in another unit of length.
 
     Args:
@@ -42,7 +42,7 @@ def check_sizes(paths: Sequence[Path], radii: NDArray[np.floating], unit: str | 
             raise DatasetError(f"{path}: is {how} than most others; {hint}")
 
 
-def _all_odd(paths: Sequence[Path], radii: NDArray[np.floating], unit: str, median: float) -> str:
+def _all_odd(paths: Sequence[Path], radii: Floats, unit: str, median: float) -> str:
     """Return a sentence about things of odd size, with the unit that makes them usual."""
     middle = int(np.nanargmin(np.abs(radii - median)))
     size = f"has a radius of {_length(float(radii[middle]))} if --unit {unit} is right"

@@ -34,6 +34,7 @@ from nextview.things.fusion import fuse
 from nextview.things.memory import AZIMUTHS, RINGS, joined
 from nextview.things.surface import FINEST_ERROR, Surface
 from nextview.things.symmetry import find_symmetries
+from nextview.types import Float, Float32
 
 Arrays = dict[str, NDArray]
 HELD_OUT = 8  # views of each thing that are not remembered
@@ -53,7 +54,7 @@ FACES = "faces"
 SYMMETRIES = "symmetries"  # and the axis and order of each of its symmetries, (S, 4)
 # of the radius: a camera stands farther from a large thing, and measures it less exactly
 COARSER = 0.002
-Parts = Iterator[NDArray[np.float32]]  # of embeddings, (.., F) each, in order
+Parts = Iterator[Float32]  # of embeddings, (.., F) each, in order
 
 
 @dataclass(frozen=True)
@@ -175,7 +176,7 @@ def _captured(path: Path, how: TeachingOptions) -> Capture:
     return read_turntable(path, how.turntable)
 
 
-def _surface(mesh: Mesh, to_mesh: NDArray[np.float64]) -> Arrays:
+def _surface(mesh: Mesh, to_mesh: Float) -> Arrays:
     """Return the surface of a mesh in the axes of its file; nothing without a unit."""
     if mesh.metres is None:
         return {}
@@ -195,7 +196,7 @@ def of_surface(surface: Surface) -> Arrays:
     }
 
 
-def _around(clean: Parts, sensed: Parts) -> NDArray[np.float32]:
+def _around(clean: Parts, sensed: Parts) -> Float32:
     """Return embeddings of the grid of views, (rings, azimuths, F).
 
     They are the mean of clean and sensed views.
@@ -217,7 +218,7 @@ def _clean(pool: ThreadPoolExecutor, mesh: Mesh) -> Parts:
 
 
 def _sensed(
-    pool: ThreadPoolExecutor, mesh: Mesh, poses: NDArray[np.float64], sensor: str, rng: Generator
+    pool: ThreadPoolExecutor, mesh: Mesh, poses: Float, sensor: str, rng: Generator
 ) -> Parts:
     """Embeddings of a mesh from poses, (B, 4, 4), through a sensor."""
     parts = np.split(poses, range(SETUP, len(poses), SETUP))
@@ -225,7 +226,7 @@ def _sensed(
     return pool.map(lambda camera, part: _seen(camera(), part), cameras, parts)
 
 
-def _seen(camera: Camera, poses: NDArray[np.float64]) -> NDArray[np.float32]:
+def _seen(camera: Camera, poses: Float) -> Float32:
     return embeddings([camera.observe(pose) for pose in poses])
 
 
@@ -290,7 +291,7 @@ def _features() -> Features:
     return Features(threads=1)
 
 
-def embeddings(observations: list[Observation]) -> NDArray[np.float32]:
+def embeddings(observations: list[Observation]) -> Float32:
     """Return embeddings of views from one camera, unit vectors, (B, F) float32.
 
     They are zero where nothing is seen.

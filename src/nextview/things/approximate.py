@@ -4,9 +4,9 @@ from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.checks import extras
+from nextview.types import Float32, Floats, Index
 
 LARGE = 20_000  # views of a ring from which looking at all of them takes more than 10 ms
 INDEX = "PCA64,IVF256,SQ8"  # 64 numbers of a byte for each view, in 256 cells
@@ -15,7 +15,7 @@ SAMPLE = 10_240  # views from which an index learns its cells
 NEAREST = 1000  # views of a ring that are compared exactly
 
 
-def is_large(views: NDArray[np.float32]) -> bool:
+def is_large(views: Float32) -> bool:
     """Whether remembered views, (rings, N, F), are searched approximately.
 
     They are if there are many, and faiss is installed.
@@ -26,14 +26,12 @@ def is_large(views: NDArray[np.float32]) -> bool:
 class NearestViews:
     """An index for each ring of remembered views, (rings, N, F) float32, unit vectors."""
 
-    def __init__(self, views: NDArray[np.float32]) -> None:
+    def __init__(self, views: Float32) -> None:
         sample = np.random.default_rng(0).permutation(views.shape[1])[:SAMPLE]
         self._views = views
         self._indices = [_index(ring, sample) for ring in views]
 
-    def similarities(
-        self, embeddings: NDArray[np.floating], shares: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
+    def similarities(self, embeddings: Floats, shares: Float32) -> Float32:
         """Cosines of views with what is remembered, summed over rings.
 
         The nearest of each ring are compared exactly. All others count as the least alike of these.
@@ -59,7 +57,7 @@ class NearestViews:
         return found
 
 
-def _index(views: NDArray[np.float32], sample: NDArray[np.int64]) -> Any:
+def _index(views: Float32, sample: Index) -> Any:
     with extras():
         import faiss
 

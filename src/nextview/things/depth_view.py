@@ -10,10 +10,7 @@ from nextview.errors import ObservationError
 from nextview.geometry.observation import Observation
 from nextview.sensing.facets import Noise, estimate_noise
 from nextview.things.ground import Ground, find_ground
-
-Float32 = NDArray[np.float32]
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from nextview.types import Float, Float32, Index, Mask
 
 NOT_MEASURED, ELSEWHERE, THING = np.arange(3, dtype=np.uint8)
 """What a pixel shows: nothing was measured; something else, or nothing at all, was; the thing."""
@@ -176,7 +173,7 @@ class MetricImage:
         thing = kind[some] == THING
         return find_ground(points[~thing], points[thing], origin, self.pose[:3, 2])
 
-    def _rays(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Float:
+    def _rays(self, rows: Index, columns: Index) -> Float:
         """Rays through some rows and columns of pixels, (rows * columns, 3), object frame."""
         focal = self.intrinsics[[0, 1], [0, 1]]
         x = (columns + 0.5 - self.intrinsics[0, 2]) / focal[0]
@@ -255,9 +252,7 @@ def _what_is_seen(observation: Observation) -> tuple[Float32, NDArray[np.uint8],
     return depth, kind, pose, intrinsics
 
 
-def _window(
-    mask: Mask, side: int, relative_margin: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _window(mask: Mask, side: int, relative_margin: float) -> tuple[Index, Index]:
     """Ascending rows and columns that lie evenly over an outline and a margin around it."""
     ends = []
     for axis in (1, 0):
@@ -279,7 +274,7 @@ def _window(
     return rows, columns
 
 
-def _step(lines: NDArray[np.int64]) -> float:
+def _step(lines: Index) -> float:
     """Mean distance between chosen rows or columns, pixels."""
     return float(lines[-1] - lines[0]) / max(1, len(lines) - 1)
 

@@ -11,12 +11,10 @@ mean, the marching cubes of a truncated signed distance 0.7 and 1.6 mm: it blurs
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.sensing.sighting import Sighting
 from nextview.things.surface import Surface
-
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 FINEST_CELL = 0.0015  # metres: what depth cameras tell apart
 CELLS = 45.0  # in a radius, of a large thing

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from nextview.types import Float, Floats
 
 FEWEST_POINTS = 50  # on the plane
 LEAST_SHARE = 0.25  # of what is measured beside the thing
@@ -32,7 +31,7 @@ class Ground:
     offset: float
     noise: float
 
-    def heights(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
+    def heights(self, points: Floats) -> Floats:
         """Height of points, (..., 3), object frame, above the plane, (...,), metres."""
         normal = self.normal.astype(points.dtype)
         return points @ normal + points.dtype.type(self.offset)

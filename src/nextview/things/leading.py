@@ -3,12 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.things.verifier import Verified
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
+from nextview.types import Float, Index
 
 MOST_LEADING = 10  # hypotheses that are rendered
 FEW_THINGS = 5  # likeliest things whose best hypothesis is always among them

@@ -19,13 +19,13 @@ from nextview.recognition.model_card import FEATURES, ModelCard, find_card
 from nextview.recognition.novelty import ROUNDED, Quantiles, unit
 from nextview.things.approximate import NearestViews, is_large
 from nextview.things.stored_surfaces import StoredSurfaces
+from nextview.types import Float32, Floats, Index
 
 RINGS = (0.0, 18.0, 36.0, 54.0, 72.0)  # elevations of the remembered views, degrees
 AZIMUTHS = 16  # remembered views on a ring: the azimuth bins of a memory
 PICTURE = 64  # side of the picture of a thing, pixels
 LARGEST_RADIUS = 1e4  # of a thing, metres; nothing as large is looked at from around
 LARGEST_LOGIT = 700.0  # that a head can say: the exponential of more is no number
-Float = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
@@ -48,15 +48,15 @@ class Memory:
         surfaces: Of the things, in metres, in the frames of their scan files.
     """
 
-    views: Float
-    thing: NDArray[np.int64]
-    rotations: Float
-    held_out: Float
-    held_out_views: Float
-    radii: Float
+    views: Floats
+    thing: Index
+    rotations: Floats
+    held_out: Floats
+    held_out_views: Floats
+    radii: Floats
     pictures: NDArray[np.uint8]
-    head: Float
-    head_bias: Float
+    head: Floats
+    head_bias: Floats
     surfaces: StoredSurfaces
 
     def __post_init__(self) -> None:
@@ -234,7 +234,7 @@ def check_features(card: ModelCard, memory: Memory, size: int) -> None:
         )
 
 
-def similarities(views: Float, embeddings: Float, elevations: Float) -> NDArray[np.float32]:
+def similarities(views: Floats, embeddings: Floats, elevations: Floats) -> Float32:
     """How alike views are to what is remembered, between two rings interpolated.
 
     Args:
@@ -254,7 +254,7 @@ def similarities(views: Float, embeddings: Float, elevations: Float) -> NDArray[
     return found.reshape(len(embeddings), -1, AZIMUTHS)
 
 
-def ring_shares(elevations: Float) -> NDArray[np.float32]:
+def ring_shares(elevations: Floats) -> Float32:
     """How much each ring counts for views from elevations, (B,), radians: (B, rings)."""
     place = np.interp(elevations, np.radians(RINGS), np.arange(len(RINGS)))
     shares = np.maximum(1 - np.abs(place[:, None] - np.arange(len(RINGS))), 0)
@@ -292,7 +292,7 @@ class TaughtRecogniser(NetworkRecogniser):
             usual = np.array(about.usual) if about.usual else None
             self.novelty = Quantiles(np.array(about.novelty), judged, joint=True, usual=usual)
 
-    def from_inputs(self, inputs: NDArray[Any], elevations: Float | None = None) -> Evidence:
+    def from_inputs(self, inputs: NDArray[Any], elevations: Floats | None = None) -> Evidence:
         """Judge views by shape alone.
 
         Args:
@@ -309,7 +309,7 @@ class TaughtRecogniser(NetworkRecogniser):
             raise ModelError("a memory of things needs the elevations of the views")
         return self.evidence(self._features(inputs), elevations)
 
-    def evidence(self, embeddings: Float, elevations: Float) -> Evidence:
+    def evidence(self, embeddings: Floats, elevations: Floats) -> Evidence:
         """Return the evidence of views by their embeddings.
 
         Args:
@@ -328,18 +328,18 @@ class TaughtRecogniser(NetworkRecogniser):
         logits = embeddings @ self.memory.head + self.memory.head_bias
         return Evidence(logits, azimuth_bins=self.card.memory.weight * alike)
 
-    def features(self, inputs: NDArray[Any]) -> NDArray[np.float32]:
+    def features(self, inputs: NDArray[Any]) -> Float32:
         """The embeddings of views, (B, F)."""
         return self._features(inputs)
 
 
-def by_ring(views: Float) -> NDArray[np.float32]:
+def by_ring(views: Floats) -> Float32:
     """Sort remembered views, (H, rings, azimuths, F), by ring: (rings, H * azimuths, F) float32."""
     h, rings, azimuths, f = views.shape
     return np.ascontiguousarray(views.swapaxes(0, 1).reshape(rings, h * azimuths, f), np.float32)
 
 
-def joined(clean: Float, sensed: Float) -> NDArray[np.float32]:
+def joined(clean: Floats, sensed: Floats) -> Float32:
     """Return the mean of clean and sensed embeddings, which is what a memory holds.
 
     Args:

@@ -12,8 +12,7 @@ from nextview.things.depth_view import DepthView, depth_view
 from nextview.things.registration import pose_covariances
 from nextview.things.taught import TaughtThings
 from nextview.things.verifier import FINE_SIDE, Verified, Verifier
-
-Float = NDArray[np.float64]
+from nextview.types import Index
 
 AXES = 3  # along each of which a camera's place errs
 LEAST_PROBABILITY = 0.01  # of a pose that is named beside the likeliest one
@@ -88,7 +87,7 @@ def _deviations(
     verifier: Verifier,
     found: Verified,
     views: Sequence[DepthView],
-    rows: NDArray[np.int64],
+    rows: Index,
 ) -> list[tuple[float, float]]:
     """Standard deviations of turn, degrees, and place, millimetres, of some hypotheses."""
     alignment = found.alignment(rows, verifier)

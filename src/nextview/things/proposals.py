@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
+from nextview.types import Float, Index, Mask
 
 BASIN = 2  # azimuth bins to each side that registration reaches from a peak
 FEWEST_PROPOSALS = 24
@@ -90,7 +89,7 @@ def propose(
     return Proposals(hypotheses[:count], azimuths, np.log(marginal[hypotheses[:count]] + 1e-300))
 
 
-def _peaks(joint: Float) -> NDArray[np.bool_]:
+def _peaks(joint: Float) -> Mask:
     """The azimuth bins of each hypothesis that are likelier than those around them."""
     peak = np.ones(joint.shape, bool)
     for shift in range(1, BASIN + 1):

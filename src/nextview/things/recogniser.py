@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.errors import ModelError, ObservationError
 from nextview.geometry.observation import Observation
@@ -21,8 +20,7 @@ from nextview.things.memory import TaughtRecogniser, open_memory
 from nextview.things.pose_candidates import candidates_of
 from nextview.things.taught import TaughtThings
 from nextview.things.verifier import Verified
-
-Float = NDArray[np.float64]
+from nextview.types import Float, Floats, Index
 
 NO_SCALE = "the scale of what is seen is not known in metres"
 
@@ -70,7 +68,7 @@ class VerifiedRecogniser(TaughtRecogniser):
         return tilted
 
     @cached_property
-    def labels(self) -> NDArray[np.int64]:
+    def labels(self) -> Index:
         """Class of each thing whose geometry is known, (T,) int64."""
         of_hypotheses = np.array(self.calibration.hypotheses)[self.things.rows]
         labels = np.zeros(len(self.things.names), np.int64)
@@ -78,7 +76,7 @@ class VerifiedRecogniser(TaughtRecogniser):
         return labels
 
     def together(
-        self, observations: Sequence[Observation], total: NDArray[np.floating], counted: int
+        self, observations: Sequence[Observation], total: Floats, counted: int
     ) -> JointBelief:
         """What is believed of an object by all views of it.
 

@@ -18,9 +18,7 @@ from scipy.ndimage import distance_transform_edt
 
 from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, DepthView
 from nextview.things.surface import SurfaceCaster
-
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
+from nextview.types import Float, Float32, Index, Mask
 
 TURN = slice(0, 3)
 PLACE = slice(3, 6)
@@ -107,7 +105,7 @@ class Alignment:
             place, (H, V, 3) float64.
     """
 
-    things: NDArray[np.int64]
+    things: Index
     ups: Float
     rotations: Float
     centres: Float
@@ -208,7 +206,7 @@ class Rendered:
     normals: Float32
     radii: Float32
 
-    def sunk(self, view: DepthView) -> NDArray[np.bool_]:
+    def sunk(self, view: DepthView) -> Mask:
         """Where a hypothesis shows below the ground, (H, P) bool: nothing can be there."""
         if view.ground is None:
             return np.zeros(self.depth.shape, bool)
@@ -224,7 +222,7 @@ class Rendered:
         """Deviation of each surface from the thing itself, (H,) float32, metres."""
         return np.hypot(SCAN_ERROR, RELATIVE_SCAN_ERROR * self.radii).astype(np.float32)
 
-    def hidden(self, view: DepthView) -> NDArray[np.bool_]:
+    def hidden(self, view: DepthView) -> Mask:
         """Where something else stands before a hypothesis, (H, P) bool."""
         before = np.hypot(HIDING, HIDING_NOISE * view.noise) + self.errors[:, None]
         return (view.kind == ELSEWHERE) & (view.depth < self.depth - before)
@@ -308,7 +306,7 @@ def _heights_on_the_ground(
     return ground - lowest
 
 
-def _overlap(view: DepthView, shows: NDArray[np.bool_]) -> Float:
+def _overlap(view: DepthView, shows: Mask) -> Float:
     """Intersection over union of where hypotheses show, (H, P), with the thing's pixels, (H,)."""
     thing = view.kind == THING
     hidden = view.kind == NOT_MEASURED
@@ -379,9 +377,7 @@ def _pulls(view: DepthView, rendered: Rendered, centres: Float, reach: Float32) 
     return _Pulls(arms, directions, distances, weights.astype(np.float32))
 
 
-def _nearest_shown(
-    view: DepthView, shows: NDArray[np.bool_]
-) -> tuple[NDArray[np.int64], Float32, Float32]:
+def _nearest_shown(view: DepthView, shows: Mask) -> tuple[Index, Float32, Float32]:
     """For each pixel the nearest one where a hypothesis shows, (H, P), -1 where none does.
 
     And the distance from there to the pixel, (H, P), pixels of the image, and its direction, (H, P,
@@ -503,7 +499,7 @@ def _equations(
     return left, right
 
 
-def different_poses(caster: SurfaceCaster, alignment: Alignment) -> NDArray[np.int64]:
+def different_poses(caster: SurfaceCaster, alignment: Alignment) -> Index:
     """Leave out hypotheses that have come to the pose of an earlier one.
 
     Args:

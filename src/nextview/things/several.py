@@ -9,7 +9,6 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.errors import ModelError
 from nextview.geometry.observation import Observation
@@ -21,8 +20,7 @@ from nextview.recognition.novelty import Novelty, Quantiles, ViewScore, values_o
 from nextview.recognition.protocol import JointBelief
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.recogniser import VerifiedRecogniser
-
-Float = NDArray[np.float64]
+from nextview.types import Floats
 
 EXPLAINED = 0.02  # p-value from which on a scan explains what is seen
 OTHERS = 1e-3  # share of the belief that is left to all but the collection that answers
@@ -84,7 +82,7 @@ class SeveralRecognisers:
         self.classes = _told_apart(
             {name: one.classes for name, one in (memories | networks).items()}
         )
-        self._said: WeakKeyDictionary[Observation, list[NDArray[np.floating]]] = WeakKeyDictionary()
+        self._said: WeakKeyDictionary[Observation, list[Floats]] = WeakKeyDictionary()
         self._novelties: WeakKeyDictionary[Observation, float] = WeakKeyDictionary()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -111,7 +109,7 @@ class SeveralRecognisers:
         directions = np.stack([direction_of(observation.pose) for observation in observations])
         azimuths = azimuth_of(directions)
         logits = []
-        said: list[list[NDArray[np.floating]]] = [[] for _ in observations]
+        said: list[list[Floats]] = [[] for _ in observations]
         for member in self.members:
             found = member(observations)
             logs = log_evidence_of(found.logits, found.azimuth_bins, azimuths)
@@ -126,7 +124,7 @@ class SeveralRecognisers:
         return Evidence(np.concatenate(logits, 1), seen=seen)
 
     def together(
-        self, observations: Sequence[Observation], total: NDArray[np.floating], counted: int
+        self, observations: Sequence[Observation], total: Floats, counted: int
     ) -> JointBelief:
         """What is believed of an object by all views of it.
 

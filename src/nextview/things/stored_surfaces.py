@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from nextview.checks import check_array
 from nextview.errors import ModelError
 from nextview.things.surface import Surface
+from nextview.types import Float, Index
 
 STEPS = 65535  # of a box along each axis: 5 micrometres for a thing of 30 cm
 SHORT = 65536  # vertices of a thing whose indices need no more than 16 bits
@@ -30,8 +31,8 @@ class StoredSurfaces:
 
     places: NDArray[np.uint16]
     faces: NDArray[np.unsignedinteger]
-    counts: NDArray[np.int64]
-    boxes: NDArray[np.float64]
+    counts: Index
+    boxes: Float
 
     def __post_init__(self) -> None:
         check_array("its places", self.places, np.uint16, (None, 3), empty=True)
@@ -118,7 +119,7 @@ class StoredSurfaces:
         )
 
 
-def _sums(counts: NDArray[np.int64]) -> tuple[int, int]:
+def _sums(counts: Index) -> tuple[int, int]:
     """Sums of counts, (T, 2), of any size: Python's integers do not overflow."""
     vertices, faces = counts.T.tolist()
     return sum(vertices), sum(faces)

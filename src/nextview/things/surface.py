@@ -12,8 +12,7 @@ from scipy.spatial import cKDTree
 from nextview.errors import MeshError
 from nextview.geometry.mesh import UNITS, Mesh
 from nextview.geometry.ray_caster import embree_scene
-
-Float32 = NDArray[np.float32]
+from nextview.types import Float, Float32, Index
 
 FEWEST_FACES = 500  # a simplified surface has at least so many triangles, if it had as many
 # metres by which a simplified surface may be off: less than depth cameras measure
@@ -71,7 +70,7 @@ class Surface:
         return float(np.linalg.norm(self.vertices - self.centre, axis=1).max())
 
     @cached_property
-    def centroid(self) -> NDArray[np.float64]:
+    def centroid(self) -> Float:
         """Mean of all points of the surface, (3,) float64, metres, in the frame of the scan file.
 
         It lies on every axis of symmetry, and a small part hardly moves it.
@@ -124,7 +123,7 @@ class Surface:
         return kept
 
     @cached_property
-    def _areas(self) -> NDArray[np.float64]:
+    def _areas(self) -> Float:
         """Area of each triangle, (F,), square metres."""
         corners = self.vertices[self.faces].astype(np.float64)
         edges = corners[:, 1:] - corners[:, :1]
@@ -135,7 +134,7 @@ class Surface:
         """Square metres."""
         return float(self._areas.sum())
 
-    def triangles_by_area(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    def triangles_by_area(self, count: int, rng: np.random.Generator) -> Index:
         """Draw triangles with probabilities in proportion to their areas.
 
         Args:
@@ -147,7 +146,7 @@ class Surface:
         """
         return rng.choice(len(self._areas), count, p=self._areas / self._areas.sum())
 
-    def sample(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    def sample(self, count: int, rng: np.random.Generator) -> Float:
         """Draw points that are spread evenly over the surface.
 
         Args:

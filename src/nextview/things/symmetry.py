@@ -11,13 +11,11 @@ from collections.abc import Iterable, Sequence
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import QhullError, cKDTree
 
 from nextview.recognition.model_card import Symmetry
 from nextview.things.surface import Surface
-
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 # metres: three deviations of edges that a stereo camera sees at arm's length
 LEAST_TOLERANCE = 0.005

@@ -5,7 +5,6 @@ from copy import copy
 from dataclasses import fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.errors import ModelError, ObservationError
 from nextview.geometry.observation import Observation
@@ -18,8 +17,7 @@ from nextview.things.unknown import KnownResiduals
 from nextview.things.verifier import Verified, Verifier
 from nextview.things.view_templates import ViewTemplates
 from nextview.things.weighing import EvidenceWeights
-
-Float = NDArray[np.float64]
+from nextview.types import Float, Floats
 
 # The radius of what is seen, of that of the whole thing: much may be hidden, or little taken in.
 SMALLEST_SHARE = 0.25
@@ -134,16 +132,14 @@ class TaughtThings:
             raise ObservationError("no view shows the thing, so nothing can be recognised")
         return self.verify(seen, self.log_evidence(seen))
 
-    def log_evidence(self, observations: Sequence[Observation]) -> NDArray[np.floating]:
+    def log_evidence(self, observations: Sequence[Observation]) -> Floats:
         """What features and size say of each view, (V, D): it can be summed over views."""
         evidence = self.recogniser(observations)
         directions = np.stack([direction_of(observation.pose) for observation in observations])
         azimuths = np.arctan2(directions[:, 1], directions[:, 0])
         return log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuths)
 
-    def verify(
-        self, observations: Sequence[Observation], log_evidence: NDArray[np.floating]
-    ) -> Verified:
+    def verify(self, observations: Sequence[Observation], log_evidence: Floats) -> Verified:
         """Recognise the thing that some views show, of which the features have been looked at.
 
         Args:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 # number of residuals that the mean of all things counts for, beside those of a thing
 SHRINKAGE = 2.0

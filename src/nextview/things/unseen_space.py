@@ -9,12 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.geometry.observation import Observation
-
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
+from nextview.types import Float, Float32, Mask
 
 STEPS = 10  # places on each line of sight that are looked up
 BEFORE = 0.01  # metres before a measured surface, from which on space is known to be free
@@ -45,7 +42,7 @@ class DepthImage:
         depth = scene.depth * np.float32(observation.radius)
         return cls(depth, pose, scene.intrinsics.astype(np.float64))
 
-    def shows_free(self, points: Float32) -> NDArray[np.bool_]:
+    def shows_free(self, points: Float32) -> Mask:
         """Whether the camera looked through some places.
 
         Where nothing was measured, nothing is taken to stand: most often what is behind is too far
@@ -76,7 +73,7 @@ def chance_of_sight(
     seen: Sequence[DepthImage],
     ends: Float32,
     rays: Float32,
-    hidden: NDArray[np.bool_],
+    hidden: Mask,
     reach: float,
     top: float,
 ) -> Float32:

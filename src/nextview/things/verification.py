@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, DepthView
 from nextview.things.registration import Rendered
-
-Float = NDArray[np.float64]
+from nextview.types import Float
 
 
 @dataclass(frozen=True)

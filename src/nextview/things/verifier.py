@@ -31,8 +31,7 @@ from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.verification import PixelModel, ViewLikelihood, likelihood
 from nextview.things.view_templates import ViewTemplates
 from nextview.things.weighing import EvidenceWeights, JudgedEpisode
-
-Float = NDArray[np.float64]
+from nextview.types import Float, Floats, Index
 
 ANY_TILT = 0.3  # radians by which a thing in any orientation is off its proposal: hardly held
 TILTED_PROPOSALS = 120  # of things in any orientation, of all views together
@@ -108,8 +107,8 @@ class Verified:
     """
 
     belief: Float
-    things: NDArray[np.int64]
-    resting: NDArray[np.int64]
+    things: Index
+    resting: Index
     probabilities: Float
     poses: Float
     cameras: Float
@@ -128,7 +127,7 @@ class Verified:
             truth, self.things, self.mean, self.camera_costs, self.log_belief, self.by_features
         )
 
-    def alignment(self, rows: NDArray[np.int64], verifier: "Verifier") -> Alignment:
+    def alignment(self, rows: Index, verifier: "Verifier") -> Alignment:
         """Some of the hypotheses, as they were aligned.
 
         Args:
@@ -168,7 +167,7 @@ class _Proposed:
         against: see ``Verified``.
     """
 
-    resting: NDArray[np.int64]
+    resting: Index
     rotations: Float
     log_belief: Float
     by_features: Float
@@ -198,7 +197,7 @@ class Verifier:
         self,
         surfaces: Sequence[Surface],
         owners: NDArray[np.integer],
-        rotations: NDArray[np.floating],
+        rotations: Floats,
         weights: EvidenceWeights = EvidenceWeights(),
         pixels: PixelModel = PixelModel(),
         prior: RegistrationPrior = RegistrationPrior(),
@@ -344,7 +343,7 @@ class Verifier:
         proposed: _Proposed,
         views: Sequence[DepthView],
         prior: RegistrationPrior,
-    ) -> tuple[Alignment, NDArray[np.int64]]:
+    ) -> tuple[Alignment, Index]:
         """The likeliest things, turned about the vertical to where they explain the views best.
 
         A small part of a round body draws a hypothesis only from near its own azimuth.
@@ -399,7 +398,7 @@ class Verifier:
         scores: Float,
         costs: Float,
         judged: Sequence[ViewLikelihood],
-        rows: NDArray[np.int64],
+        rows: Index,
     ) -> Verified:
         """The answer of the proposals that survived, sorted by their scores.
 

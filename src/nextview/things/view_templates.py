@@ -18,10 +18,7 @@ from numpy.typing import NDArray
 from nextview.geometry.viewsphere import rotation_z
 from nextview.things.depth_view import THING, MetricImage
 from nextview.things.surface import SurfaceCaster
-
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Index = NDArray[np.int64]
+from nextview.types import Float, Float32, Index, Mask
 
 DIRECTIONS = 162  # from which each thing is rendered: some 15 degrees apart
 TURNS = 24  # in the image plane, in which what is seen is compared: 15 degrees apart
@@ -212,7 +209,7 @@ def _from_z_to(direction: Float) -> Float:
 
 
 def _picture(
-    depth: NDArray, shown: NDArray[np.bool_], focal: float, turns: Float
+    depth: NDArray, shown: Mask, focal: float, turns: Float
 ) -> tuple[Float32, Float32, float] | None:
     """Outlines and depths on grids that are turned by some angles, (A, C), and the size, metres.
 

@@ -5,11 +5,9 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.errors import ModelError
-
-Float = NDArray[np.float64]
+from nextview.types import Float, Index
 
 NEVER = -1e9  # log-likelihood of a thing that was not aligned
 LEAST_BELIEF = 1e-9  # belief in the truth below which it is not told how wrong it was
@@ -60,7 +58,7 @@ class EvidenceWeights:
         together = 1 + self.correlation * (mean.shape[1] - 1)
         return of_views.sum(1) / together + self.features * log_belief
 
-    def belief(self, scores: Float, things: NDArray[np.int64], by_features: Float) -> Float:
+    def belief(self, scores: Float, things: Index, by_features: Float) -> Float:
         """Belief in each thing, by its likeliest hypothesis.
 
         Args:
@@ -92,7 +90,7 @@ class JudgedEpisode:
     """
 
     truth: int
-    things: NDArray[np.int64]
+    things: Index
     mean: Float
     camera_costs: Float
     log_belief: Float

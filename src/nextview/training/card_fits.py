@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 from numpy.random import Generator
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import beta, gaussian_kde
 
@@ -29,7 +28,7 @@ from nextview.recognition.belief import (
 )
 from nextview.recognition.model_card import ModelCard
 from nextview.training.fitting_set import blind_walks, card_to_fit, for_fitting, load_sensed
-from nextview.types import Float, Floats
+from nextview.types import Float, Floats, Index, Mask
 
 # of promised error rates
 THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())
@@ -130,7 +129,7 @@ class Walks:
     """
 
     data: Predictions
-    objects: NDArray[np.int64]
+    objects: Index
     totals: Float
 
     @classmethod
@@ -156,7 +155,7 @@ class Walks:
         return cls(data, objects, np.cumsum(evidence, axis=1))
 
     @property
-    def numbers(self) -> NDArray[np.int64]:
+    def numbers(self) -> Index:
         """Of the views so far, 1, 2, ..."""
         return np.arange(1, self.totals.shape[1] + 1)
 
@@ -272,7 +271,7 @@ def fit_risk(
     return RiskBounds(THRESHOLDS, tuple(promised), delta)
 
 
-def _promise(sure: Float, wrong: NDArray[np.bool_], weights: Float, delta: float) -> Float:
+def _promise(sure: Float, wrong: Mask, weights: Float, delta: float) -> Float:
     """Return the guaranteed error rate of each threshold, (T,).
 
     Confidences and mistakes are (walks * N, views).
@@ -392,7 +391,7 @@ def fit_size(
     return FittedSize(size, len(taught), len(data), before, after)
 
 
-def densities(radii: Float, labels: NDArray[np.int64], classes: int) -> Float:
+def densities(radii: Float, labels: Index, classes: int) -> Float:
     """Return the log-density of each class over the log radius.
 
     Args:
@@ -501,7 +500,7 @@ def fit_valleys(
 
 
 def valley_gains(
-    sphere: ViewSphere, logits: Floats, maps: Floats, labels: NDArray[np.int64]
+    sphere: ViewSphere, logits: Floats, maps: Floats, labels: Index
 ) -> dict[int, float]:
     """Return what the valley of a map gains over its peak for each class.
 

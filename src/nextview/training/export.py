@@ -35,6 +35,7 @@ from nextview.training.inputs import load_inputs
 from nextview.training.map_training import target_of
 from nextview.training.recipes import MapRecipe, RecogniserRecipe
 from nextview.training.runs import load_run, read_recipe, read_run
+from nextview.types import Float32, Index
 
 with extras():
     import onnx
@@ -194,11 +195,11 @@ class _Candidate:
     card: ModelCard
     network: ShippedRecogniser | ShippedMap
     sample: NDArray
-    judging: NDArray[np.int64]
+    judging: Index
     seen: Callable[[int], NDArray]
-    scores: Callable[[NDArray[np.float32]], dict[str, Any]]
+    scores: Callable[[Float32], dict[str, Any]]
 
-    def answers(self, card: Path) -> Callable[[NDArray], NDArray[np.float32]]:
+    def answers(self, card: Path) -> Callable[[NDArray], Float32]:
         """From views to what the file says of them."""
         if self.card.is_recogniser:
             recogniser = NetworkRecogniser(card)
@@ -401,7 +402,7 @@ def _export(candidate: _Candidate, out: Path, bits: int, overwrite: bool, track:
                 f"{name}: its answers differ from the network's by up to {difference:.2g}; not"
                 " written"
             )
-        rows: list[NDArray[np.float32]] = []
+        rows: list[Float32] = []
 
         def judged() -> Iterator[int]:
             for i in candidate.judging:

@@ -7,7 +7,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.data.predictions import Predictions
 from nextview.data.splits import duplicate_groups
@@ -19,10 +18,10 @@ from nextview.policies.base import Evidence, Policy
 from nextview.recognition.belief import FixedLength
 from nextview.recognition.model_card import ModelCard, read_card, write_card
 from nextview.session.episode import run_episodes
-from nextview.types import Index
+from nextview.types import Floats, Index
 
 
-def hold_out(labels: Index, measured: NDArray[np.floating], folds: int, seed: int) -> list[Index]:
+def hold_out(labels: Index, measured: Floats, folds: int, seed: int) -> list[Index]:
     """Divide objects into parts of which each is held out from one network.
 
     Every class is spread evenly; copies of a shape stay together.

@@ -45,6 +45,7 @@ from nextview.training.rollout import (
     judge_all,
     rollout,
 )
+from nextview.types import Float, Float32, Floats
 
 with extras():
     import torch
@@ -112,7 +113,7 @@ class Score:
 
     networks: Perceptrons
 
-    def __call__(self, features: NDArray[np.floating]) -> NDArray[np.floating]:
+    def __call__(self, features: Floats) -> Floats:
         with torch.inference_mode():
             return self.networks(
                 torch.from_numpy(features).to(self.networks.weights[0].dtype)
@@ -255,7 +256,7 @@ def averaged(policies: Sequence[Gain]) -> Gain:
     return replace(policies[0], score=Score(joined))
 
 
-def write_gain(card: Path, policy: Gain, about: PolicyCard, features: NDArray[np.float32]) -> float:
+def write_gain(card: Path, policy: Gain, about: PolicyCard, features: Float32) -> float:
     """Write a trained policy, NAME.onnx and NAME.json, replacing files of these names.
 
     Args:
@@ -319,7 +320,7 @@ class TrainedGain:
     card: Path
     objects: int
     validated_on: str
-    value: NDArray[np.float64]
+    value: Float
     travel_weight: float
     states: int
     difference: float
@@ -483,7 +484,7 @@ def _load(
     return _Data(learned, validated, objects, validated_on, about, rng)
 
 
-def _shapes(p: Predictions) -> NDArray[np.floating]:
+def _shapes(p: Predictions) -> Floats:
     """Return rows that are equal for equal shapes, (N, ...).
 
     Shapes are compared by their views, in scenes by their names.

@@ -17,6 +17,7 @@ from nextview.data.store import ViewStore
 from nextview.errors import DAMAGED, DatasetError
 from nextview.files import new_folder, only_one
 from nextview.recognition.network_input import CHANNELS_OF, InputKind, InputSpec, from_store
+from nextview.types import Index
 
 # views are mostly background and flat faces: a sixth is left, or less
 PACKING = Blosc("lz4", 5, Blosc.NOSHUFFLE)
@@ -34,7 +35,7 @@ class PackedViews:
     """
 
     packed: NDArray[np.uint8]
-    places: NDArray[np.int64]
+    places: Index
     size: tuple[int, ...]
 
     @property

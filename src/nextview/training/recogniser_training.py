@@ -19,7 +19,7 @@ from nextview.training.architectures import recogniser_network
 from nextview.training.inputs import PackedViews, ready_inputs
 from nextview.training.recipes import Hardware, RecogniserRecipe
 from nextview.training.runs import OwnBatches, fit, new_run, optimiser, start_from, train_once
-from nextview.types import Float, Index
+from nextview.types import Float, Float32, Index
 
 with extras():
     import lightning as L
@@ -40,7 +40,7 @@ class StoredInputs:
 
     inputs: NDArray[np.uint8] | PackedViews
     row: Index
-    azimuth_bins: NDArray[np.float32] | None = None
+    azimuth_bins: Float32 | None = None
 
 
 class Views(OwnBatches):
@@ -304,7 +304,7 @@ def mirror_planes(store: ViewStore, objects: Index) -> Float:
     return np.argmax(of_class, 1).astype(np.float64)
 
 
-def azimuth_bins(store: ViewStore, azimuths: int, planes: Float) -> NDArray[np.float32]:
+def azimuth_bins(store: ViewStore, azimuths: int, planes: Float) -> Float32:
     """Return the azimuth bin from which each view sees its object.
 
     Args:

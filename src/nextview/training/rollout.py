@@ -18,7 +18,7 @@ from nextview.recognition.belief import FixedLength, of_true_class
 from nextview.session.episode import run_episodes
 from nextview.training.card_fits import calibration_of
 from nextview.training.fitting_set import for_fitting
-from nextview.types import Float
+from nextview.types import Float, Index
 
 # belief in the truth, its logarithm, or whether the answer is right
 OBJECTIVES = ("belief", "log-belief", "right")
@@ -155,7 +155,7 @@ def value_after(table: ReplayTable, total: Float, n_views: NDArray | int, kind: 
     )
 
 
-def value_of(logs: Float, labels: NDArray[np.int64], kind: str) -> Float:
+def value_of(logs: Float, labels: Index, kind: str) -> Float:
     """Return the value of log-beliefs.
 
     Args:

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from nextview.data.folders import Entry, left_out_phrases, list_dataset
 from nextview.data.pool import WorkerDied, each
@@ -25,7 +24,7 @@ from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.teaching.thing_views import embeddings
 from nextview.training.fitting_set import card_to_fit
-from nextview.types import Float32
+from nextview.types import Float, Float32, Index
 
 REMEMBERED_VIEWS = 3
 """Remembered views of each known object as its mesh has it, and as many of a stretched copy."""
@@ -178,7 +177,7 @@ def _random_views(camera: Camera, wanted: int, rng: Generator) -> Float32:
 
 
 def fit_novelty(
-    known: Float32, held_out: Float32, labels: NDArray[np.int64], n_views: int = CALIBRATION_VIEWS
+    known: Float32, held_out: Float32, labels: Index, n_views: int = CALIBRATION_VIEWS
 ) -> Novelty:
     """Returns a novelty score of views, calibrated on objects that are not among the known ones.
 
@@ -210,7 +209,7 @@ def fit_novelty(
     return replace(raw, standard=standard, quantiles=table)
 
 
-def quantiles(scores: NDArray[np.float64], labels: NDArray[np.int64], n_views: int) -> Float32:
+def quantiles(scores: Float, labels: Index, n_views: int) -> Float32:
     """Return quantiles of the mean score over several views, with classes weighted evenly.
 
     Args:

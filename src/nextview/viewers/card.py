@@ -15,6 +15,7 @@ from nextview.recognition.poses import place_in_words
 from nextview.session.style import ACCENT, FAINT, GROUND, INK, WOOD, heat, rgb
 from nextview.session.view import View
 from nextview.things.expected_views import RivalPictures
+from nextview.types import Float, Mask
 from nextview.viewers.exploration import Walk
 
 CELL = 11  # side of a cell of a map, pixels
@@ -149,7 +150,7 @@ def _table(rows: Iterable[Iterable[str]]) -> str:
     return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
 
 
-def geometry_card(walk: Walk, direction: NDArray[np.float64], what: str) -> str:
+def geometry_card(walk: Walk, direction: Float, what: str) -> str:
     """The two leading hypotheses as rendered from a direction, (3,), and where they differ.
 
     Nothing where no geometry is known, or only one hypothesis is left.
@@ -180,7 +181,7 @@ def geometry_card(walk: Walk, direction: NDArray[np.float64], what: str) -> str:
 
 def differing(rivals: RivalPictures) -> NDArray[np.uint8]:
     """What shows of either hypothesis, faint, and the pixels in which they differ, (S, S, 3)."""
-    either: NDArray[np.bool_] = np.asarray(rivals.pictures.any(0))
+    either: Mask = np.asarray(rivals.pictures.any(0))
     drawn = np.where(either[..., None], rgb(FAINT), rgb(GROUND))
     return np.where(rivals.different[..., None], rgb(ACCENT), drawn).astype(np.uint8)
 

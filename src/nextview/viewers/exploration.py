@@ -26,7 +26,7 @@ from nextview.session.view import View
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.expected_views import RivalPictures
 from nextview.things.memory import AZIMUTHS, RINGS, TaughtRecogniser
-from nextview.types import Float
+from nextview.types import Float, Float32
 
 
 class StoredViews:
@@ -205,7 +205,7 @@ class Walk:
         return [view.index for view in self.views]
 
     @property
-    def points(self) -> NDArray[np.float32]:
+    def points(self) -> Float32:
         """All points seen so far, (N, 3), object frame, object radii."""
         seen = [view.observation.points for view in self.views if view.observation.seen]
         return np.concatenate([np.zeros((0, 3), np.float32), *seen])

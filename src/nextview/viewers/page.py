@@ -12,7 +12,6 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.checks import extras, whole
 from nextview.errors import NextviewError, UsageError
@@ -21,6 +20,7 @@ from nextview.policies.registry import map_policy_names, policy_names
 from nextview.recognition.model_card import find_models
 from nextview.session.style import GROUND, PAPER, rgb
 from nextview.simulation.sensor import SENSORS
+from nextview.types import Float
 from nextview.viewers.card import class_card, preview_card, walk_card
 from nextview.viewers.exploration import Exploration
 from nextview.viewers.walk_scene import WalkScene
@@ -188,10 +188,10 @@ class Page:
         self._draw()
         return taken
 
-    def _look(self, walk: int, where: int | NDArray[np.float64]) -> None:
+    def _look(self, walk: int, where: int | Float) -> None:
         self._act(lambda: self._drawn(lambda: self.exploration.walks[walk].look(where)), None)
 
-    def _drag(self, walk: int, place: NDArray[np.float64], let_go: bool) -> None:
+    def _drag(self, walk: int, place: Float, let_go: bool) -> None:
         """Show a preview while a camera is dragged, and take the view where it is released."""
         if let_go:
             self._preview.visible = False

@@ -4,14 +4,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from nextview.checks import extras
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.viewsphere import great_circle
 from nextview.session.style import ACCENT, FAINT, INK, WOOD, heat, rgb
-from nextview.types import Float
+from nextview.types import Float, Float32
 from nextview.viewers.card import warm
 from nextview.viewers.exploration import Walk
 
@@ -164,7 +163,7 @@ class WalkScene:
         self._drawn = len(places)
 
 
-def _rings(places: Float) -> NDArray[np.float32]:
+def _rings(places: Float) -> Float32:
     """Return level circles below views, (V, 3), as segments, (S, 2, 3).
 
     There are none for views that lie on no rings.
