@@ -31,10 +31,10 @@ from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.recognition.belief import FixedLength
 from nextview.session.result import Recognition
 from nextview.session.session import Session
-from nextview.session.style import BLUE, GREY, PAPER, STYLE
+from nextview.session.style import BLUE, FIGURE_STYLE, GREY, PAPER
 from nextview.simulation.robot_camera import RobotCamera
 from nextview.simulation.scene import Scene, build_scene, footprint
-from nextview.simulation.simulated import OTHER, TARGET
+from nextview.simulation.simulated import SHOWS_OTHER, SHOWS_TARGET
 
 SHOWS = 0.15
 """Share of the target that the first view shows at least."""
@@ -57,8 +57,8 @@ def session(
 def from_above(axis: Axes, scene: Scene, directions: list[np.ndarray]) -> None:
     """The table, and the way of the camera above it."""
     for outline, colour in [
-        (footprint(scene.target.vertices), TARGET),
-        *((i.footprint, OTHER) for i in scene.items),
+        (footprint(scene.target.vertices), SHOWS_TARGET),
+        *((i.footprint, SHOWS_OTHER) for i in scene.items),
     ]:
         axis.add_patch(Polygon(outline, color=COLOURS[colour]))
     at = 3 * np.array(directions)
@@ -111,7 +111,7 @@ def main(
     may = (shows >= SHOWS) & ~np.isin(np.arange(len(shows)), layout.unreachable)
     start = int(np.where(may, shows, np.inf).argmin())
     what = target.rpartition("_")[0].replace("_", " ")
-    with matplotlib.rc_context(STYLE | {"axes.grid": False, "axes.facecolor": PAPER}):
+    with matplotlib.rc_context(FIGURE_STYLE | {"axes.grid": False, "axes.facecolor": PAPER}):
         figure = Figure((3.1 * (views + 1), 3.5 * len(policies)))
         axes = figure.subplots(
             len(policies), views + 1, squeeze=False, gridspec_kw={"wspace": 0.06, "hspace": 0.2}

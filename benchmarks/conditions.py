@@ -206,9 +206,9 @@ def draw(table: dict[str, dict[str, tuple[float, float, float]]], path: Path) ->
     import matplotlib
     from matplotlib.figure import Figure
 
-    from nextview.session.style import SERIES, STYLE, to_png
+    from nextview.session.style import FIGURE_STYLE, SERIES, to_png
 
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(FIGURE_STYLE):
         figure = Figure((6.4, 4.6))
         axes = figure.subplots()
         for k, ((models, rows), colour) in enumerate(zip(table.items(), SERIES, strict=False)):

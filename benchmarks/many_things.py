@@ -51,7 +51,7 @@ from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin, rotation_z
 from nextview.recognition.model_card import (
-    FEATURES,
+    FEATURE_NETWORK,
     ModelCard,
     Thing,
     Training,
@@ -65,7 +65,7 @@ from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.teaching.memory_fit import size_evidence
 from nextview.teaching.thing_views import COARSER, embeddings
-from nextview.things.memory import AZIMUTHS, PICTURE, RINGS, Memory, TaughtRecogniser
+from nextview.things.memory import AZIMUTHS, RINGS, THING_PICTURE, Memory, TaughtRecogniser
 from nextview.things.stored_surfaces import StoredSurfaces
 from nextview.things.surface import FINEST_ERROR, Surface
 from nextview.things.taught import TaughtThings
@@ -184,14 +184,14 @@ def join(out: Path, names: Sequence[str], found: Sequence[dict[str, NDArray]]) -
         held_out=np.zeros((count, 1, views.shape[-1]), np.float16),
         held_out_views=np.zeros((count, 1, 2), np.float32),
         radii=radii,
-        pictures=np.zeros((count, PICTURE, PICTURE), np.uint8),
+        pictures=np.zeros((count, THING_PICTURE, THING_PICTURE), np.uint8),
         head=np.zeros((views.shape[-1], count), np.float32),
         head_bias=np.zeros(count, np.float32),
         surfaces=StoredSurfaces.of(surfaces),
     )
 
     bundled = find_card("ycb")
-    features = find_card(FEATURES)
+    features = find_card(FEATURE_NETWORK)
     assert bundled.memory is not None
     assert bundled.memory.verification is not None
     sha256 = memory.save(out / "memory.safetensors", overwrite=True)

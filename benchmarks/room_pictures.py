@@ -17,7 +17,7 @@ from scipy.ndimage import binary_closing
 
 from nextview.files import new_folder
 from nextview.sensing import Frame
-from nextview.session.style import ACCENT, BLUE, INK, PAPER, STYLE
+from nextview.session.style import ACCENT, BLUE, FIGURE_STYLE, INK, PAPER
 
 Mask = NDArray[np.bool_]
 
@@ -90,7 +90,7 @@ def write_page(folder: Path, pictures: Iterable[Picture], causes: Sequence[str])
 
 def _draw(pictures: Sequence[Picture], path: Path) -> None:
     rows = -(-len(pictures) // ACROSS)
-    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
+    with matplotlib.rc_context(FIGURE_STYLE | {"axes.grid": False}):
         figure = Figure((ACROSS * WIDTH, rows * HEIGHT), facecolor=PAPER)
         axes = figure.subplots(rows, ACROSS, squeeze=False).ravel()
         for axis in axes:

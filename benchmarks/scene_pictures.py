@@ -23,15 +23,19 @@ from nextview.errors import UsageError
 from nextview.geometry.depth import headlight
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.session.style import PAPER, STYLE
+from nextview.session.style import FIGURE_STYLE, PAPER
 from nextview.simulation.scene import Scene, build_scene
-from nextview.simulation.scene_layout import LEVELS
-from nextview.simulation.simulated import OTHER, TABLE_TOP, TARGET, SceneCamera
+from nextview.simulation.scene_layout import CLUTTER_LEVELS
+from nextview.simulation.simulated import SHOWS_OTHER, SHOWS_TABLE, SHOWS_TARGET, SceneCamera
 
 SIZE = 240
 WIDE = 0.55
 """Of the focal length with which the target fills the picture."""
-COLOURS = {TARGET: (0.95, 0.55, 0.15), OTHER: (0.74, 0.71, 0.67), TABLE_TOP: (0.95, 0.92, 0.86)}
+COLOURS = {
+    SHOWS_TARGET: (0.95, 0.55, 0.15),
+    SHOWS_OTHER: (0.74, 0.71, 0.67),
+    SHOWS_TABLE: (0.95, 0.92, 0.86),
+}
 VIEWS = (10, 12, 14, 16, 18, 27)
 
 
@@ -65,12 +69,12 @@ def main(
         raise UsageError(f"{dataset}: no object of the split {split} is called {target}")
     meshes = Meshes(dataset, tuple(sorted(files.values())))
     sphere = ViewSphere.named("40")
-    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        figure = Figure((1.65 * len(VIEWS), 1.85 * len(LEVELS)))
+    with matplotlib.rc_context(FIGURE_STYLE | {"axes.grid": False}):
+        figure = Figure((1.65 * len(VIEWS), 1.85 * len(CLUTTER_LEVELS)))
         axes = figure.subplots(
-            len(LEVELS), len(VIEWS), gridspec_kw={"wspace": 0.04, "hspace": 0.16}
+            len(CLUTTER_LEVELS), len(VIEWS), gridspec_kw={"wspace": 0.04, "hspace": 0.16}
         )
-        for row, level in zip(axes, LEVELS, strict=True):
+        for row, level in zip(axes, CLUTTER_LEVELS, strict=True):
             layout = draw_scene(files[target], meshes, level, seed, f"{target}@{level}-0")
             scene = build_scene(layout, dataset)
             for axis, view in zip(row, VIEWS, strict=True):

@@ -45,8 +45,8 @@ from nextview.data.scene_views import scenes_of
 from nextview.errors import UsageError
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import of_true_class
-from nextview.session.style import STYLE
-from nextview.simulation.scene_layout import LEVELS
+from nextview.session.style import FIGURE_STYLE
+from nextview.simulation.scene_layout import CLUTTER_LEVELS
 from nextview.training.rollout import ReplayTable
 from nextview.training.rollout import judge as follow
 
@@ -154,7 +154,7 @@ def judge(
         seed: of all that is random.
     """
     names = list(dict.fromkeys([REFERENCE, *policies, ours, *CEILINGS]))
-    found: dict[str, dict[str, list[Reached]]] = {level: {} for level in LEVELS}
+    found: dict[str, dict[str, list[Reached]]] = {level: {} for level in CLUTTER_LEVELS}
     looked_at = {name.rpartition("@")[0] for path in known for name in Predictions.load(path).names}
     for path in predictions:
         p = Predictions.load(path)
@@ -271,7 +271,7 @@ def draw(scenes: dict[str, dict[str, Reached]], out: Path) -> None:
     """Accuracy after 1 to 5 views against the travel until then, in cells and in seconds, by
     level.
     """
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(FIGURE_STYLE):
         figure = Figure((3.2 * len(scenes), 6.4), layout="constrained")
         axes = figure.subplots(2, len(scenes), sharey="col", squeeze=False)
         for column, (level, of) in zip(axes.T, scenes.items(), strict=True):
@@ -389,7 +389,9 @@ def calibration(
     )
     print("|---" * 9 + "|")
     rng = np.random.default_rng([seed, 1])
-    for name, k in product((*(name for name in LEVELS if name in level), "any"), (1, *COUNTS)):
+    for name, k in product(
+        (*(name for name in CLUTTER_LEVELS if name in level), "any"), (1, *COUNTS)
+    ):
         mine = (level == name) | (name == "any")
         share = show[:, k - 1]
         kept = {"all": mine} | {

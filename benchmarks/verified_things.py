@@ -50,7 +50,7 @@ from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import ViewSphere, rotation_z
 from nextview.simulation.scene import boxes_around
-from nextview.simulation.sensed_camera import TABLE, SensedCamera
+from nextview.simulation.sensed_camera import BARE_TABLE_RADIUS, SensedCamera
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
@@ -294,7 +294,7 @@ def shown(taught: Taught, things: TaughtThings, thing: int, draw: int, setting: 
         setting.sensor,
         np.random.default_rng([thing, draw, 7]),
         around=around,
-        table=0.0 if setting.any_orientation else TABLE,
+        table=0.0 if setting.any_orientation else BARE_TABLE_RADIUS,
     )
     observations = []
     cameras = []

@@ -39,7 +39,7 @@ from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
 from nextview.data.predictions import Predictions
 from nextview.errors import UsageError
-from nextview.session.style import GREY, STYLE, to_png
+from nextview.session.style import FIGURE_STYLE, GREY, to_png
 
 POLICIES = (
     "random",
@@ -102,7 +102,7 @@ def front(table: pd.DataFrame, travel_weights: dict[str, list[tuple[float, str]]
             text_of[name] = f"{Path(family).name if name == family else ''}@{travel_weight:g}"
         if family not in text_of:
             text_of[members[0][1]] = Path(members[0][1]).name
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(FIGURE_STYLE):
         figure = Figure((3.7 * len(n_views), 4.4), dpi=160, layout="constrained")
         FigureCanvasAgg(figure)  # measures text
         panels = figure.subplots(1, len(n_views), sharey=True, squeeze=False)[0]

@@ -66,7 +66,7 @@ def example_maps(p: Predictions, name: str, rng: np.random.Generator) -> Figure:
     order = np.argsort([error[labels == index].mean() for index in classes], kind="stable")
     classes = classes[np.sort(order[_steps(len(classes), ROWS)])]
     gap = np.full((true.shape[1], 1), np.nan)
-    with matplotlib.rc_context(style.STYLE):
+    with matplotlib.rc_context(style.FIGURE_STYLE):
         figure = style.PlainFigure((9.6, 0.6 + 1.3 * len(classes)))
         grid = figure.subplots(
             len(classes), EXAMPLES, squeeze=False, gridspec_kw={"hspace": 0.35, "wspace": 0.12}

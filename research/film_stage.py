@@ -15,7 +15,7 @@ from embreex.rtcore_scene import EmbreeScene
 from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 
-from nextview.geometry.viewsphere import LAYOUTS, great_circle, level_pose, look_at_origin
+from nextview.geometry.viewsphere import VIEW_LAYOUTS, great_circle, level_pose, look_at_origin
 from nextview.policies.discriminate import Rivals
 from nextview.session.style import heat
 
@@ -279,7 +279,7 @@ SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 
 def dots(draw: ImageDraw.ImageDraw, shot: Shot, look: Look, colour: Colour) -> None:
     """The candidate views, in the colours of what they are worth; those behind the thing faint."""
-    places = LAYOUTS["40"].directions * REACH * shot.radius + shot.centre
+    places = VIEW_LAYOUTS["40"].directions * REACH * shot.radius + shot.centre
     flat, depth = shot.place(places)
     known = look.values is not None and np.isfinite(look.values).any()
     colours = heat(look.values) if known else np.full((len(places), 3), 150)

@@ -58,7 +58,7 @@ from nextview.errors import UsageError
 from nextview.files import new_file
 from nextview.recognition.map_names import map_name
 from nextview.recognition.model_card import find_card, find_models
-from nextview.session.style import BLUE, INK, STYLE, PlainFigure, to_png
+from nextview.session.style import BLUE, FIGURE_STYLE, INK, PlainFigure, to_png
 from nextview.training.card_fits import valley_gains
 from research.measure import measure as measure_meshes
 
@@ -256,7 +256,7 @@ def figure(table: pd.DataFrame, n_views: tuple[int, ...]) -> Figure:
     classes = [
         label for label in table[table["quantity"] == "correlation"]["label"].unique() if label
     ]
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(FIGURE_STYLE):
         made = PlainFigure((13, 0.34 * len(names) + 1.9), layout="constrained")
         left, middle, right = made.subplots(
             1, 3, sharey=True, width_ratios=[1, 0.11 * len(classes) + 0.6, 1]

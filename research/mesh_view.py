@@ -14,7 +14,7 @@ from nextview.data.measures import MeasuredView
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.observation import checked_pose, pinhole
 from nextview.geometry.ray_caster import embree_scene
-from nextview.geometry.viewsphere import DISTANCE
+from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.simulation.simulated import SimulatedCamera
 
 APART = 4  # pixels of a row between those that are asked first which face they show; a power of 2
@@ -84,7 +84,7 @@ class FaceCamera:
     ``distance`` are as there.
     """
 
-    def __init__(self, mesh: Mesh, size: int = 224, distance: float = DISTANCE) -> None:
+    def __init__(self, mesh: Mesh, size: int = 224, distance: float = CAMERA_DISTANCE) -> None:
         self.surface = Surface(mesh.vertices, mesh.faces)
         self.intrinsics = pinhole(size, distance)
         self._scene = embree_scene([(mesh.vertices, mesh.faces)])
@@ -154,7 +154,7 @@ def _fill(found: NDArray[np.int32], z: NDArray[np.float32], step: int) -> None:
 
 
 def view_of(
-    mesh: Mesh, pose: NDArray[np.float64], size: int = 224, distance: float = DISTANCE
+    mesh: Mesh, pose: NDArray[np.float64], size: int = 224, distance: float = CAMERA_DISTANCE
 ) -> MeshView:
     """What a measure is handed of a mesh, seen from a pose, (4, 4), object frame, object radii."""
     return FaceCamera(mesh, size, distance).view(

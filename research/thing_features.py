@@ -39,7 +39,7 @@ from nextview.files import sha256_of
 from nextview.geometry.mesh import load_mesh, make_mesh
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.recognition.inference import FEATURES_OUTPUT, OnnxFile, open_onnx
-from nextview.recognition.model_card import BUNDLED, RECOGNISER, find_card, read_card
+from nextview.recognition.model_card import BUNDLED_MODELS, RECOGNISER, find_card, read_card
 from nextview.recognition.network_input import from_observations
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
@@ -169,7 +169,10 @@ def joined(lite: Path, middle: NDArray, projection: NDArray, out: Path) -> None:
     """Write one network: both files side by side, then the projection to unit vectors."""
     part = out.with_suffix(".part.onnx")
     utils.extract_model(
-        str(read_card(BUNDLED / f"{RECOGNISER}.json").path), str(part), ["input"], ["features"]
+        str(read_card(BUNDLED_MODELS / f"{RECOGNISER}.json").path),
+        str(part),
+        ["input"],
+        ["features"],
     )
     graphs = [
         compose.add_prefix(onnx.load(path), name)
@@ -229,7 +232,7 @@ def main(
         lite,
         8,
     )
-    held_out = set(read_card(BUNDLED / f"{RECOGNISER}.json").held_out)
+    held_out = set(read_card(BUNDLED_MODELS / f"{RECOGNISER}.json").held_out)
     meshes = [
         e.path for e in list_dataset(dataset) if e.split == "train" and e.name not in held_out
     ]

@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import ResultsError
 from nextview.files import new_file
-from nextview.session.style import ACCENT, INK, LIGHT_BLUE, STYLE, PlainFigure, to_png
+from nextview.session.style import ACCENT, FIGURE_STYLE, INK, LIGHT_BLUE, PlainFigure, to_png
 
 SELECTED = {"class_accuracy": max, "validation_mse": min}
 """By which score, and which way, the kept epoch was chosen: the first that a log has."""
@@ -43,7 +43,7 @@ def training_curves(log: dict[str, list[float]]) -> Figure:
     twins = {f"{VALIDATION}{name}" for name in log}
     panels = [name for name in log if name not in ("epoch", "step", "seconds", *twins)]
     selected = next((name for name in SELECTED if name in log), None)
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(FIGURE_STYLE):
         figure = PlainFigure((4.6, 0.4 + 1.5 * len(panels)), layout="constrained")
         for axes, name in zip(
             figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0], panels, strict=True

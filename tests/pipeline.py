@@ -25,7 +25,7 @@ from nextview.cli.main import main
 from nextview.data.folders import Entry
 from nextview.data.measures import MeasuredView
 from nextview.data.predictions import Predictions
-from nextview.data.samples import SAMPLES, boxes_mesh
+from nextview.data.samples import SAMPLE_MESHES, boxes_mesh
 from nextview.data.store import DONE, ViewStore, describe
 from nextview.geometry.mesh import Mesh, make_mesh
 from nextview.geometry.observation import pinhole
@@ -85,7 +85,7 @@ def write_furniture(folder: Path, train: int = 4, test: int = 2, seed: int = 0) 
             scale = rng.uniform(0.8, 1.25, 3)
             boxes = [
                 tuple(tuple(np.multiply(corner, scale)) for corner in box)
-                for box in SAMPLES[label]()
+                for box in SAMPLE_MESHES[label]()
             ]
             split = "train" if k < train else "test"
             write_off(folder / label / split / f"{label}_{k}.off", boxes_mesh(boxes, label))

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare
 
-from nextview.geometry.depth import POINTS, visible_points
+from nextview.geometry.depth import CLOUD_POINTS, visible_points
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.recognition.network_input import cloud_input
@@ -63,7 +63,7 @@ def test_pixels_are_drawn_without_replacement_and_repeat_evenly_when_few(visible
         assert (points == 0).all()
         return
     drawn, times = np.unique(pixels_of(points, POSES[10], intrinsics), axis=0, return_counts=True)
-    assert len(drawn) == min(visible, POINTS)
+    assert len(drawn) == min(visible, CLOUD_POINTS)
     assert np.ptp(times) <= 1
 
 

@@ -159,12 +159,12 @@ def test_meshes_are_rendered_as_the_agent_goes(tmp_path):
     assert observation["depth"].shape == (112, 112)
     assert observation["depth"].max() > 2
     # The beliefs are those of a session that takes the same views.
-    from nextview.data.samples import SAMPLES, sample_mesh
+    from nextview.data.samples import SAMPLE_MESHES, sample_mesh
 
     plain = gymnasium.make("nextview/RecogniseMesh-v0", inputs=("belief",), max_views=2)
     observation, _ = plain.reset(options={"object": 0, "start": 3})
     system = load(policy="spread", max_views=2)
-    camera = simulated(sample_mesh(next(iter(SAMPLES))))
+    camera = simulated(sample_mesh(next(iter(SAMPLE_MESHES))))
     session: Session = system.session(start=3)
     np.testing.assert_allclose(
         observation[:10], session.update(camera.observe(session.pose)).belief, atol=1e-5

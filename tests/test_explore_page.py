@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 
 from nextview.data.samples import sample_mesh
 from nextview.viewers.exploration import Exploration, ShownObject, shown_objects
-from nextview.viewers.page import NOTHING, Page
+from nextview.viewers.page import NO_ANSWER, Page
 
 PATIENCE = 60_000
 """Milliseconds for what takes one on an idle machine."""
@@ -49,7 +49,7 @@ def test_what_is_chosen_is_done_and_shown(page):
     assert [walk.visited for walk in exploration.walks] == [[5], [5]]
     page._object.value = "monitor"
     until(lambda: exploration.shown.name == "monitor", "another object")
-    page._second.value = NOTHING
+    page._second.value = NO_ANSWER
     until(lambda: exploration.policies == ["gain"] and len(page._scenes) == 1, "one policy")
     page._sensor.value = "kinect"
     until(lambda: exploration.sensor == "kinect:1", "a sensor")
@@ -150,7 +150,7 @@ def test_a_policy_that_is_not_listed_is_not_imported(page, tmp_path, monkeypatch
     with sockets(page) as socket:
         socket.send(msgspec.msgpack.encode(CAMERA))  # the first message of a page
         until(lambda: page.server.get_clients(), "viser knows the page")
-        for sent in ("evilmod:go", NOTHING, 3, None):
+        for sent in ("evilmod:go", NO_ANSWER, 3, None):
             message = {
                 "type": "GuiUpdateMessage",
                 "uuid": page._policy._impl.uuid,

@@ -13,7 +13,14 @@ from nextview import Session, Stopping, ViewSphere
 from nextview.errors import SessionError, UsageError
 from nextview.policies.registry import make_policy
 from nextview.sensing import Frame, ObservedObject
-from nextview.session.limits import BEHIND_WALL, HIDDEN, TOO_HIGH, TOO_LOW, TOO_NEAR, Limits
+from nextview.session.limits import (
+    BEHIND_SOMETHING,
+    BEHIND_WALL,
+    TOO_HIGH,
+    TOO_LOW,
+    TOO_NEAR,
+    Limits,
+)
 
 SPHERE = ViewSphere.named("40")
 SHAPE = 240, 320
@@ -135,7 +142,7 @@ def test_what_another_thing_hides_is_left_out_until_a_frame_shows_that_it_is_fre
     board = box((0.3, 0.02, 0.35), (0, 0.25, 0.175))
     session = begin(tiny, distance=0.6, point=(0, 0, 0.03))
     session.update(look(pose_at(25, -90, 0.8, (0, 0, 0.1)), BRICK, board, TABLE))
-    hidden = np.array(session.left_out) == HIDDEN
+    hidden = np.array(session.left_out) == BEHIND_SOMETHING
     assert hidden.any()
     assert (places(session)[hidden, 1] > 0.3).all()
 

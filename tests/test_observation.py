@@ -12,7 +12,7 @@ from pipeline import meshed
 
 from nextview.data.samples import sample_mesh
 from nextview.errors import ObservationError
-from nextview.geometry.observation import LEAST_PIXELS, LEAST_SHARE, Observation, pinhole
+from nextview.geometry.observation import LEAST_PIXELS, LEAST_VISIBLE_SHARE, Observation, pinhole
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.simulation.simulated import SimulatedCamera
 
@@ -52,11 +52,11 @@ def test_a_view_shows_something_from_so_many_pixels_on(size):
         depth[:pixels] = 3
         view = Observation(depth.reshape(size, size), POSE, pinhole(size, 3.0))
         assert view.seen == (pixels == least)
-    assert least - 1 < max(LEAST_PIXELS, LEAST_SHARE * size**2) <= least
+    assert least - 1 < max(LEAST_PIXELS, LEAST_VISIBLE_SHARE * size**2) <= least
 
 
 def test_specks_far_apart_show_nothing_until_they_are_many_or_touch():
-    """Squares of 8 x 8 pixels in an image of 112: below LEAST_SHARE each."""
+    """Squares of 8 x 8 pixels in an image of 112: below LEAST_VISIBLE_SHARE each."""
     for squares, apart, seen in [
         (1, 9, False),
         (4, 9, False),

@@ -15,7 +15,7 @@ from nextview.policies.maps import MapPeak, SpherePeak
 from nextview.policies.off_grid import OffGrid, anywhere
 from nextview.policies.registry import POLICIES, make_policy, make_policy_anywhere
 from nextview.recognition.belief import Calibration, FixedLength
-from nextview.session.episode import VISITED, Episodes
+from nextview.session.episode import VISITED_ANGLE, Episodes
 
 SPHERE = ViewSphere.named("40")
 CLASSES = 10
@@ -208,12 +208,12 @@ def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(
             to = int(step.next_views[0])
             path.append(to)
             angles = np.arccos(np.clip(np.array(places) @ sphere.directions.T, -1, 1))
-            visited = {*angles.argmin(1), *np.flatnonzero((angles < VISITED - 1e-6).any(0))}
+            visited = {*angles.argmin(1), *np.flatnonzero((angles < VISITED_ANGLE - 1e-6).any(0))}
             free = set(np.flatnonzero(reachable)) - visited
             if to >= 0:
                 assert to in free
             else:
-                near = set(np.flatnonzero((angles <= VISITED + 1e-6).any(0)))
+                near = set(np.flatnonzero((angles <= VISITED_ANGLE + 1e-6).any(0)))
                 assert len(path) == min(8, len(sphere)) or free <= near
         assert not episodes.outcome.confident[0]
         paths.append(path)

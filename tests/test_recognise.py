@@ -21,7 +21,7 @@ from nextview.cli.main import main
 from nextview.errors import ModelError, NextviewError, ResultsError, UsageError
 from nextview.policies.policy_card import bundled_policies
 from nextview.recognition.inference import MapNetwork, NetworkRecogniser
-from nextview.recognition.model_card import BUNDLED, RECOGNISER, bundled_cards
+from nextview.recognition.model_card import BUNDLED_MODELS, RECOGNISER, bundled_cards
 from nextview.session import fonts
 from nextview.session.style import PlainFigure
 
@@ -154,7 +154,7 @@ def test_bundled_models_are_what_their_cards_say():
     cards = bundled_cards()
     assert {card.kind for card in cards.values()} >= {"recogniser", "lem"}
     # nothing that is pickled
-    assert {path.suffix for path in BUNDLED.iterdir()} <= {".onnx", ".json", ".safetensors"}
+    assert {path.suffix for path in BUNDLED_MODELS.iterdir()} <= {".onnx", ".json", ".safetensors"}
     assert sum(card.path.stat().st_size for card in cards.values()) < 90e6
     for card in cards.values():
         training = card.training

@@ -17,7 +17,7 @@ from nextview.data.room_drawing import LIFE_SIZES, draw_rooms
 from nextview.errors import DatasetError, UsageError
 from nextview.geometry.viewsphere import level_pose
 from nextview.sensing import ObservedObject
-from nextview.simulation.room import UNEVEN, Room, RoomCamera, build_room
+from nextview.simulation.room import UNEVEN_HEIGHT, Room, RoomCamera, build_room
 from nextview.simulation.room_layout import RoomLayout, Slab, Standing
 from nextview.simulation.scene import footprint, mesh_hash, separation
 from nextview.simulation.sensor import SENSORS
@@ -82,7 +82,7 @@ def test_a_frame_shows_the_cube_the_wall_and_the_floor_where_they_are(tmp_path):
     places = frame.positions(rows, columns)
     x, y, z = np.abs(places.T)
     from_surface = np.stack([z, 3 - x, 2 - y, 2.5 - z], 1)
-    assert from_surface.min(1).max() < 4 * UNEVEN + 0.002
+    assert from_surface.min(1).max() < 4 * UNEVEN_HEIGHT + 0.002
     assert {*from_surface.argmin(1)} == {0, 1, 2, 3}  # floor, the wall behind, side walls, ceiling
 
 

@@ -32,7 +32,7 @@ from nextview.sensing.expected_visibility import SeenScene, expected_visibility
 from nextview.session.session import Session
 from nextview.simulation.robot_camera import RobotCamera
 from nextview.simulation.scene_layout import Block
-from nextview.simulation.simulated import TARGET, OccludedCamera, SceneCamera
+from nextview.simulation.simulated import SHOWS_TARGET, OccludedCamera, SceneCamera
 from research.plan import plan
 
 TEN = tuple(read_table(ACCURACY[10]))
@@ -48,7 +48,7 @@ def looks(scene, *views: int) -> list[SceneView]:
     camera, found = SceneCamera(scene, k, (80, 80)), []
     for view in views:
         depth, owner = camera.look(GRID.poses[view])
-        found.append(SceneView(depth, owner == TARGET, GRID.poses[view], k, True))
+        found.append(SceneView(depth, owner == SHOWS_TARGET, GRID.poses[view], k, True))
     return found
 
 

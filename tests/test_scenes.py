@@ -11,19 +11,26 @@ import trimesh
 from matplotlib.path import Path as Outline
 
 from nextview import SimulatedCamera
-from nextview.data.scene_drawing import SPREAD, TOLERANCE, draw_scenes
+from nextview.data.scene_drawing import SPREAD, VISIBLE_TOLERANCE, draw_scenes
 from nextview.data.scene_views import scene_views
 from nextview.data.store import ViewStore, check
 from nextview.errors import DatasetError
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.simulation.robot_camera import RobotCamera
-from nextview.simulation.scene import TABLE, Scene, block_item, build_scene, footprint, separation
-from nextview.simulation.scene_layout import LEVELS, Block, SceneLayout
+from nextview.simulation.scene import (
+    SCENE_TABLE,
+    Scene,
+    block_item,
+    build_scene,
+    footprint,
+    separation,
+)
+from nextview.simulation.scene_layout import CLUTTER_LEVELS, Block, SceneLayout
 from nextview.simulation.simulated import (
-    NOTHING,
-    OTHER,
-    TABLE_TOP,
-    TARGET,
+    SHOWS_NOTHING,
+    SHOWS_OTHER,
+    SHOWS_TABLE,
+    SHOWS_TARGET,
     OccludedCamera,
     SceneCamera,
 )
@@ -60,12 +67,12 @@ def test_every_pixel_has_its_owner():
     row, column = np.mgrid[:80, :80]
     rays = np.stack([(column + 0.5 - 40) / 40, (row + 0.5 - 40) / 40, np.ones((80, 80))], -1)
     places = (depth[..., None] * rays) @ pose[:3, :3].T + pose[:3, 3]
-    np.testing.assert_allclose(np.linalg.norm(places[owner == TARGET], axis=-1), 1, atol=0.01)
-    np.testing.assert_allclose(places[owner == TABLE_TOP][:, 2], -1, atol=1e-4)
-    assert np.abs(places[owner == TABLE_TOP][:, :2]).max() <= TABLE + 1e-4
-    assert (np.linalg.norm(places[owner == OTHER][:, :2] - (0, 2), axis=1) < 0.36).all()
-    assert {*np.unique(owner)} == {NOTHING, TARGET, OTHER, TABLE_TOP}
-    np.testing.assert_array_equal(depth == 0, owner == NOTHING)
+    np.testing.assert_allclose(np.linalg.norm(places[owner == SHOWS_TARGET], axis=-1), 1, atol=0.01)
+    np.testing.assert_allclose(places[owner == SHOWS_TABLE][:, 2], -1, atol=1e-4)
+    assert np.abs(places[owner == SHOWS_TABLE][:, :2]).max() <= SCENE_TABLE + 1e-4
+    assert (np.linalg.norm(places[owner == SHOWS_OTHER][:, :2] - (0, 2), axis=1) < 0.36).all()
+    assert {*np.unique(owner)} == {SHOWS_NOTHING, SHOWS_TARGET, SHOWS_OTHER, SHOWS_TABLE}
+    np.testing.assert_array_equal(depth == 0, owner == SHOWS_NOTHING)
 
 
 def test_shares_are_those_of_another_ray_caster(cluttered, furniture):
@@ -109,11 +116,14 @@ def test_drawn_scenes_stand_on_their_table_and_never_overlap(cluttered, furnitur
         assert len(scene.items) >= 3
         for item in scene.items:
             assert item.vertices[:, 2].min() == pytest.approx(scene.floor, abs=1e-12)
-            assert np.abs(item.footprint).max() <= TABLE
+            assert np.abs(item.footprint).max() <= SCENE_TABLE
         outlines = [footprint(scene.target.vertices), *(item.footprint for item in scene.items)]
         for a, b in combinations(outlines, 2):
             assert not Outline(a).intersects_path(Outline(b), filled=True)
-        assert abs(np.mean(layout.visible) - LEVELS[layout.level]) < SPREAD + TOLERANCE + 0.03
+        assert (
+            abs(np.mean(layout.visible) - CLUTTER_LEVELS[layout.level])
+            < SPREAD + VISIBLE_TOLERANCE + 0.03
+        )
         split = path.parent.name
         assert all(f"/{split}/" in placed.mesh for placed in (layout.target, *layout.objects))
         assert layout.target.mesh not in [placed.mesh for placed in layout.objects]
@@ -170,7 +180,7 @@ def test_a_store_of_scenes_holds_what_shows_and_the_scene(cluttered_views, clutt
     shown = np.count_nonzero(opened.depth(i), axis=(1, 2)) / alone
     assert shown == pytest.approx(views.visible_share, abs=0.05)
     # The same object fills the same part of both pictures.
-    wide = np.count_nonzero(views.owner == TARGET, axis=(1, 2)) / views.intrinsics[0, 0] ** 2
+    wide = np.count_nonzero(views.owner == SHOWS_TARGET, axis=(1, 2)) / views.intrinsics[0, 0] ** 2
     narrow = np.count_nonzero(opened.depth(i), axis=(1, 2)) / opened.intrinsics[0, 0] ** 2
     assert wide == pytest.approx(narrow, abs=0.1 * narrow.max())
 

@@ -9,7 +9,7 @@ from pipeline import SPHERE, refused
 
 from nextview.data.measures import measure
 from nextview.data.rendering import RenderOptions, render
-from nextview.data.store import RENDERED, ViewStore, check
+from nextview.data.store import RENDERED_ARRAYS, ViewStore, check
 from nextview.errors import DatasetError
 
 
@@ -41,7 +41,7 @@ def found(views: Path) -> dict[str, str]:
     return {name: problem for name, problem in check(views, workers=0) if problem}
 
 
-@pytest.mark.parametrize("name", [name for name in RENDERED if name != "status"])
+@pytest.mark.parametrize("name", [name for name in RENDERED_ARRAYS if name != "status"])
 @pytest.mark.parametrize("how", ["flipped", "cut", "lost"])
 def test_damage_is_named_by_every_read_and_by_check(store, name, how):
     ViewStore.open(store).note(unit="cm")
@@ -71,7 +71,7 @@ def test_a_damaged_object_ends_the_command_that_reads_it(store, models, tmp_path
     assert "1 of 18 objects are damaged" in refused(capsys, "check", store, "--workers", 0)
 
 
-@pytest.mark.parametrize("name", RENDERED)
+@pytest.mark.parametrize("name", RENDERED_ARRAYS)
 def test_check_and_render_say_which_array_is_missing(store, furniture, capsys, name):
     shutil.rmtree(store / name)
     for command in (["check", store], ["render", furniture, store, "--size", 32]):

@@ -11,12 +11,12 @@ from pipeline import SAMPLE_FILES, make_map_network, make_recogniser, run_python
 
 import nextview
 from nextview.cli.main import main
-from nextview.data.samples import SAMPLES, sample_mesh
+from nextview.data.samples import SAMPLE_MESHES, sample_mesh
 
 SAMPLE = SAMPLE_FILES / "chair.off"
 
 
-@pytest.mark.parametrize("name", SAMPLES)
+@pytest.mark.parametrize("name", SAMPLE_MESHES)
 def test_sample_files_are_the_sample_meshes(name):
     read, made = nextview.load_mesh(SAMPLE.with_stem(name)), sample_mesh(name)
     np.testing.assert_allclose(read.vertices, made.vertices, atol=1e-6)
@@ -97,7 +97,7 @@ def test_the_bundled_models_keep_their_accuracy():
 def test_the_sample_meshes_are_told_apart_from_any_view():
     """Falls where the bundled models do."""
     system = nextview.load()
-    both = itertools.product(SAMPLES, range(0, 40, 3))
+    both = itertools.product(SAMPLE_MESHES, range(0, 40, 3))
     assert (
         np.mean([system.recognise(SAMPLE.with_stem(n), start=k).answer == n for n, k in both]) > 0.9
     )

@@ -24,7 +24,7 @@ from nextview.things.ground import levelling
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.proposals import propose
 from nextview.things.registration import (
-    COARSE,
+    COARSE_LEVELS,
     FINE,
     FIRST,
     align,
@@ -40,7 +40,7 @@ from nextview.things.taught import TaughtThings
 from nextview.things.unknown import KnownResiduals
 from nextview.things.verification import likelihood
 from nextview.things.verifier import Verified, Verifier
-from nextview.things.weighing import CORRELATIONS, EvidenceWeights, JudgedEpisode, fit_weights
+from nextview.things.weighing import VIEW_CORRELATIONS, EvidenceWeights, JudgedEpisode, fit_weights
 
 SIDE = 40
 VIEWS = ((25.0, 20.0), (50.0, 140.0), (35.0, 260.0))  # elevation and azimuth, degrees
@@ -119,7 +119,7 @@ def aligned(mesh: Mesh, observations, yaws) -> tuple[SurfaceCaster, np.ndarray, 
     coarse = [depth_view(each, 24) for each in observations]
     fine = [depth_view(each, SIDE) for each in observations]
     found = start(np.zeros(len(yaws), int), rotation_z(yaws), len(observations))
-    found = align(caster, centred(caster, found, coarse), coarse, (*FIRST, *COARSE))
+    found = align(caster, centred(caster, found, coarse), coarse, (*FIRST, *COARSE_LEVELS))
     found = align(caster, found, fine, FINE)
     judged = [likelihood(view, render(caster, found, view, k)).mean for k, view in enumerate(fine)]
     return found, found.poses(caster), np.sum(judged, 0)
@@ -186,7 +186,9 @@ def test_a_missing_handle_lowers_the_likelihood():
         observation = views_of(cup(handle), directions=((30.0, 60.0),))[0]
         view = depth_view(observation, SIDE)
         found = start(np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), 1)
-        found = align(caster, centred(caster, found, [view]), [view], (*FIRST, *COARSE, *FINE))
+        found = align(
+            caster, centred(caster, found, [view]), [view], (*FIRST, *COARSE_LEVELS, *FINE)
+        )
         with_it, without = likelihood(view, render(caster, found, view, 0)).mean
         assert (with_it > without + 0.1) == handle
 
@@ -578,7 +580,7 @@ def test_views_that_err_together_are_not_trusted_as_many():
         for case in range(4)
     ]
     fitted = fit_weights(both)
-    assert fitted.correlation == max(CORRELATIONS)
+    assert fitted.correlation == max(VIEW_CORRELATIONS)
     assert fitted.geometry == 10  # log-odds of 3 to 1 are 1.1
     with pytest.raises(ModelError, match="fitted to episodes, and there is none"):
         fit_weights([])

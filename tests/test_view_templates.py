@@ -14,7 +14,7 @@ from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.depth_view import MetricImage
 from nextview.things.view_templates import (
-    GRID,
+    TEMPLATE_SIDE,
     TURNS,
     Pictures,
     ViewTemplates,
@@ -103,7 +103,7 @@ def test_the_mismatch_is_what_is_defined():
     rng = np.random.default_rng(0)
     made = []
     for count in (3, 5):
-        outline = (rng.random((count, GRID**2)) < 0.5).astype(np.float32)
+        outline = (rng.random((count, TEMPLATE_SIDE**2)) < 0.5).astype(np.float32)
         depth = outline * rng.normal(size=outline.shape).astype(np.float32)
         made.append(Pictures(outline, depth, rng.uniform(0.05, 0.1, count)))
     costs = mismatch(*made)

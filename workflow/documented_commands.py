@@ -320,7 +320,7 @@ def _in_table(page: str, number: int, line: str) -> Iterator[Step]:
 
 def make_inputs(folder: Path) -> None:
     """What the commands of the pages find in their working folder."""
-    from nextview.data.samples import SAMPLES, boxes_mesh
+    from nextview.data.samples import SAMPLE_MESHES, boxes_mesh
     from nextview.recognition.model_card import find_card
 
     for name in ("samples", "benchmarks", "research", "examples", "docs", "workflow"):
@@ -330,7 +330,7 @@ def make_inputs(folder: Path) -> None:
     held_out = find_card("recogniser-modelnet10").held_out
     rng = np.random.default_rng(0)
     test = {"chair": ("chair_0890", "chair_0917"), "table": ("table_0399", "table_0400")}
-    for label in SAMPLES:
+    for label in SAMPLE_MESHES:
         learned = [name for name in held_out if name.rpartition("_")[0] == label][:3]
         names = [(name, "train") for name in (*learned, f"{label}_0001", f"{label}_0002")]
         names += [(name, "test") for name in test.get(label, (f"{label}_0470", f"{label}_0471"))]
@@ -338,7 +338,7 @@ def make_inputs(folder: Path) -> None:
             scale = rng.uniform(0.8, 1.25, 3)
             boxes = [
                 tuple(tuple(np.multiply(corner, scale)) for corner in box)
-                for box in SAMPLES[label]()
+                for box in SAMPLE_MESHES[label]()
             ]
             mesh = boxes_mesh(boxes, label)
             inches = trimesh.Trimesh(rng.uniform(15, 30) * mesh.vertices, mesh.faces, process=False)
@@ -347,7 +347,7 @@ def make_inputs(folder: Path) -> None:
             inches.export(path)
     for copy in ("ModelNet10", "DATASET/ModelNet10"):
         shutil.copytree(folder / "data/ModelNet10", folder / copy)
-    for label in SAMPLES:  # of classes that no recogniser knows
+    for label in SAMPLE_MESHES:  # of classes that no recogniser knows
         shutil.copytree(
             folder / "data/ModelNet10" / label / "test", folder / "PSB" / f"strange_{label}"
         )

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from nextview.data.folders import list_dataset
-from nextview.data.samples import SAMPLES, boxes_mesh
+from nextview.data.samples import SAMPLE_MESHES, boxes_mesh
 from nextview.geometry.mesh import Mesh
 
 LARGEST = 2_000_000
@@ -50,7 +50,7 @@ def main() -> None:
             folder = given.out.joinpath(*place)
             folder.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(entry.path, folder / entry.path.name)
-    for name, build in SAMPLES.items() if given.meshes is None else []:
+    for name, build in SAMPLE_MESHES.items() if given.meshes is None else []:
         for split in ("train", "test"):
             folder = given.out / name / split
             folder.mkdir(parents=True, exist_ok=True)

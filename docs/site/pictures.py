@@ -19,7 +19,7 @@ from nextview.data.measures import depth_entropy
 from nextview.data.samples import sample_mesh
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.maps import local_peaks
-from nextview.session.style import ACCENT, BLUE, FAINT, INK, STYLE, PlainFigure
+from nextview.session.style import ACCENT, BLUE, FAINT, FIGURE_STYLE, INK, PlainFigure
 from nextview.session.view import View
 
 IMAGES = Path(__file__).parents[1] / "images"
@@ -222,5 +222,5 @@ def samples(views: tuple[int, ...]) -> Figure:
 
 
 if __name__ == "__main__":
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(FIGURE_STYLE):
         main()

@@ -32,7 +32,7 @@ T = TypeVar("T")
 Sha256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # errors of a full disk
 MARKER = "nextview-unfinished.json"  # in each temporary folder: an ``Unfinished`` record
-LONGEST_NAME = 40  # letters of an output's name that the name of its temporary folder holds
+LONGEST_OUTPUT_NAME = 40  # letters of an output's name that the name of its temporary folder holds
 LONGEST_PATH = 300  # letters of a path that a sentence shows
 LARGEST_RECORD = 64 * 2**20  # bytes of a JSON record; a card takes some hundred thousand
 
@@ -213,7 +213,9 @@ def _marked_folder(path: Path, key: str) -> Path:
     folder = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix=f".{path.name[:LONGEST_NAME]}-", dir=path.parent))
+        folder = Path(
+            tempfile.mkdtemp(prefix=f".{path.name[:LONGEST_OUTPUT_NAME]}-", dir=path.parent)
+        )
         (folder / MARKER).write_bytes(msgspec.json.encode(Unfinished(path.name, key)))
     except OSError as error:
         if folder is not None:
@@ -225,7 +227,7 @@ def _marked_folder(path: Path, key: str) -> Path:
 def _marked(place: Path, name: str) -> list[Path]:
     """The temporary folders for an output of that name in a folder, by their markers."""
     found = []
-    for folder in sorted(place.glob(f".{glob.escape(name[:LONGEST_NAME])}-*")):
+    for folder in sorted(place.glob(f".{glob.escape(name[:LONGEST_OUTPUT_NAME])}-*")):
         marker = _marker(folder)
         if marker is not None and marker.output == name:
             found.append(folder)

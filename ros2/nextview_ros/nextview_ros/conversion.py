@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from nextview.captured.messages import depth_of, intrinsics_of, pose_of, seconds
 from nextview.errors import ObservationError
-from nextview.sensing.frame import AXES, Frame
+from nextview.sensing.frame import CAMERA_AXES, Frame
 
 Float = NDArray[np.float64]
 
@@ -80,7 +80,7 @@ def fill_pose(message: Any, pose: Float, axes: str = "opencv") -> Any:
     """Write a camera-to-world pose, (4, 4), OpenCV axes, into a ``geometry_msgs/Pose``, for a
     frame of some axes.
     """
-    quaternion = Rotation.from_matrix(pose[:3, :3] @ AXES[axes].T).as_quat()
+    quaternion = Rotation.from_matrix(pose[:3, :3] @ CAMERA_AXES[axes].T).as_quat()
     message.position.x, message.position.y, message.position.z = map(float, pose[:3, 3])
     (
         message.orientation.x,

@@ -25,7 +25,7 @@ from nextview.policies.registry import (
     map_policy_names,
     policy_names,
 )
-from nextview.recognition.map_names import LCM, LEM, SPHERE, in_order, map_name
+from nextview.recognition.map_names import LCM, LEM, SPHERE_SUFFIX, in_order, map_name
 from nextview.recognition.model_card import DISCRIMINATE
 
 
@@ -66,7 +66,7 @@ MAP_ORACLE = re.compile(r"(true-)?(.+?)(-peak|-oracle-valley)?")
 """Oracles by a map. "true-MAP" climbs the true one: to its peaks, or to its valleys for some
 classes, by the belief; "true-MAP-peak" always to its peaks. With "-oracle-valley" the true class
 decides, also on the predicted map."""
-MORE = f"{LEM}{SPHERE}-peak"  # by Parisotto et al., see ``maps.SpherePeak``; always compared
+MORE = f"{LEM}{SPHERE_SUFFIX}-peak"  # by Parisotto et al., see ``maps.SpherePeak``; always compared
 FIXED = ("best", "worst", "high-entropy", "low-entropy", "random-fixed", "orbit")
 """Fixed views by name, followed by their number: "best-5", "orbit-8". They go on to the end
 whatever is believed.
@@ -102,7 +102,7 @@ def default_entries(specs: EpisodeSpecs) -> list[str]:
     sphere = specs.predictions.sphere
     n = sphere.azimuths
     v = len(sphere)
-    maps = [name for name in in_order(specs.predictions.maps) if not name.endswith(SPHERE)]
+    maps = [name for name in in_order(specs.predictions.maps) if not name.endswith(SPHERE_SUFFIX)]
     names = [*policy_names(), *(each for name in maps for each in (name, f"{name}-peak")), MORE]
     names = [name for name in (*names, *bundled_policies(), *ORACLES) if name not in IN_SCENES]
     if specs.scenes is not None:
@@ -167,7 +167,9 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
 
     match = MAP_ORACLE.fullmatch(name)
     true, base, how = match.groups("") if match else ("", "", "")
-    predicted = [name for name in p.maps if how == "-oracle-valley" and not name.endswith(SPHERE)]
+    predicted = [
+        name for name in p.maps if how == "-oracle-valley" and not name.endswith(SPHERE_SUFFIX)
+    ]
     base = map_name(base) if true else base  # the true map of a measure, by either name
     if base in (known_maps(p) if true else predicted):
         return _oracle(specs, true, base, how)

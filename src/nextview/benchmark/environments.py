@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from nextview.checks import extras, number, one_line, whole
 from nextview.data.folders import list_dataset
 from nextview.data.predictions import Predictions
-from nextview.data.samples import SAMPLES, sample_mesh
+from nextview.data.samples import SAMPLE_MESHES, sample_mesh
 from nextview.errors import DatasetError, PredictionsError, SessionError, UsageError
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.viewsphere import ViewSphere
@@ -591,7 +591,7 @@ class RecogniseMeshEnv(TaskEnv):
         calibration = self._models.recogniser.calibration
 
         objects: list[tuple[str, Callable[[], Mesh]]] = [
-            (name, partial(sample_mesh, name)) for name in SAMPLES
+            (name, partial(sample_mesh, name)) for name in SAMPLE_MESHES
         ]
         if meshes is not None:
             entries = [e for e in list_dataset(Path(meshes)) if split in (None, e.split)]

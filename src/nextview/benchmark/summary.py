@@ -15,7 +15,7 @@ from nextview.benchmark.views import COLUMNS, measured
 from nextview.checks import extras
 from nextview.data import metrics
 from nextview.session.episode import Outcome
-from nextview.simulation.scene_layout import LEVELS, clutter_level
+from nextview.simulation.scene_layout import CLUTTER_LEVELS, clutter_level
 from nextview.types import Float
 
 with extras():
@@ -319,7 +319,7 @@ def by_level(grid: Grid, reference: str, samples: int, rng: np.random.Generator)
     """
     names: tuple[str, ...] = grid.specs.predictions.names
     level_of = levels_of(names)
-    order = list(LEVELS)
+    order = list(CLUTTER_LEVELS)
     rows = []
     paths = {name: paths for name, paths in grid.paths.items() if not paths.fixed}
     counts = [k for k in (1, *LEVEL_VIEWS) if k <= grid.max_views]

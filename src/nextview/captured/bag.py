@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.captured.frames import CapturedFrame, Views
+from nextview.captured.frames import CapturedFrame, LayoutViews
 from nextview.captured.messages import (
+    ENCODING_STEPS,
     ENCODINGS,
-    STEPS,
     compressed_encoding,
     depth_of,
     depth_of_compressed,
@@ -44,7 +44,7 @@ RAW = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TF = "tf2_msgs/msg/TFMessage"
-FIXED = "tf_static"  # the end of the name of the topic of transforms that never change
+STATIC_TRANSFORMS = "tf_static"  # the end of the name of the topic of transforms that never change
 NANOSECONDS = 1e-9
 
 
@@ -60,7 +60,7 @@ def read_bag(
     intrinsics: Float | None = None,
     depth_topic: str | None = None,
     world_frame: str | None = None,
-) -> Views:
+) -> LayoutViews:
     """Find the depth images of a bag, the intrinsics of their camera and its poses.
 
     Args:
@@ -101,7 +101,7 @@ def read_bag(
         notes.append(f"intrinsics of {source}")
 
     # a frame that only carries the camera tells nothing of the vertical
-    views = Views([], notes, z_is_up=world_frame is not None or tree.moves(camera, world))
+    views = LayoutViews([], notes, z_is_up=world_frame is not None or tree.moves(camera, world))
     lost = _add_frames(views, images, tree, world, intrinsics)
     if lost:
         notes.append(f"{lost} images have no pose in tf and are left out")
@@ -366,7 +366,7 @@ def _transforms(bag: Bag) -> TransformTree:
     tree = TransformTree()
     topics = bag.of_type(TF)
     said = (
-        (connection.topic.endswith(FIXED), each)
+        (connection.topic.endswith(STATIC_TRANSFORMS), each)
         for connection, _, message in (bag.messages(topics) if topics else ())
         for each in message.transforms
     )
@@ -419,13 +419,13 @@ def _fits(info: Any, image: RecordedImage) -> bool:
 
 
 def _add_frames(
-    views: Views, images: list[RecordedImage], tree: TransformTree, world: str, k: Float
+    views: LayoutViews, images: list[RecordedImage], tree: TransformTree, world: str, k: Float
 ) -> int:
     """Add frames with the poses of some images; returns how many have none."""
     lost = 0
     for image in images:
         try:
-            if image.encoding not in STEPS:
+            if image.encoding not in ENCODING_STEPS:
                 raise ObservationError(f"{image}: its encoding is {image.encoding!r}")
             pose = tree.pose(image.frame, world, image.stamp)
         except NoTransformError:
@@ -433,7 +433,7 @@ def _add_frames(
         except (DatasetError, ObservationError) as error:
             views.unreadable[image.name] = str(error)
         else:
-            scale = STEPS[image.encoding]
+            scale = ENCODING_STEPS[image.encoding]
             views.frames.append(CapturedFrame(image.name, image, scale, k, pose))
     return lost
 

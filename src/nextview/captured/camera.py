@@ -17,12 +17,12 @@ from nextview.types import Float
 
 # the axes of a world that may be called up by name
 UP = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-AROUND = 3  # pixels around the object's centre that tell whether it is hidden
-HIDDEN = 1.5  # object radii before its centre from which something else hides it
+PIXELS_AROUND_CENTRE = 3  # pixels around the object's centre that tell whether it is hidden
+HIDING_DISTANCE = 1.5  # object radii before its centre from which something else hides it
 
 
 @dataclass(frozen=True)
-class Taken:
+class TakenView:
     """A captured view that answered a request, and its angular distance from it.
 
     Attributes:
@@ -78,7 +78,7 @@ class CapturedCamera:
         self._masked = point is None and box is None
         self._total = len(capture.frames) + len(capture.unreadable)
         self.capture, self.left_out = check_capture(capture, self._masked)
-        self.taken: list[Taken] = []
+        self.taken: list[TakenView] = []
         self.misses: dict[str, str] = dict(self.left_out)
         self._left = list(self.capture.frames)
 
@@ -123,7 +123,7 @@ class CapturedCamera:
                 self.left_out[captured.name] = self.misses[captured.name] = str(error)
                 refuse_many(self.capture, self.misses, self._total)
             else:
-                self.taken.append(Taken(captured, _degrees_off(captured, asked, found)))
+                self.taken.append(TakenView(captured, _degrees_off(captured, asked, found)))
                 return frame
 
         why = f" ({min(self.left_out.values())})" if self.left_out else ""
@@ -169,7 +169,9 @@ class CapturedCamera:
             return False
         around = frame.depth[_near(row, height), _near(column, width)]
         measured = around[around > 0]
-        return not len(measured) or bool(np.median(measured) > depth - HIDDEN * found.radius)
+        return not len(measured) or bool(
+            np.median(measured) > depth - HIDING_DISTANCE * found.radius
+        )
 
     def _find(self, up: ArrayLike | None, point: ArrayLike | None) -> ObjectFrame:
         """About where the object is."""
@@ -208,7 +210,9 @@ def _projected(captured: CapturedFrame, point: Float) -> tuple[float, float, flo
 
 def _near(at: float, size: int) -> slice:
     """Rows or columns around one of them."""
-    return slice(max(0, int(at) - AROUND), min(size, int(at) + AROUND + 1))
+    return slice(
+        max(0, int(at) - PIXELS_AROUND_CENTRE), min(size, int(at) + PIXELS_AROUND_CENTRE + 1)
+    )
 
 
 def _cost(frame: CapturedFrame, asked: Float, found: ObjectFrame) -> float:

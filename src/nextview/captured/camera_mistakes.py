@@ -9,14 +9,12 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import minimize
 
+from nextview.captured.shifted_poses import FEWER_CONTRADICTIONS, LEAST_OVERLAP
 from nextview.sensing.agreement import SHARP, Agreement, SurfaceView, compare
 from nextview.types import Float
 
 # share of the points that is contradicted from which a mistake of the camera is searched for
-LEAST_SHARE = 0.05
-# a mistake is named if at most this part of the contradicted share is left without it
-FEWER_CONTRADICTIONS = 0.5
-LEAST_OVERLAP = 0.5  # and if at least this part of the points can still be judged
+LEAST_CAMERA_CONTRADICTION = 0.05
 FLIPS = {
     "flipped left to right": (-1.0, 1.0, 1.0),
     "flipped top to bottom": (1.0, -1.0, 1.0),
@@ -45,7 +43,7 @@ def find_camera_mistake(views: Sequence[SurfaceView], poses: Float, intrinsics: 
         intrinsics: pinhole matrix of the frames, for the sentence, pixels, (3, 3).
     """
     as_read = compare(views, poses, sharpness=SHARP)
-    if 1 - as_read.share < LEAST_SHARE:
+    if 1 - as_read.share < LEAST_CAMERA_CONTRADICTION:
         return ""
     return _flip(views, poses, as_read) or _focal_length(
         views, poses, as_read, float(intrinsics[0, 0])
@@ -60,7 +58,7 @@ def find_offset(views: Sequence[SurfaceView], poses: Float) -> str:
         poses: of their cameras, camera-to-world, (N, 4, 4), metres.
     """
     as_read = compare(views, poses, sharpness=SHARP)
-    if 1 - as_read.share < LEAST_SHARE:
+    if 1 - as_read.share < LEAST_CAMERA_CONTRADICTION:
         return ""
 
     offset = _fitted_offset(views, poses)

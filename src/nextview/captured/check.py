@@ -19,7 +19,7 @@ from nextview.errors import DatasetError, ObservationError
 from nextview.sensing.agreement import SHARP, Agreement, SurfaceView, compare, surface_view
 from nextview.sensing.frame import Frame
 
-MOST_COMPARED = 60  # frames of a capture that are compared with each other, evenly spread
+MOST_COMPARED_FRAMES = 60  # frames of a capture that are compared with each other, evenly spread
 MOST_REFUSED = 0.1  # share of the frames that may be left out; a single one always may
 CONTRADICTED_SHARE = 0.5  # a frame of which less is confirmed contradicts the others
 CONTRADICTED_SHARPLY = 0.3  # the same, looked at sharply, if it is also so many times what is usual
@@ -101,7 +101,7 @@ def _read_some(
 ) -> tuple[np.ndarray, list[Frame]]:
     """Read frames that are spread evenly; those that cannot be read are added to ``refused``."""
     count = len(capture.frames)
-    spread = np.unique(np.linspace(0, count - 1, min(count, MOST_COMPARED)).astype(int))
+    spread = np.unique(np.linspace(0, count - 1, min(count, MOST_COMPARED_FRAMES)).astype(int))
     indices = []
     frames = []
 
@@ -158,7 +158,7 @@ def _contradicting(capture: Capture, compared: np.ndarray, frames: list[Frame]) 
     refused = _late_frames(capture, compared, shifts)
 
     kept = np.flatnonzero(~late)
-    evidence = Evidence.of([views[i] for i in kept], poses[compared[kept]])
+    evidence = PoseEvidence.of([views[i] for i in kept], poses[compared[kept]])
     blamed = _to_blame(evidence)
     left = np.setdiff1d(np.arange(len(kept)), list(blamed))
     most_blamed = most - int(late.sum()) if len(frames) >= FEWEST_TO_BLAME else 0
@@ -185,7 +185,7 @@ def _disagree(capture: Capture, looks: str) -> DatasetError:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class PoseEvidence:
     """Agreement of N frames, by what is judged and how closely.
 
     Attributes:
@@ -199,7 +199,7 @@ class Evidence:
     sharp: Agreement
 
     @classmethod
-    def of(cls, views: Sequence[SurfaceView], poses: np.ndarray) -> "Evidence":
+    def of(cls, views: Sequence[SurfaceView], poses: np.ndarray) -> "PoseEvidence":
         """Compare frames under some poses.
 
         Args:
@@ -217,7 +217,7 @@ class Evidence:
         )
 
 
-def _to_blame(evidence: Evidence) -> dict[int, float]:
+def _to_blame(evidence: PoseEvidence) -> dict[int, float]:
     """Return frames that contradict the others most, worst first, with confirmed shares.
 
     A frame is blamed where most of its points are contradicted, or most of those that stand out of
@@ -249,7 +249,7 @@ def _enough_judged(agreement: Agreement) -> np.ndarray:
     return np.where(judged >= FEWEST_JUDGED, share, 1.0)
 
 
-def _disagreeing(evidence: Evidence, left: np.ndarray) -> bool:
+def _disagreeing(evidence: PoseEvidence, left: np.ndarray) -> bool:
     """Return whether the remaining frames contradict each other about the object.
 
     All of them do, or those from one frame on contradict those before.
@@ -261,7 +261,7 @@ def _disagreeing(evidence: Evidence, left: np.ndarray) -> bool:
     return first > 0 and 1 - _across(standing, first).share > CONTRADICTED_IN_ALL
 
 
-def _unexplained(capture: Capture, compared: np.ndarray, evidence: Evidence) -> DatasetError:
+def _unexplained(capture: Capture, compared: np.ndarray, evidence: PoseEvidence) -> DatasetError:
     """The error where the frames contradict each other, and no usual mistake explains it."""
     contradicted = 1 - min(evidence.all.share, evidence.standing.share)
     problem = f"its frames do not agree about one rigid object ({contradicted:.0%} of what they "

@@ -13,7 +13,14 @@ import numpy as np
 from PIL import Image
 
 from nextview.captured.camera_file import CameraFile, read_camera_file
-from nextview.captured.frames import CapturedFrame, DepthFile, Views, numbers_of, read_table, rigid
+from nextview.captured.frames import (
+    CapturedFrame,
+    DepthFile,
+    LayoutViews,
+    numbers_of,
+    read_table,
+    rigid,
+)
 from nextview.checks import did_you_mean
 from nextview.errors import DAMAGED, DatasetError
 from nextview.files import read_record
@@ -33,8 +40,8 @@ CAMERA_FILES = (
 CAMERA_TABLES = ("cam_K.txt", "intrinsics.txt")  # a pinhole matrix alone
 POSES = ("poses", "pose")
 MASKS = ("masks", "mask")
-COLOURS = ("color", "colour", "rgb")
-PICTURES = (".png", ".jpg", ".jpeg")
+COLOUR_FOLDERS = ("color", "colour", "rgb")
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
 LINES_OF_A_POSE = 5  # in Open3D's log: three numbers, and the rows of the matrix
 ASK_FOR_SCALE = (
     "nothing says what one step of the depth images stands for: give --depth-scale, in metres"
@@ -52,7 +59,7 @@ def is_depth_folder(folder: Path) -> bool:
     return next(folder.glob("depth/*.png"), None) is not None
 
 
-def read_depth_folder(folder: Path, intrinsics: Float | None, scale: float | None) -> Views:
+def read_depth_folder(folder: Path, intrinsics: Float | None, scale: float | None) -> LayoutViews:
     """Read the poses and the intrinsics of a folder of depth images.
 
     Args:
@@ -75,14 +82,14 @@ def read_depth_folder(folder: Path, intrinsics: Float | None, scale: float | Non
     poses, unreadable, of_poses = _poses(folder, [path.stem for path in images])
 
     # Which way is up in its world, no file says.
-    views = Views([], [*notes, of_poses], unreadable, z_is_up=False)
+    views = LayoutViews([], [*notes, of_poses], unreadable, z_is_up=False)
     for path in images:
         depth = DepthFile(path)
         if path.stem not in poses:
             continue
         _check_size(depth, camera, folder)
         mask = _beside(folder, MASKS, path.stem)
-        colour = _beside(folder, COLOURS, path.stem)
+        colour = _beside(folder, COLOUR_FOLDERS, path.stem)
         if colour is not None and not _same_size(colour, depth):
             colour = None  # not registered to the depth
         pose = poses[path.stem]
@@ -94,7 +101,7 @@ def read_depth_folder(folder: Path, intrinsics: Float | None, scale: float | Non
 
 def read_depth_image(
     path: Path, intrinsics: Float | None, scale: float | None, camera_file: Any = None
-) -> Views:
+) -> LayoutViews:
     """A single depth image: its camera is the world.
 
     Args:
@@ -116,7 +123,7 @@ def read_depth_image(
     if scale is None:
         raise DatasetError(f"{path}: {ASK_FOR_SCALE}")
     frame = CapturedFrame(path.stem, DepthFile(path), scale, intrinsics, np.eye(4))
-    return Views([frame], ["one image: its camera is the world"], z_is_up=False)
+    return LayoutViews([frame], ["one image: its camera is the world"], z_is_up=False)
 
 
 def _camera(folder: Path, intrinsics: Float | None) -> tuple[CameraFile, list[str]]:
@@ -247,7 +254,7 @@ def _in_order(
 
 def _beside(folder: Path, inside: tuple[str, ...], name: str) -> Path | None:
     """The picture of an image's name in one of some folders, if there is one."""
-    paths = (folder / each / f"{name}{ending}" for each in inside for ending in PICTURES)
+    paths = (folder / each / f"{name}{ending}" for each in inside for ending in IMAGE_ENDINGS)
     return next((path for path in paths if path.exists()), None)
 
 

@@ -23,7 +23,7 @@ from nextview.captured.frames import (
     Capture,
     CapturedFrame,
     DepthFile,
-    Views,
+    LayoutViews,
     lines_of,
     numbers_of,
     pinhole_of,
@@ -40,12 +40,12 @@ from nextview.types import Float
 # the pinhole matrix in a folder of TUM or 7-Scenes, as in 3DMatch
 INTRINSICS = "camera-intrinsics.txt"
 TUM_STEP = 1 / 5000  # metres that one step of TUM's depth images stands for
-TOGETHER = 0.02  # seconds that an image and its pose, or depth and colour, may be apart
+STAMP_DIFFERENCE = 0.02  # seconds that an image and its pose, or depth and colour, may be apart
 MOST_LOST = 0.1  # share of the lines of a trajectory that may hold no pose
 # fx, fy, cx, cy of the depth camera of 7-Scenes, for all of its scenes
 KINECT = (585.0, 585.0, 320.0, 240.0)
 LARGEST_SCALE = 0.05  # metres that a step of a depth image may stand for; a float image has 1
-Three = Annotated[list[float], Meta(min_length=3, max_length=3)]
+ThreeNumbers = Annotated[list[float], Meta(min_length=3, max_length=3)]
 Nine = Annotated[list[float], Meta(min_length=9, max_length=9)]
 # as given by hand, see ``read_capture``
 Intrinsics = tuple[float, float, float, float] | str | Path | None
@@ -85,8 +85,8 @@ def read_capture(
     The images are read when they are used.
 
     Args:
-        path: a folder of one of ``LAYOUTS``, a ROS 2 bag (a folder, or its .mcap or .db3 file), or
-            one depth image (.png).
+        path: a folder of one of ``FOLDER_LAYOUTS``, a ROS 2 bag (a folder, or its .mcap or .db3
+            file), or one depth image (.png).
         intrinsics: see ``Reading``, as all others.
         object_id: of a BOP scene.
         depth_scale: metres.
@@ -108,7 +108,7 @@ def read_capture(
         _check_links(path)
 
     k, said = _given_intrinsics(path, how.intrinsics)
-    views = LAYOUTS[layout](path, k, how)
+    views = FOLDER_LAYOUTS[layout](path, k, how)
     if not views.frames:
         raise DatasetError(
             next(iter(views.unreadable.values()), f"{path}: no image shows the object")
@@ -164,7 +164,7 @@ def _layout_of(path: Path) -> str:
 
 def _layouts_in(folder: Path) -> list[str]:
     """The layouts whose marks a folder has."""
-    return [layout for layout, files in MARKS.items() if next(folder.glob(files), None)]
+    return [layout for layout, files in LAYOUT_MARKS.items() if next(folder.glob(files), None)]
 
 
 def _check_scale(scale: float) -> None:
@@ -222,7 +222,7 @@ def _no_capture(folder: Path) -> str:
     ):
         look = f"recognise one of them ({mesh}), or teach it them: nextview learn {folder} OUT"
         return f"{folder}: is a folder of meshes, not of captured views; {look}"
-    known = ", ".join(f"{files} ({layout})" for layout, files in MARKS.items())
+    known = ", ".join(f"{files} ({layout})" for layout, files in LAYOUT_MARKS.items())
     return (
         f"{folder}: no captured views are found; there is none of {known}, depth/*.png"
         f" ({DEPTH_FOLDER}), metadata.yaml or *.mcap ({BAG})"
@@ -230,9 +230,9 @@ def _no_capture(folder: Path) -> str:
 
 
 class _BoxFile(Struct, forbid_unknown_fields=True):
-    low: Three
-    high: Three
-    axes: Annotated[list[Three], Meta(min_length=3, max_length=3)] | None = None
+    low: ThreeNumbers
+    high: ThreeNumbers
+    axes: Annotated[list[ThreeNumbers], Meta(min_length=3, max_length=3)] | None = None
 
 
 def read_box(path: Path) -> Box:
@@ -252,13 +252,13 @@ class _Camera(Struct):
     cam_K: Nine
     depth_scale: Annotated[float, Meta(gt=0)]
     cam_R_w2c: Nine | None = None
-    cam_t_w2c: Three | None = None
+    cam_t_w2c: ThreeNumbers | None = None
 
 
 class _Object(Struct):
     obj_id: int
     cam_R_m2c: Nine | None = None
-    cam_t_m2c: Three | None = None
+    cam_t_m2c: ThreeNumbers | None = None
 
 
 LACKS_POSE = (
@@ -274,7 +274,7 @@ def _bop_mask(folder: Path, name: str, here: list[int]) -> Path | None:
     return masks[0] if len(masks) == 1 else None
 
 
-def _read_bop(folder: Path, intrinsics: Float | None, how: Reading) -> Views:
+def _read_bop(folder: Path, intrinsics: Float | None, how: Reading) -> LayoutViews:
     """Views of scene_camera.json.
 
     Without camera poses, the world is the object's model, by scene_gt.json.
@@ -299,7 +299,7 @@ def _read_bop(folder: Path, intrinsics: Float | None, how: Reading) -> Views:
     if single is None and numbers:
         notes.append(f"objects {named}: name one with --object-id, and its masks are used")
 
-    views = Views([], notes)
+    views = LayoutViews([], notes)
     from_model = False
     for index, camera in sorted(cameras.items()):
         objects = all_objects.get(index, [])
@@ -346,7 +346,7 @@ def _from_world_to_camera(rotation: list[float], translation: list[float], where
     return rigid(pose, where)
 
 
-def _read_tum(folder: Path, intrinsics: Float | None, _: Reading) -> Views:
+def _read_tum(folder: Path, intrinsics: Float | None, _: Reading) -> LayoutViews:
     """Read views by depth.txt and groundtruth.txt, with images and masks if there are any."""
     if intrinsics is None:
         raise DatasetError(
@@ -375,18 +375,23 @@ def _read_tum(folder: Path, intrinsics: Float | None, _: Reading) -> Views:
             )
 
     if not frames:
-        what = f"{folder}: no image of depth.txt has a pose in groundtruth.txt within {TOGETHER} s"
+        what = (
+            f"{folder}: no image of depth.txt has a pose in groundtruth.txt within"
+            f" {STAMP_DIFFERENCE} s"
+        )
         raise DatasetError(f"{what}; are the times of one clock, in seconds?")
 
     notes = []
     if bad_lines:
         notes.append(f"{bad_lines} lines of groundtruth.txt hold no pose and are left out")
     if lost := len(times) - len(frames):
-        notes.append(f"{lost} depth images have no pose within {TOGETHER} s and are left out")
-    return Views(frames, notes)
+        notes.append(
+            f"{lost} depth images have no pose within {STAMP_DIFFERENCE} s and are left out"
+        )
+    return LayoutViews(frames, notes)
 
 
-def _read_seven_scenes(folder: Path, intrinsics: Float | None, _: Reading) -> Views:
+def _read_seven_scenes(folder: Path, intrinsics: Float | None, _: Reading) -> LayoutViews:
     """Views by frame-*.depth.png and .pose.txt, and masks in .mask.png.
 
     The colour images are not registered.
@@ -399,7 +404,7 @@ def _read_seven_scenes(folder: Path, intrinsics: Float | None, _: Reading) -> Vi
             " assumed"
         )
     # its world is that of its first camera
-    views = Views([], notes, z_is_up=False)
+    views = LayoutViews([], notes, z_is_up=False)
     for depth in sorted(folder.glob("frame-*.depth.png")):
         name = depth.name.removeprefix("frame-").removesuffix(".depth.png")
         path = folder / f"frame-{name}.pose.txt"
@@ -416,7 +421,7 @@ def _read_seven_scenes(folder: Path, intrinsics: Float | None, _: Reading) -> Vi
     return views
 
 
-MARKS = {  # a file that tells each layout
+LAYOUT_MARKS = {  # a file that tells each layout
     "BOP": "scene_camera.json",
     "TUM RGB-D": "depth.txt",
     "7-Scenes": "frame-*.depth.png",
@@ -429,7 +434,7 @@ BAG = "ROS 2 bag"
 def _nearest(time: float, others: Float) -> int | None:
     """Return which of other times, (N,) seconds, is nearest, if it is near enough."""
     gaps = np.abs(others - time)
-    return int(gaps.argmin()) if len(gaps) and gaps.min() <= TOGETHER + 1e-6 else None
+    return int(gaps.argmin()) if len(gaps) and gaps.min() <= STAMP_DIFFERENCE + 1e-6 else None
 
 
 def _images(path: Path) -> tuple[Float, list[Path]]:
@@ -462,7 +467,7 @@ def _trajectory(path: Path) -> tuple[Float, Float, int]:
     return values[:, 0], poses, int((~good).sum())
 
 
-LAYOUTS: dict[str, Callable[[Path, Float | None, Reading], Views]] = {
+FOLDER_LAYOUTS: dict[str, Callable[[Path, Float | None, Reading], LayoutViews]] = {
     "BOP": _read_bop,
     "TUM RGB-D": _read_tum,
     "7-Scenes": _read_seven_scenes,

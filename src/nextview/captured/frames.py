@@ -14,7 +14,7 @@ from nextview.files import regular_file
 from nextview.sensing.frame import LARGEST_MEDIAN, NEAREST_MEDIAN, Frame, check_pose
 from nextview.types import Float, Float32
 
-NOTHING = np.iinfo(np.uint16).max  # what some sensors give for "nothing" besides 0
+NO_DEPTH = np.iinfo(np.uint16).max  # what some sensors give for "nothing" besides 0
 DEEP = ("I;16", "I;16B", "I")  # Pillow's names of grey images of 16 bits
 LARGEST_TEXT = 2**28  # bytes of a list of images or poses
 MILLIMETRES = 0.001
@@ -108,7 +108,7 @@ class CapturedFrame:
             ObservationError: the images show nothing of use.
         """
         raw = self.depth.read()
-        something = raw != NOTHING if raw.dtype == np.uint16 else np.isfinite(raw)
+        something = raw != NO_DEPTH if raw.dtype == np.uint16 else np.isfinite(raw)
         depth = np.where(something, raw, 0) * np.float32(self.scale)
         self._check_scale(depth)
 
@@ -130,7 +130,7 @@ class CapturedFrame:
 
 
 @dataclass
-class Views:
+class LayoutViews:
     """What a layout's reader finds.
 
     Attributes:

@@ -25,7 +25,7 @@ ENCODINGS: dict[str, np.dtype[Any]] = {
     "32FC1": np.dtype(np.float32),
 }
 """How a pixel is stored, by the encoding of a depth image."""
-STEPS = {"16UC1": MILLIMETRES, "mono16": MILLIMETRES, "32FC1": 1.0}
+ENCODING_STEPS = {"16UC1": MILLIMETRES, "mono16": MILLIMETRES, "32FC1": 1.0}
 """Metres that one step stands for, by the encoding."""
 PNG = b"\x89PNG\r\n\x1a\n"
 # of compressed_depth_image_transport, before the PNG: what is compressed, and two parameters of it

@@ -6,16 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nextview.captured.shifted_poses import relative_change
+from nextview.captured.shifted_poses import FEWER_CONTRADICTIONS, LEAST_OVERLAP, relative_change
 from nextview.sensing.agreement import Agreement, SurfaceView, compare
-from nextview.sensing.frame import AXES
+from nextview.sensing.frame import CAMERA_AXES
 from nextview.types import Float, Index
 
 FEWEST_JUDGED = 100  # points that two frames or more have to share before anything is said
 CERTAIN_SHARE = 0.99  # share of confirmed points from which no mistake is searched for
-FEWER_CONTRADICTIONS = 0.5  # a mistake is named if without it at most this part of them is left
-LEAST_CONTRADICTED = 0.08  # ... of at least this share of the points that it concerns
-LEAST_OVERLAP = 0.5  # and if at least this part of the points can still be judged without it
+# a mistake is named if FEWER_CONTRADICTIONS are left without it, of at least this share of the
+# points that it concerns
+LEAST_CONTRADICTED = 0.08
 # as read, frames that see less than this part of what they could see in common look past each other
 NO_OVERLAP = 0.25
 WELL_EXPLAINED = 0.85  # share of the points that are confirmed without the mistake
@@ -178,7 +178,7 @@ def _single_mistakes(to_world: bool, unit: float) -> list[PoseMistake]:
         ),
     ]
 
-    for name, axes in (("OpenGL", AXES["opengl"]), ("a ROS body", AXES["ros"])):
+    for name, axes in (("OpenGL", CAMERA_AXES["opengl"]), ("a ROS body", CAMERA_AXES["ros"])):
         sentence = f"the camera's axes are those of {name}, and OpenCV's are expected (x right, "
         sentence += "y down, z forward)"
         found.append(PoseMistake("axes", sentence, _turned_by(axes)))

@@ -22,7 +22,7 @@ MOST_PARTS = 3  # parts that are searched for, one inside the other or one after
 FEWER_CONTRADICTIONS = 0.5
 LEAST_EXPLAINED = 100  # contradictions that a shift has to explain
 LEAST_OF_ALL = 0.1  # part of all contradictions that each further part has to explain
-LEAST_SHARE = 0.01  # ... and the share of the points that it concerns
+LEAST_CONCERNED = 0.01  # ... and the share of the points that it concerns
 LEAST_OVERLAP = 0.5  # part of these points that can still be judged without it
 SAME_EXPLAINED = 1e-3  # contradictions that one more frame in a part has to explain
 # part of what parts explain that the same parts explain where the first frames are taken to be
@@ -233,7 +233,7 @@ def _is_explained(shifted: Shifted, as_read: Index, late: Index) -> bool:
     explained = before.contradicted.sum() - after.contradicted.sum()
     return bool(
         explained >= LEAST_EXPLAINED
-        and explained >= LEAST_SHARE * before.judged
+        and explained >= LEAST_CONCERNED * before.judged
         and after.judged >= LEAST_OVERLAP * before.judged
         and 1 - after.share <= FEWER_CONTRADICTIONS * (1 - before.share)
     )

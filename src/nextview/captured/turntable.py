@@ -18,12 +18,12 @@ from nextview.types import Float
 
 # of the fit; points of a frame; share of them that counts, the nearest
 ROUNDS = 40
-POINTS = 800
-CLOSEST = 0.7
-FAR = 6  # a sixth of a circle, or one step, lies between two frames that are compared
+TURN_POINTS = 800
+CLOSEST_TURN = 0.7
+TURN_PARTS = 6  # a sixth of a circle, or one step, lies between two frames that are compared
 # how far apart this share of the frames may lie, parts of the thing's radius, beyond noise
 AGREE = 0.008
-MOST = 0.8
+AGREEING_SHARE = 0.8
 
 
 def is_turntable(folder: Path) -> bool:
@@ -67,7 +67,7 @@ def read_turntable(folder: Path, turn: str) -> Capture:
         shown.append(thing.sightings[0])
     plane = np.median([[*s.plane.normal, s.plane.offset] for s in shown if s.plane is not None], 0)
     axes = upright_axes(plane[:3], np.array([0, 0, -1.0]))
-    few = [np.linspace(0, len(s.facets.planes) - 1, POINTS).astype(int) for s in shown]
+    few = [np.linspace(0, len(s.facets.planes) - 1, TURN_POINTS).astype(int) for s in shown]
     clouds = [
         (s.facets.points[f] @ axes.T, s.facets.planes[f] @ axes.T)
         for s, f in zip(shown, few, strict=True)
@@ -82,7 +82,7 @@ def read_turntable(folder: Path, turn: str) -> Capture:
     z = float(np.median([np.median(s.facets.points[:, 2]) for s in shown]))
     noise = float(np.median([s.noise.at(z) for s in shown])) * z**2
     # the last and the first, too: a full circle
-    worst = max(np.quantile(apart, MOST), apart[-1] / 3)
+    worst = max(np.quantile(apart, AGREEING_SHARE), apart[-1] / 3)
     if worst > AGREE * radius + noise:
         what = f"what a frame and the next show does not agree ({1000 * worst:.1f} mm apart)"
         raise DatasetError(
@@ -114,7 +114,7 @@ def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
         (p @ r.T, q @ r.T / np.linalg.norm(q, axis=1)[:, None])
         for (p, q), r in zip(clouds, turns, strict=True)
     ]
-    pairs = [(i, (i + gap) % n) for gap in sorted({max(1, n // FAR), 1}) for i in range(n)]
+    pairs = [(i, (i + gap) % n) for gap in sorted({max(1, n // TURN_PARTS), 1}) for i in range(n)]
     for _ in range(ROUNDS):
         rows = list[Float]()
         wanted = list[Float]()
@@ -124,7 +124,7 @@ def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
             q, normals = turned[j]
             shift = (turns[i] - turns[j])[:, :2]
             distance, nearest = cKDTree(q).query(p - shift @ axis)
-            close = distance <= np.quantile(distance, CLOSEST)
+            close = distance <= np.quantile(distance, CLOSEST_TURN)
             near = np.asarray(nearest)[close]
             rows.append(normals[near] @ shift)
             wanted.append((normals[near] * (p[close] - q[near])).sum(1))

@@ -8,21 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from nextview.captured.frames import NOTHING, pinhole_of
+from nextview.captured.frames import NO_DEPTH, pinhole_of
 from nextview.checks import number
 from nextview.errors import ResultsError, UsageError
 from nextview.files import new_folder
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.ray_caster import RayCaster, pixel_rays
-from nextview.geometry.viewsphere import DISTANCE, ViewSphere, look_at_origin
+from nextview.geometry.viewsphere import CAMERA_DISTANCE, ViewSphere, look_at_origin
 from nextview.simulation.scene import square
 from nextview.types import Float32
 
 # a Kinect's as ROS has it by default; first pixel's centre at 0
 PINHOLE = pinhole_of(525.0, 525.0, 319.5, 239.5)
 SHAPE = 480, 640
-TABLE = 2.0  # half the side of the table, object radii
-STEP = 0.0001  # metres that one step of the depth images stands for
+TABLE_HALF_SIDE = 2.0  # half the side of the table, object radii
+DEPTH_STEP = 0.0001  # metres that one step of the depth images stands for
 
 
 def write_capture(
@@ -53,13 +53,16 @@ def write_capture(
     """
     number(radius, "the object radius, in metres,", above=0)
     _check_others(folder, len(sphere), masks)
-    if (farthest := radius * (DISTANCE + max(1.0, 1.5 * TABLE * table))) > STEP * NOTHING:
+    if (
+        farthest := radius * (CAMERA_DISTANCE + max(1.0, 1.5 * TABLE_HALF_SIDE * table))
+    ) > DEPTH_STEP * NO_DEPTH:
         raise UsageError(
-            f"the camera sees {farthest:.3g} m far, the depth images end at {STEP * NOTHING:.3g} m"
+            f"the camera sees {farthest:.3g} m far, the depth images end at"
+            f" {DEPTH_STEP * NO_DEPTH:.3g} m"
         )
     height = -radius * float(mesh.vertices[:, 2].min())
     vertices = radius * mesh.vertices + np.array([0, 0, height])
-    things = [(vertices, mesh.faces)] + [square(TABLE * radius, 0.0)] * table
+    things = [(vertices, mesh.faces)] + [square(TABLE_HALF_SIDE * radius, 0.0)] * table
     caster = RayCaster(things)
     rays = pixel_rays(pinhole_of(525.0, 525.0, 320.0, 240.0), SHAPE).reshape(-1, 3)
     # The box has an inside, even that of a flat mesh.
@@ -70,7 +73,7 @@ def write_capture(
     x, y, z = sphere.directions.T
     # not below the table
     elevation = np.clip(np.arcsin(np.clip(z, -1, 1)), 0.0 if table else -np.pi / 2, np.pi / 2)
-    poses = look_at_origin(elevation, np.arctan2(y, x), DISTANCE * radius)
+    poses = look_at_origin(elevation, np.arctan2(y, x), CAMERA_DISTANCE * radius)
     poses[:, 2, 3] += height
     cameras = {}
     objects = {}
@@ -89,7 +92,7 @@ def write_capture(
             there = {"cam_R_w2c": flat, "cam_t_w2c": (1000 * translation).tolist()}
             cameras[str(i)] = {
                 "cam_K": PINHOLE.ravel().tolist(),
-                "depth_scale": 1000 * STEP,
+                "depth_scale": 1000 * DEPTH_STEP,
                 **there,
             }
             placed = 1000 * (rotation @ model + translation)
@@ -105,7 +108,7 @@ def _write_images(
     folder: Path, index: int, depth: Float32, which: NDArray[np.integer], masks: bool
 ) -> None:
     """Write the depth of each ray, and the mask of the object, by which thing it meets."""
-    steps = np.rint(np.where(which < 0, np.float32(0), depth) / STEP).astype(np.uint16)
+    steps = np.rint(np.where(which < 0, np.float32(0), depth) / DEPTH_STEP).astype(np.uint16)
     Image.fromarray(steps.reshape(SHAPE)).save(folder / f"depth/{index:06d}.png")
     if masks:
         mask = np.where(which == 0, 255, 0).astype(np.uint8).reshape(SHAPE)

@@ -16,7 +16,7 @@ from nextview.session.system import is_frames, simulated
 
 Unit = Literal["mm", "cm", "inch", "foot", "m"]
 Three = tuple[float, float, float]
-PICTURES = (".png", ".pdf", ".svg")
+FIGURE_ENDINGS = (".png", ".pdf", ".svg")
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ class ObjectOptions:
         return CapturedCamera(capture, up, self.point, box, not self.raw, not self.by_shape)
 
 
-def check_file(path: Path | None, overwrite: bool, kinds: tuple[str, ...] = PICTURES) -> None:
+def check_file(path: Path | None, overwrite: bool, kinds: tuple[str, ...] = FIGURE_ENDINGS) -> None:
     """Check a file that is to be written, before any work is done.
 
     Args:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from nextview.cli.progress import console, follow
-from nextview.cli.stores import Split, Workers
+from nextview.cli.stores import NamedSplit, Workers
 from nextview.data import predicting
 from nextview.data.predictions import Predictions
 from nextview.errors import ModelError, UsageError
@@ -16,7 +16,7 @@ def predict(
     store: Path,
     out: Path,
     /,
-    split: Split | None = None,
+    split: NamedSplit | None = None,
     models: str = "modelnet10",
     recogniser: str | None = None,
     held_out: str | None = None,

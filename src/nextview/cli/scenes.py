@@ -5,7 +5,7 @@ from typing import Literal
 
 from nextview.cli.common_options import Unit
 from nextview.cli.progress import console, track
-from nextview.cli.stores import Split, Workers, track_all
+from nextview.cli.stores import NamedSplit, Workers, track_all
 from nextview.data import room_drawing, scene_drawing
 from nextview.errors import DatasetError, UsageError
 from nextview.files import check_new
@@ -21,7 +21,7 @@ def scenes(
     /,
     levels: tuple[Level, ...] = ("light", "medium", "heavy"),
     scenes: int | None = None,
-    split: Split | None = None,
+    split: NamedSplit | None = None,
     held_out: str | None = None,
     room: bool = False,
     unit: Unit | None = None,

@@ -15,7 +15,7 @@ from nextview.errors import DatasetError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.model_card import RECOGNISER, find_card
 
-Split = Literal["train", "test", "val"]
+NamedSplit = Literal["train", "test", "val"]
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def measure(
     store: Path,
     /,
     measures: tuple[str, ...] = (),
-    split: Split | None = None,
+    split: NamedSplit | None = None,
     held_out: str | None = None,
     objects: int | None = None,
     workers: Workers = Workers(),

@@ -10,7 +10,7 @@ from nextview.checks import one_line
 from nextview.errors import DatasetError
 from nextview.files import new_folder, only_one
 
-LONGEST = 200  # letters of what a server says of itself
+LONGEST_ANSWER = 200  # letters of what a server says of itself
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,9 @@ def download(archive: Archive, destination: Path, timeout: float = 60, bar: Any 
                 zipfile.BadZipFile,
                 NotImplementedError,
             ) as error:
-                raise DatasetError(f"{archive.url}: {one_line(str(error), LONGEST)}") from None
+                raise DatasetError(
+                    f"{archive.url}: {one_line(str(error), LONGEST_ANSWER)}"
+                ) from None
             if not inside:
                 raise DatasetError(f"{archive.url}: holds no folder {archive.folder}")
             part.rmdir()

@@ -36,7 +36,7 @@ SPLIT_NAMES = {  # of folders, in lower case, and the split that each holds
     "validation": "val",
 }
 NAMED_FILES = 3  # that are named of those left out for one reason
-LONGEST_PATH = 200  # letters of a path in a sentence
+LONGEST_FOLDER_PATH = 200  # letters of a path in a sentence
 
 # The best first: STL knows no corners that faces share, and the axes of a GLB file are often wrong.
 BEST_FORMATS = (".ply", ".off", ".obj", ".glb", ".stl")
@@ -85,11 +85,11 @@ METADATA_FOLDERS = ("__MACOSX",)
 
 _log = logging.getLogger("nextview")
 
-HIDDEN = "hidden"
+HIDDEN_FILE = "hidden"
 LISTED_ALREADY = "a folder that is listed already"
 NO_CLASS = "not in a class folder"
 NOT_READ = f"of a format that is not read; export it as {', '.join(FORMATS)}"
-NOWHERE = "a link that leads nowhere"
+BROKEN_LINK = "a link that leads nowhere"
 UNPRINTABLE = "its name cannot be printed; rename it"
 VIEW_STORE = "a view store"
 
@@ -151,7 +151,7 @@ def left_out_phrases(left_out: Iterable[tuple[Path, str]]) -> list[str]:
     """
     reasons: dict[str, list[str]] = {}
     for path, reason in left_out:
-        reasons.setdefault(reason, []).append(one_line(str(path), LONGEST_PATH))
+        reasons.setdefault(reason, []).append(one_line(str(path), LONGEST_FOLDER_PATH))
 
     phrases = []
     for reason, paths in reasons.items():
@@ -360,7 +360,7 @@ def _real(path: Path) -> Path:
 def _not_entered(folder: Path) -> str | None:
     """Why a folder holds no objects of a dataset, whatever is in it."""
     if folder.name.startswith(".") or folder.name in METADATA_FOLDERS:
-        return HIDDEN
+        return HIDDEN_FILE
     if not folder.name.isprintable():
         return UNPRINTABLE
     return VIEW_STORE if (folder / "zarr.json").exists() else None
@@ -374,11 +374,11 @@ def _note_file(content: _Content, root: Path, place: Path, suffixes: tuple[str, 
 
     if place.name.startswith("."):
         if shape:
-            content.left_out.append((place, HIDDEN))
+            content.left_out.append((place, HIDDEN_FILE))
     elif not place.name.isprintable():
         content.left_out.append((place, UNPRINTABLE))
     elif not (root / place).is_file():
-        content.left_out.append((place, NOWHERE if (root / place).is_symlink() else "no file"))
+        content.left_out.append((place, BROKEN_LINK if (root / place).is_symlink() else "no file"))
     elif wanted:
         content.files.append(place)
     elif shape and suffixes == FORMATS:
@@ -493,7 +493,7 @@ def _notes(root: Path, entries: list[Entry]) -> list[str]:
         if _split_of(label)
     ]
     if len(labels) == 1 and any(count > 1 for count in _deep_folders(entries).values()):
-        inside = one_line(str(root / labels[0]), LONGEST_PATH)
+        inside = one_line(str(root / labels[0]), LONGEST_FOLDER_PATH)
         notes.append(
             f"all are of the class {labels[0]}; if the folders in it are the classes, give {inside}"
         )

@@ -90,17 +90,19 @@ class Measure:
         return self.function(view)
 
 
-MEASURES: dict[str, Measure] = {  # the thesis's own; packages add theirs by entry points of GROUP
+MEASURES: dict[
+    str, Measure
+] = {  # the thesis's own; packages add theirs by entry points of MEASURE_ENTRY_POINTS
     "depth_entropy": Measure(
         lambda view: depth_entropy(view.depth), "depth", "Parisotto et al.; eq. 3"
     )
 }
-GROUP = "nextview.measures"
+MEASURE_ENTRY_POINTS = "nextview.measures"
 
 
 def all_measures() -> dict[str, Measure]:
     """Every measure that has a name: MEASURES, and those that installed packages add."""
-    return MEASURES | {name: find_measure(name) for name in plugins(GROUP)}
+    return MEASURES | {name: find_measure(name) for name in plugins(MEASURE_ENTRY_POINTS)}
 
 
 def find_measure(name: str) -> Measure:
@@ -110,9 +112,9 @@ def find_measure(name: str) -> Measure:
     """
     if name in MEASURES:
         return MEASURES[name]
-    path = plugins(GROUP).get(name, name)
+    path = plugins(MEASURE_ENTRY_POINTS).get(name, name)
     if ":" not in path:
-        known = ", ".join([*MEASURES, *plugins(GROUP)])
+        known = ", ".join([*MEASURES, *plugins(MEASURE_ENTRY_POINTS)])
         raise MeasureError(f"no measure is called {name!r}; there are {known}, or MODULE:FUNCTION")
     with plugin_errors(lambda said: MeasureError(f"measure {name} cannot be imported ({said})")):
         found = plugin(path)

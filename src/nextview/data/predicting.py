@@ -17,12 +17,12 @@ from nextview.errors import DAMAGED, PredictionsError
 from nextview.files import check_new, command, unfinished
 from nextview.geometry.observation import enough_shows
 from nextview.recognition.inference import MapNetwork, NetworkRecogniser
-from nextview.recognition.model_card import BUNDLED, ModelCard
+from nextview.recognition.model_card import BUNDLED_MODELS, ModelCard
 from nextview.recognition.network_input import from_store
 from nextview.things.recogniser import open_recogniser
 from nextview.types import Float32, Index
 
-BATCH = 8  # views a call of the networks
+VIEWS_PER_CALL = 8  # views a call of the networks
 Cards = dict[str, ModelCard]  # of map networks, by name
 Files = tuple[tuple[str, Path], ...]  # where these are
 
@@ -105,7 +105,7 @@ def predict(
 
 def _plan(store: ViewStore, objects: Index, recogniser: ModelCard, maps: Cards) -> Predictions:
     """What store and cards say of the objects; what the networks say is still to come."""
-    own = [card for card in (recogniser, *maps.values()) if card.path.parent != BUNDLED]
+    own = [card for card in (recogniser, *maps.values()) if card.path.parent != BUNDLED_MODELS]
     made_by = [
         *store.commands,
         *(line for card in own for line in card.training.commands),
@@ -146,7 +146,10 @@ def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> 
     store, recogniser, maps = _open(*files)
     specs = {recogniser.card.input} | {network.card.input for network in maps.values()}
     inputs = {spec: from_store(spec, store, i) for spec in specs}
-    batches = [slice(start, start + BATCH) for start in range(0, len(store.sphere), BATCH)]
+    batches = [
+        slice(start, start + VIEWS_PER_CALL)
+        for start in range(0, len(store.sphere), VIEWS_PER_CALL)
+    ]
     elevation = store.sphere.elevation
 
     found: dict[str, Any] = {}

@@ -22,13 +22,13 @@ from nextview.policies.base import Evidence
 from nextview.recognition.belief import PLAIN_SUM, Calibration, log_evidence_of
 from nextview.types import Float, Float32, Index, Mask
 
-FORMAT = 1
+PREDICTIONS_FORMAT = 1
 # a file holds at most this many times its size, and so many bytes more
 PACKED = 100
 SPARE = 64 * 2**20
-SAME = 1e-5  # difference between logits that are the same, but for rounding
+SAME_LOGIT = 1e-5  # difference between logits that are the same, but for rounding
 # of numpy's types; all other arrays are of floats
-KINDS = {"labels": "iu", "splits": "U", "conflicting": "b"}
+ARRAY_KINDS = {"labels": "iu", "splits": "U", "conflicting": "b"}
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class Predictions:
                 raise PredictionsError(
                     f"{name} of these predictions has the shape {values.shape}, not {shape}"
                 )
-            if values.dtype.kind not in KINDS.get(name, "f"):
+            if values.dtype.kind not in ARRAY_KINDS.get(name, "f"):
                 raise PredictionsError(
                     f"{name} of these predictions is of the wrong type, {values.dtype}"
                 )
@@ -145,11 +145,13 @@ class Predictions:
 
         In all other views the classes are alike.
         """
-        seen = np.ptp(self.by_shape().logits, axis=2) > (SAME if len(self.classes) > 1 else -1)
+        seen = np.ptp(self.by_shape().logits, axis=2) > (
+            SAME_LOGIT if len(self.classes) > 1 else -1
+        )
         return (
             seen
             if self.azimuth_bins is None
-            else seen | (np.ptp(self.azimuth_bins, axis=(2, 3)) > SAME)
+            else seen | (np.ptp(self.azimuth_bins, axis=(2, 3)) > SAME_LOGIT)
         )
 
     @property
@@ -314,7 +316,7 @@ class Predictions:
         }
 
         arrays |= {
-            "format": FORMAT,
+            "format": PREDICTIONS_FORMAT,
             "names": np.array(self.names),
             "classes": np.array(self.classes),
             "elevations": np.array(self.sphere.elevations),
@@ -360,8 +362,10 @@ class Predictions:
                 if name.startswith(prefix)
             }
 
-        if "format" not in f or f["format"].tolist() != FORMAT:
-            raise PredictionsError(f"not a predictions file of format {FORMAT}; make it again")
+        if "format" not in f or f["format"].tolist() != PREDICTIONS_FORMAT:
+            raise PredictionsError(
+                f"not a predictions file of format {PREDICTIONS_FORMAT}; make it again"
+            )
         needed = ("logits", "depth_entropy", "labels", "splits", "conflicting")
         arrays: dict[str, Any] = {name: f[name] for name in needed}
         trust = str(f.get("calibration", "{}")).encode()

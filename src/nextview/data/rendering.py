@@ -29,7 +29,7 @@ from nextview.data.store import (
 )
 from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.files import command, sha256_of
-from nextview.geometry.depth import POINTS
+from nextview.geometry.depth import CLOUD_POINTS
 from nextview.geometry.mesh import (
     FORMATS,
     MAX_FACES,
@@ -40,7 +40,7 @@ from nextview.geometry.mesh import (
     mesh_warnings,
 )
 from nextview.geometry.observation import Camera
-from nextview.geometry.viewsphere import DISTANCE, ViewSphere, rotation_z
+from nextview.geometry.viewsphere import CAMERA_DISTANCE, ViewSphere, rotation_z
 from nextview.sensing.observed_object import SIZE
 from nextview.simulation.robot_camera import sensed_camera
 from nextview.simulation.scene import build_scene
@@ -110,7 +110,7 @@ def render_object(camera: Camera, sphere: ViewSphere, size: int) -> dict[str, np
     """
     image = np.empty((len(sphere), size, size), np.uint8)
     depth = np.empty((len(sphere), size, size), np.uint16)
-    points = np.empty((len(sphere), POINTS, 3), np.float32)
+    points = np.empty((len(sphere), CLOUD_POINTS, 3), np.float32)
 
     for view, pose in enumerate(sphere.poses):
         observation = camera.observe(pose)
@@ -280,9 +280,10 @@ def _check(path: Path, sphere: ViewSphere, size: int, options: RenderOptions) ->
 
     if options.sensor is None:
         return None
-    if (size, sphere.distance) != (SIZE, DISTANCE):
+    if (size, sphere.distance) != (SIZE, CAMERA_DISTANCE):
         raise UsageError(
-            f"a sensor's views are of {SIZE} pixels, from {DISTANCE:g} object radii; give no other"
+            f"a sensor's views are of {SIZE} pixels, from {CAMERA_DISTANCE:g} object radii; give no"
+            " other"
         )
     return sensor_named(options.sensor)
 

@@ -31,25 +31,25 @@ from nextview.simulation.scene import footprint, mesh_hash, separation
 from nextview.simulation.scene_layout import SUFFIX
 from nextview.types import Float
 
-LEVEL = "room"  # in the names of rooms, where other scenes have their level of clutter
-LAYOUTS_TRIED = 60
+ROOM_NAME = "room"  # in the names of rooms, where other scenes have their level of clutter
+ROOM_LAYOUTS_TRIED = 60
 VIEWS_TRIED = 60  # first views of one layout
 
 ROOM_SIDE = (3.5, 6.5)  # metres
 ROOM_HEIGHT = (2.4, 2.8)
 AT_WALL = (0.0, 0.06)  # metres between a thing that stands against a wall and the wall
-GAP = 0.3  # metres between the target and other furniture, at least
+FURNITURE_GAP = 0.3  # metres between the target and other furniture, at least
 FURNITURE = (1, 3)  # things beside the target, at least and at most
 PLACES_TRIED = 20  # for each
 
 HAND_SIZED = 0.3  # metres: what has a smaller radius lies on a table
-TABLE_HEIGHT = (0.70, 0.78)
+TABLE_HEIGHTS = (0.70, 0.78)
 TABLE_WIDTH = (1.2, 1.6)
 TABLE_DEPTH = (0.7, 0.9)
-TABLE_TOP = 0.04  # thickness
+TABLE_TOP_THICKNESS = 0.04  # thickness
 TABLE_LEG = 0.05
-EDGE = 0.08  # metres from the edge of the table to what lies on it, at least
-BESIDE = 0.08  # metres between two things on a table, at least
+TABLE_EDGE = 0.08  # metres from the edge of the table to what lies on it, at least
+LEAST_SPACING = 0.08  # metres between two things on a table, at least
 MOST_BESIDE = 2
 BOOK = ((0.05, 0.25), (0.05, 0.2), (0.03, 0.15))  # width, depth and height of boxes on a table
 CABINET = ((0.4, 1.2), (0.3, 0.5), (0.6, 2.0))
@@ -58,16 +58,18 @@ CABINET = ((0.4, 1.2), (0.3, 0.5), (0.6, 2.0))
 FLOOR_DISTANCE = (1.5, 3.5)
 FLOOR_HEIGHT = (0.6, 1.6)
 ABOVE_TABLE = 0.1
-CLOSEST = 0.8  # metres from the target's sphere
+CLOSEST_CAMERA = 0.8  # metres from the target's sphere
 TABLE_DISTANCE = (0.4, 0.7)
 CLOSEST_TO_SMALL = 0.25
 TABLE_ELEVATION = (20.0, 60.0)  # degrees
 AIM_OFF = 0.02  # standard deviation of where the camera is aimed, as a part of its distance
-SHOWN = 0.7  # share of the target's picture that nothing else hides in the first view, at least
-PICTURE = 96  # pixels across, in which that is measured
+LEAST_SHOWN = (
+    0.7  # share of the target's picture that nothing else hides in the first view, at least
+)
+PREVIEW_SIDE = 96  # pixels across, in which that is measured
 FIELD = 0.9  # of that picture: its half width at unit distance
 
-NOWHERE = tuple(np.eye(4).ravel().tolist())  # the first pose of a layout that has none yet
+NO_POSE = tuple(np.eye(4).ravel().tolist())  # the first pose of a layout that has none yet
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ MOST_LENGTH = 2.6  # metres on the floor: a wide table is lower than usual inste
 
 
 @dataclass(frozen=True)
-class Task:
+class RoomTask:
     """One room to draw.
 
     Attributes:
@@ -172,7 +174,7 @@ def draw_rooms(
     dataset = Path(dataset)
     out = Path(out)
     wanted = room_tasks(dataset, out, rooms, seed, split)
-    there = next(out.rglob(f"*@{LEVEL}-*{SUFFIX}"), None)
+    there = next(out.rglob(f"*@{ROOM_NAME}-*{SUFFIX}"), None)
     if there is None:
         check_new(out, folder=True)
     elif RoomLayout.load(there).seed != seed:
@@ -191,7 +193,7 @@ def draw_rooms(
 
 def room_tasks(
     dataset: Path, out: Path, rooms: int | None, seed: int, split: str | None
-) -> list[Task]:
+) -> list[RoomTask]:
     """All rooms that are asked for, see ``draw_rooms``.
 
     Args:
@@ -210,10 +212,10 @@ def room_tasks(
         order = _in_turns([entry for entry in entries if entry.split == one], seed)
         for number in range(len(order) if rooms is None else rooms):
             entry = order[number % len(order)]
-            name = f"{entry.name}@{LEVEL}-{number // len(order)}"
+            name = f"{entry.name}@{ROOM_NAME}-{number // len(order)}"
             path = out.absolute() / entry.label / one / f"{name}{SUFFIX}"
             target = entry.path.relative_to(dataset).as_posix()
-            found.append(Task(target, one, entry.label, name, path))
+            found.append(RoomTask(target, one, entry.label, name, path))
     return found
 
 
@@ -248,7 +250,7 @@ def _source(dataset: Path, unit: str | None) -> Source:
     )
 
 
-def _draw(source: Source, seed: int, task: Task) -> str | None:
+def _draw(source: Source, seed: int, task: RoomTask) -> str | None:
     """Draw one room into its file; the reason if that cannot be."""
     try:
         draw_room(source, task, seed).save(task.path)
@@ -257,7 +259,7 @@ def _draw(source: Source, seed: int, task: Task) -> str | None:
     return None
 
 
-def draw_room(source: Source, task: Task, seed: int) -> RoomLayout:
+def draw_room(source: Source, task: RoomTask, seed: int) -> RoomLayout:
     """A room around a target; seed and name decide all that is random.
 
     Args:
@@ -274,7 +276,7 @@ def draw_room(source: Source, task: Task, seed: int) -> RoomLayout:
     radius = life_radius(mesh, task.label, rng)
     small = task.label in ON_TABLES or (mesh.metres is not None and radius < HAND_SIZED)
     drawing = _on_table if small else _on_floor
-    for _ in range(LAYOUTS_TRIED):
+    for _ in range(ROOM_LAYOUTS_TRIED):
         layout = drawing(source, task, mesh, radius, rng)
         if layout is None:
             continue
@@ -282,7 +284,9 @@ def draw_room(source: Source, task: Task, seed: int) -> RoomLayout:
         pose = _first_view(room, rng)
         if pose is not None:
             return _with_pose(layout, seed, pose)
-    raise DatasetError(f"{source.folder / task.target}: shows in none of {LAYOUTS_TRIED} rooms")
+    raise DatasetError(
+        f"{source.folder / task.target}: shows in none of {ROOM_LAYOUTS_TRIED} rooms"
+    )
 
 
 def life_radius(mesh: Mesh, label: str, rng: np.random.Generator) -> float:
@@ -309,7 +313,7 @@ def life_radius(mesh: Mesh, label: str, rng: np.random.Generator) -> float:
 
 
 def _on_floor(
-    source: Source, task: Task, mesh: Mesh, radius: float, rng: np.random.Generator
+    source: Source, task: RoomTask, mesh: Mesh, radius: float, rng: np.random.Generator
 ) -> RoomLayout | None:
     """A target on the floor, half of them with the back to a wall; None where nothing fits."""
     width, depth, height = rng.uniform(*np.transpose([ROOM_SIDE, ROOM_SIDE, ROOM_HEIGHT]))
@@ -330,14 +334,14 @@ def _on_floor(
         width=_short(width),
         depth=_short(depth),
         height=_short(height),
-        pose=NOWHERE,
+        pose=NO_POSE,
         objects=tuple(objects),
         slabs=tuple(slabs),
     )
 
 
 def _on_table(
-    source: Source, task: Task, mesh: Mesh, radius: float, rng: np.random.Generator
+    source: Source, task: RoomTask, mesh: Mesh, radius: float, rng: np.random.Generator
 ) -> RoomLayout | None:
     """A target on a table; None where it does not fit."""
     width, depth, height = rng.uniform(*np.transpose([ROOM_SIDE, ROOM_SIDE, ROOM_HEIGHT]))
@@ -372,7 +376,7 @@ def _on_table(
         width=_short(width),
         depth=_short(depth),
         height=_short(height),
-        pose=NOWHERE,
+        pose=NO_POSE,
         objects=(*objects, *more),
         slabs=(*slabs, *boxes),
     )
@@ -441,7 +445,7 @@ def _furniture(
                     continue
                 corners = at_rest(mesh.vertices, thing)
             outline = footprint(corners)
-            if min(separation(outline, other) for other in taken) >= GAP:
+            if min(separation(outline, other) for other in taken) >= FURNITURE_GAP:
                 taken.append(outline)
                 (objects if isinstance(thing, Standing) else slabs).append(thing)  # type: ignore[arg-type]
                 break
@@ -474,7 +478,7 @@ def _cabinet(room: tuple[float, float], rng: np.random.Generator) -> Slab:
 def _table(room: tuple[float, float], rng: np.random.Generator) -> list[Slab]:
     """A table top with four legs, against a wall or in the room; the top comes first."""
     width, depth = rng.uniform(*np.transpose([TABLE_WIDTH, TABLE_DEPTH]))
-    height = rng.uniform(*TABLE_HEIGHT)
+    height = rng.uniform(*TABLE_HEIGHTS)
     wall = int(rng.integers(4))
     azimuth = np.pi / 2 * (wall - 1)
     half = np.array([width, depth] if wall % 2 else [depth, width]) / 2
@@ -485,14 +489,14 @@ def _table(room: tuple[float, float], rng: np.random.Generator) -> list[Slab]:
         side = 1 if wall < 2 else -1
         place[axis] = side * (room[axis] / 2 - half[axis] - rng.uniform(*AT_WALL))
 
-    size = width, depth, TABLE_TOP
-    top = _slab((*place, height - TABLE_TOP), azimuth, size, even=False)
+    size = width, depth, TABLE_TOP_THICKNESS
+    top = _slab((*place, height - TABLE_TOP_THICKNESS), azimuth, size, even=False)
     legs = []
     for x in (-1, 1):
         for y in (-1, 1):
             aside = np.array([x * (width - TABLE_LEG), y * (depth - TABLE_LEG), 0]) / 2
             at = place + (rotation_z(azimuth) @ aside)[:2]
-            size = TABLE_LEG, TABLE_LEG, height - 2 * TABLE_TOP
+            size = TABLE_LEG, TABLE_LEG, height - 2 * TABLE_TOP_THICKNESS
             legs.append(_slab((*at, 0.0), azimuth, size))
     return [top, *legs]
 
@@ -535,7 +539,7 @@ def _lying(
 
 
 def _beside(
-    source: Source, task: Task, top: Slab, taken: list[Float], rng: np.random.Generator
+    source: Source, task: RoomTask, top: Slab, taken: list[Float], rng: np.random.Generator
 ) -> Standing | Slab | None:
     """Another thing on a table, or a box; None where it does not fit."""
     others = [file for file in source.small.get(task.split, ()) if file != task.target]
@@ -559,7 +563,7 @@ def _beside(
 
 def _on_top(top: Slab, rng: np.random.Generator) -> Float:
     """A place on a table, (2,)."""
-    free = np.array([top.width, top.depth]) / 2 - EDGE
+    free = np.array([top.width, top.depth]) / 2 - TABLE_EDGE
     aside = np.append(rng.uniform(-free, free), 0)
     return np.array([top.x, top.y]) + (rotation_z(top.azimuth) @ aside)[:2]
 
@@ -567,8 +571,8 @@ def _on_top(top: Slab, rng: np.random.Generator) -> Float:
 def _fits(outline: Float, top: Slab, taken: list[Float]) -> bool:
     """Whether an outline, (K, 2), lies on a table, away from its edge and from what is taken."""
     own = (outline - (top.x, top.y)) @ rotation_z(top.azimuth)[:2, :2]
-    inside = (np.abs(own) < np.array([top.width, top.depth]) / 2 - EDGE / 2).all()
-    return bool(inside) and all(separation(outline, other) >= BESIDE for other in taken)
+    inside = (np.abs(own) < np.array([top.width, top.depth]) / 2 - TABLE_EDGE / 2).all()
+    return bool(inside) and all(separation(outline, other) >= LEAST_SPACING for other in taken)
 
 
 def _slab(place: Sequence[float], azimuth: float, size: Sequence[float], even: bool = True) -> Slab:
@@ -592,7 +596,7 @@ def _first_view(room: Room, rng: np.random.Generator) -> Float | None:
     for _ in range(VIEWS_TRIED):
         azimuth = rng.uniform(0, 2 * np.pi)
         if room.layout.kind == "floor" or room.layout.label in ON_TABLES:
-            distance = max(rng.uniform(*FLOOR_DISTANCE), room.radius + CLOSEST)
+            distance = max(rng.uniform(*FLOOR_DISTANCE), room.radius + CLOSEST_CAMERA)
             lowest = max(FLOOR_HEIGHT[0], room.layout.target.z + ABOVE_TABLE)
             rise = np.clip((rng.uniform(lowest, FLOOR_HEIGHT[1]) - centre[2]) / distance, -1, 1)
         else:
@@ -603,16 +607,16 @@ def _first_view(room: Room, rng: np.random.Generator) -> Float | None:
         aim = centre + rng.normal(0, AIM_OFF * distance, 3)
         pose = level_pose(direction, distance)
         pose[:3, 3] += aim
-        if room.reachable(pose) and _shown(room, pose) >= SHOWN:
+        if room.reachable(pose) and _shown(room, pose) >= LEAST_SHOWN:
             return pose
     return None
 
 
 def _shown(room: Room, pose: Float) -> float:
     """Share of the target's picture from a pose that lies in it and that nothing hides."""
-    focal = PICTURE / 2 / FIELD
-    intrinsics = np.array([[focal, 0, PICTURE / 2], [0, focal, PICTURE / 2], [0, 0, 1.0]])
-    rays = pixel_rays(intrinsics, (PICTURE, PICTURE)).reshape(-1, 3) @ pose[:3, :3].T
+    focal = PREVIEW_SIDE / 2 / FIELD
+    intrinsics = np.array([[focal, 0, PREVIEW_SIDE / 2], [0, focal, PREVIEW_SIDE / 2], [0, 0, 1.0]])
+    rays = pixel_rays(intrinsics, (PREVIEW_SIDE, PREVIEW_SIDE)).reshape(-1, 3) @ pose[:3, :3].T
     alone, _ = RayCaster(room.things[:1]).cast(pose[:3, 3], rays.astype(np.float32))
     _, which = room.caster.cast(pose[:3, 3], rays.astype(np.float32))
     whole_picture = np.isfinite(alone).sum()

@@ -50,14 +50,18 @@ def monitor() -> list[Box]:
     ]
 
 
-SAMPLES: dict[str, Callable[[], list[Box]]] = {"chair": chair, "table": table, "monitor": monitor}
+SAMPLE_MESHES: dict[str, Callable[[], list[Box]]] = {
+    "chair": chair,
+    "table": table,
+    "monitor": monitor,
+}
 
 
 def sample_mesh(name: str) -> Mesh:
     """A sample object by name."""
-    if name not in SAMPLES:
-        raise UsageError(f"no sample is called {name!r}; there are {', '.join(SAMPLES)}")
-    return boxes_mesh(SAMPLES[name](), name)
+    if name not in SAMPLE_MESHES:
+        raise UsageError(f"no sample is called {name!r}; there are {', '.join(SAMPLE_MESHES)}")
+    return boxes_mesh(SAMPLE_MESHES[name](), name)
 
 
 def boxes_mesh(boxes: list[Box], name: str) -> Mesh:

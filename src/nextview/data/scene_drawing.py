@@ -21,9 +21,9 @@ from nextview.geometry.mesh import Mesh
 from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.simulation.scene import (
+    BLOCK_HEIGHT,
     FOOTPRINT,
-    HEIGHT,
-    TABLE,
+    SCENE_TABLE,
     Item,
     Scene,
     block_item,
@@ -33,31 +33,31 @@ from nextview.simulation.scene import (
     place,
     separation,
 )
-from nextview.simulation.scene_layout import LEVELS, SUFFIX, Block, Placement, SceneLayout
+from nextview.simulation.scene_layout import CLUTTER_LEVELS, SUFFIX, Block, Placement, SceneLayout
 from nextview.simulation.simulated import SimulatedCamera, visible_shares
 from nextview.types import Mask
 
 SCENE_VIEWS = ViewSphere.named("40")
 # pixels of the pictures that tell how much of the target shows: in the end, and while drawing
 SHARE_PIXELS = 112
-COARSE = 48
+COARSE_PICTURE = 48
 # how far a scene's wanted share lies from its level's at most, and how well it is met
 SPREAD = 0.04
-TOLERANCE = 0.02
+VISIBLE_TOLERANCE = 0.02
 # things around a target
 FEWEST_AROUND = 3
 MOST_AROUND = 20
 # things that are tried for one layout, and layouts for one scene
-TRIES = 200
-LAYOUTS_TRIED = 20
-GAP = 0.04  # between things, at least, object radii
+THINGS_TRIED = 200
+SCENE_LAYOUTS_TRIED = 20
+THING_GAP = 0.04  # between things, at least, object radii
 # from the target's middle, object radii
-AWAY = {"light": (0.5, 2.6), "medium": (0.5, 2.3), "heavy": (0.5, 2.1)}
+CLUTTER_DISTANCES = {"light": (0.5, 2.6), "medium": (0.5, 2.3), "heavy": (0.5, 2.1)}
 OBJECT_RADIUS = (0.5, 1.1)
 FEWEST_OBJECTS = 2  # of things that are no boxes or walls, if there are any meshes for them
 OBJECTS = {"light": 0.7, "medium": 0.6, "heavy": 0.4}  # share of objects among objects and boxes
 # what is low hides nothing from above
-BOX_HEIGHT = {"light": HEIGHT, "medium": HEIGHT, "heavy": (1.4, 2.9)}
+BOX_HEIGHT = {"light": BLOCK_HEIGHT, "medium": BLOCK_HEIGHT, "heavy": (1.4, 2.9)}
 # what a thing hides at least: the table is soon full
 LEAST_HIDDEN = {"light": 0.0, "medium": 0.0, "heavy": 0.008}
 # chances of 0, 1 and 2
@@ -75,7 +75,7 @@ MOST_SCENES = 100_000  # at each level, of each split
 
 
 @dataclass(frozen=True)
-class Task:
+class SceneTask:
     """A scene to draw.
 
     Attributes:
@@ -109,7 +109,7 @@ class Meshes:
 def draw_scenes(
     dataset: Path,
     out: Path,
-    levels: Sequence[str] = tuple(LEVELS),
+    levels: Sequence[str] = tuple(CLUTTER_LEVELS),
     scenes: int | None = None,
     seed: int = 0,
     split: str | None = None,
@@ -176,7 +176,7 @@ def tasks(
     seed: int,
     split: str | None,
     held_out: str | Path | None = None,
-) -> list[Task]:
+) -> list[SceneTask]:
     """List all scenes that are to be drawn, see ``draw_scenes``.
 
     Args:
@@ -194,16 +194,17 @@ def tasks(
     Raises:
         UsageError: a level, the number of scenes or the seed is not valid.
     """
-    unknown = [level for level in levels if level not in LEVELS]
+    unknown = [level for level in levels if level not in CLUTTER_LEVELS]
     if unknown or not levels:
         raise UsageError(
-            f"the level of a scene is {', '.join(LEVELS)}, not {unknown[0] if unknown else 'none'}"
+            f"the level of a scene is {', '.join(CLUTTER_LEVELS)},"
+            f" not {unknown[0] if unknown else 'none'}"
         )
     if scenes is not None:
         whole(scenes, "the number of scenes at each level", 1, MOST_SCENES)
     whole(seed, "a seed", 0, 2**31 - 1)
 
-    found: list[Task] = []
+    found: list[SceneTask] = []
     entries = select(list_dataset(dataset), dataset, split, held_out)
     for one in dict.fromkeys(entry.split for entry in entries):
         mine = [entry for entry in entries if entry.split == one]
@@ -215,13 +216,13 @@ def tasks(
                 name = f"{entry.name}@{level}-{number // len(mine)}"
                 path = out.absolute() / entry.label / one / f"{name}{SUFFIX}"
                 found.append(
-                    Task(entry.path.relative_to(dataset).as_posix(), one, level, name, path)
+                    SceneTask(entry.path.relative_to(dataset).as_posix(), one, level, name, path)
                 )
 
     return found
 
 
-def _draw(meshes: dict[str, Meshes], seed: int, task: Task) -> str | None:
+def _draw(meshes: dict[str, Meshes], seed: int, task: SceneTask) -> str | None:
     """Draw one scene into its file; the reason if that cannot be."""
     try:
         draw_scene(task.target, meshes[task.split], task.level, seed, task.name).save(task.path)
@@ -253,14 +254,14 @@ def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) ->
     others = [others[i] for i in rng.permutation(len(others))[:MESHES_TRIED]]
     hiding = _Hiding(mesh)
 
-    for _ in range(LAYOUTS_TRIED):
+    for _ in range(SCENE_LAYOUTS_TRIED):
         placed = _layout(
             mesh,
             others,
             meshes.folder,
             hiding,
             level,
-            LEVELS[level] + rng.uniform(-SPREAD, SPREAD),
+            CLUTTER_LEVELS[level] + rng.uniform(-SPREAD, SPREAD),
             rng,
         )
 
@@ -279,8 +280,8 @@ def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) ->
             middle = Placement(target, mesh_hash(meshes.folder / target))
             return SceneLayout(name, level, seed, middle, objects, blocks, shares, unreachable)
     raise DatasetError(
-        f"{meshes.folder / target}: no layout of {LAYOUTS_TRIED} lets {LEVELS[level]:.0%} of it"
-        " show"
+        f"{meshes.folder / target}: no layout of {SCENE_LAYOUTS_TRIED} lets"
+        f" {CLUTTER_LEVELS[level]:.0%} of it show"
     )
 
 
@@ -288,7 +289,7 @@ class _Hiding:
     """Rays from 40 cameras to the points of a target's surface that they see."""
 
     def __init__(self, mesh: Mesh) -> None:
-        camera = SimulatedCamera(mesh, COARSE, SCENE_VIEWS.distance)
+        camera = SimulatedCamera(mesh, COARSE_PICTURE, SCENE_VIEWS.distance)
         eyes = []
         rays = []
         views = []
@@ -351,9 +352,9 @@ def _layout(
     placed: list[Thing] = []
     free = np.ones(len(hiding.views), bool)
 
-    for _ in range(TRIES):
+    for _ in range(THINGS_TRIED):
         share = hiding.share(free)
-        if len(placed) >= FEWEST_AROUND + walls and share <= goal + TOLERANCE:
+        if len(placed) >= FEWEST_AROUND + walls and share <= goal + VISIBLE_TOLERANCE:
             return placed
         if len(placed) == MOST_AROUND:
             return None
@@ -364,7 +365,7 @@ def _layout(
         )
         thing = _wall(rng) if len(placed) < walls else _thing(others, folder, level, short, rng)
         item = _stood(thing, folder, floor)
-        if item is None or np.abs(item.footprint).max() > TABLE:
+        if item is None or np.abs(item.footprint).max() > SCENE_TABLE:
             continue
 
         # it overlaps with what is there
@@ -373,12 +374,16 @@ def _layout(
                 separation(item.footprint, other)
                 for other in [middle, *(i.footprint for _, i in placed)]
             )
-            < GAP
+            < THING_GAP
         ):
             continue
 
         left = free & ~hiding.by(item, free)
-        if goal - TOLERANCE <= hiding.share(left) <= share - LEAST_HIDDEN[level] * (not short):
+        if (
+            goal - VISIBLE_TOLERANCE
+            <= hiding.share(left)
+            <= share - LEAST_HIDDEN[level] * (not short)
+        ):
             placed.append((thing, item))
             free = left
     return None
@@ -388,7 +393,7 @@ def _thing(
     others: Sequence[str], folder: Path, level: str, short: bool, rng: np.random.Generator
 ) -> Placement | Block:
     """An object or a box, anywhere around; an object where there are too few."""
-    away = rng.uniform(*AWAY[level])
+    away = rng.uniform(*CLUTTER_DISTANCES[level])
     towards = rng.uniform(0, 2 * np.pi)
     azimuth = rng.uniform(0, 2 * np.pi)
     there = away * np.cos(towards), away * np.sin(towards), azimuth

@@ -13,18 +13,17 @@ from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.geometry.observation import SceneView
 from nextview.geometry.viewsphere import ViewSphere
-from nextview.policies.base import EpisodeState
 from nextview.sensing.expected_visibility import (
-    GRID,
+    VISIBILITY_GRID,
     Occupancy,
     SeenScene,
     expected_visibility,
     sight_lines,
 )
-from nextview.session.episode import Visible, unconstrained
+from nextview.session.episode import Constrain, Visible, unconstrained
 from nextview.simulation.scene import Scene
 from nextview.simulation.scene_layout import clutter_level
-from nextview.simulation.simulated import TARGET, SceneCamera, visible_shares
+from nextview.simulation.simulated import SHOWS_TARGET, SceneCamera, visible_shares
 from nextview.types import Float, Float32, Index, Mask
 
 SCENE_SIDE = 80  # of the pictures of the whole scene, pixels
@@ -81,7 +80,7 @@ class SceneViews:
 
     Attributes:
         depth: (V, S, S), object radii, 0 = nothing.
-        owner: of each pixel: NOTHING, TARGET, OTHER or TABLE_TOP, (V, S, S).
+        owner: of each pixel: SHOWS_NOTHING, SHOWS_TARGET, SHOWS_OTHER or SHOWS_TABLE, (V, S, S).
         intrinsics: of the camera, pixels, (3, 3).
         poses: camera-to-world, (V, 4, 4).
         reachable: whether a camera can stand at each view, (V,).
@@ -100,7 +99,11 @@ class SceneViews:
     def scene_view(self, view: int) -> SceneView:
         """What a camera sees from there: things and table alike are no target."""
         return SceneView(
-            self.depth[view], self.owner[view] == TARGET, self.poses[view], self.intrinsics, True
+            self.depth[view],
+            self.owner[view] == SHOWS_TARGET,
+            self.poses[view],
+            self.intrinsics,
+            True,
         )
 
 
@@ -130,9 +133,6 @@ def scene_views(store: ViewStore, i: int) -> SceneViews:
         store.read("measures/visible_share", i),
         store.read("measures/clearance", i),
     )
-
-
-Constrain = Callable[[EpisodeState], EpisodeState]
 
 
 def sight_of(scenes: "SceneSight | None", objects: Index) -> tuple[Constrain, Visible]:
@@ -240,9 +240,11 @@ class SceneSight:
     def _frame(self, row: int, view: int, read: Callable[[int], SceneViews]) -> SeenScene:
         """Return what the frame from one view shows, kept packed."""
         if (row, view) not in self._frames:
-            asked = sight_lines(GRID, self.store.sphere.poses[:, :3, 3].tobytes()).asked
-            seen = SeenScene(Occupancy.unseen(GRID, asked)).seen(read(row).scene_view(view))
+            asked = sight_lines(VISIBILITY_GRID, self.store.sphere.poses[:, :3, 3].tobytes()).asked
+            seen = SeenScene(Occupancy.unseen(VISIBILITY_GRID, asked)).seen(
+                read(row).scene_view(view)
+            )
             self._frames[row, view] = zlib.compress(seen.occupancy.cells.tobytes(), 1), seen.floor
         packed, floor = self._frames[row, view]
-        cells = np.frombuffer(zlib.decompress(packed), np.uint8).reshape((GRID.n,) * 3)
-        return SeenScene(Occupancy(GRID, cells), floor)
+        cells = np.frombuffer(zlib.decompress(packed), np.uint8).reshape((VISIBILITY_GRID.n,) * 3)
+        return SeenScene(Occupancy(VISIBILITY_GRID, cells), floor)

@@ -22,13 +22,13 @@ from nextview.data.folders import Entry
 from nextview.data.pool import WorkerDied, each
 from nextview.errors import DAMAGED, DatasetError
 from nextview.files import decode_record, new_folder, only_one
-from nextview.geometry.depth import POINTS
+from nextview.geometry.depth import CLOUD_POINTS
 from nextview.geometry.mesh import UNITS
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.types import Float, Float32, Index, Mask
 
-FORMAT = 2
+STORE_FORMAT = 2
 DEPTH_UNIT = 1e-4  # depth is stored as uint16 in steps of this many object radii
 POINT_UNIT = 1 / 32767  # points are stored as int16 in steps of this many object radii
 PENDING = 0
@@ -36,7 +36,7 @@ DONE = 1
 FAILED = 2
 PLANNED = 5  # views of a plan: the thesis's longest episode
 # by rendering; more in scenes:
-RENDERED = ("image", "depth", "points", "measures/depth_entropy", "radius", "status")
+RENDERED_ARRAYS = ("image", "depth", "points", "measures/depth_entropy", "radius", "status")
 SCENE = (
     "scene/depth",
     "scene/owner",
@@ -182,8 +182,10 @@ class ViewStore:
                 f"{path}: zarr.json is damaged ({error}); copy it back or render again"
             ) from None
         content = group.attrs.asdict()
-        if content.get("format") != FORMAT:
-            raise DatasetError(f"{path}: not a view store of format {FORMAT}; render it again")
+        if content.get("format") != STORE_FORMAT:
+            raise DatasetError(
+                f"{path}: not a view store of format {STORE_FORMAT}; render it again"
+            )
 
         content.setdefault("rotated", content.get("turn", False))  # its name before
 
@@ -196,7 +198,7 @@ class ViewStore:
     @property
     def rendered(self) -> tuple[str, ...]:
         """Names of the arrays that rendering makes: more for cluttered scenes."""
-        return RENDERED if self.attributes.scene is None else (*RENDERED, *SCENE)
+        return RENDERED_ARRAYS if self.attributes.scene is None else (*RENDERED_ARRAYS, *SCENE)
 
     @property
     def added(self) -> list[str]:
@@ -239,7 +241,7 @@ class ViewStore:
         layouts = {
             "image": ((v, size, size), "uint8", 0),
             "depth": ((v, size, size), "uint16", 0),
-            "points": ((v, POINTS, 3), "int16", 0),
+            "points": ((v, CLOUD_POINTS, 3), "int16", 0),
             "measures/depth_entropy": ((v,), "float32", 0),
             "radius": ((), "float64", np.nan),
             "status": ((), "uint8", PENDING),

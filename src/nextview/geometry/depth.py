@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from nextview.types import Float, Float32, Floats
 
 # object radii; what is farther is no object: depth cameras have large numbers for "nothing"
-FARTHEST = 50.0
+FARTHEST_SURFACE = 50.0
 # brightness of a surface seen edge-on, so that it stays apart from the black background
 AMBIENT = 0.15
-POINTS = 1024  # points in the partial cloud of one view (thesis, section 4.1.2)
+CLOUD_POINTS = 1024  # points in the partial cloud of one view (thesis, section 4.1.2)
 
 
 def object_depth(depth: Floats) -> Floats:
@@ -22,9 +22,9 @@ def object_depth(depth: Floats) -> Floats:
 
     If there are none, the array itself is returned.
     """
-    if depth.min() >= 0 and depth.max() < FARTHEST:  # not so if there is a NaN
+    if depth.min() >= 0 and depth.max() < FARTHEST_SURFACE:  # not so if there is a NaN
         return depth
-    return np.where((depth > 0) & (depth < FARTHEST), depth, 0)
+    return np.where((depth > 0) & (depth < FARTHEST_SURFACE), depth, 0)
 
 
 def slope(before: NDArray, here: NDArray, after: NDArray) -> Float32:
@@ -106,15 +106,15 @@ def visible_points(
     flat = object_depth(depth).ravel()
     order = pixel_order(flat.size, seed)
     # most often the beginning of the order holds enough
-    for first in (4 * POINTS, 8 * POINTS, 16 * POINTS, flat.size):
+    for first in (4 * CLOUD_POINTS, 8 * CLOUD_POINTS, 16 * CLOUD_POINTS, flat.size):
         visible = np.flatnonzero(flat[order[:first]])
-        if len(visible) >= POINTS:
+        if len(visible) >= CLOUD_POINTS:
             break
-    chosen = order[visible[:POINTS]]
+    chosen = order[visible[:CLOUD_POINTS]]
     if len(chosen) == 0:
-        return np.zeros((POINTS, 3), np.float32)
-    chosen = np.resize(chosen, POINTS)
+        return np.zeros((CLOUD_POINTS, 3), np.float32)
+    chosen = np.resize(chosen, CLOUD_POINTS)
     rows, columns = np.divmod(chosen, depth.shape[1])
     (fx, _, cx), (_, fy, cy) = intrinsics[:2]
-    rays = np.stack([(columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy, np.ones(POINTS)], -1)
+    rays = np.stack([(columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy, np.ones(CLOUD_POINTS)], -1)
     return ((rays * flat[chosen, None]) @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)

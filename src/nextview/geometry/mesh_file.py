@@ -32,14 +32,14 @@ OFF_HEADER = re.compile(
 )
 # Of vertices, faces and edges, on one line or on three; the last is often missing.
 OFF_COUNTS = re.compile(rb"\s*(\d+)\s+(\d+)(?:\s+\d+(?=[ \t]*(?:\n|$)))?[ \t]*(?=\n|$)")
-Shape = tuple[Float, Index]  # vertices, (V, 3), and triangles, (F, 3)
+MeshArrays = tuple[Float, Index]  # vertices, (V, 3), and triangles, (F, 3)
 GLB_TRIANGLES = 4
 GLB_STRIP = 5
 GLB_FAN = 6
 GLB_NODES = 20_000  # Trimesh takes some seconds to place so many
 
 
-def read_off(data: bytes, max_faces: int = MAX_FACES) -> Shape:
+def read_off(data: bytes, max_faces: int = MAX_FACES) -> MeshArrays:
     """Read an OFF file, strictly; with comments, blank lines, polygons and colour columns.
 
     Args:
@@ -72,7 +72,7 @@ def read_off(data: bytes, max_faces: int = MAX_FACES) -> Shape:
     return plain or _off_by_lines(body, n_vertices, n_faces, max_faces)
 
 
-def _plain_off(body: bytes, n_vertices: int, n_faces: int) -> Shape | None:
+def _plain_off(body: bytes, n_vertices: int, n_faces: int) -> MeshArrays | None:
     """The usual case at full speed: three numbers a line, then triangles alone.
 
     None if the file is anything else.
@@ -100,7 +100,7 @@ def _plain_off(body: bytes, n_vertices: int, n_faces: int) -> Shape | None:
     return None if triangles.max() >= n_vertices else (vertices.reshape(-1, 3), triangles)
 
 
-def _off_by_lines(body: bytes, n_vertices: int, n_faces: int, max_faces: int) -> Shape:
+def _off_by_lines(body: bytes, n_vertices: int, n_faces: int, max_faces: int) -> MeshArrays:
     lines = lines_of_words(body)
     positions = array("d")
     corners = array("q")
@@ -126,7 +126,7 @@ def _off_by_lines(body: bytes, n_vertices: int, n_faces: int, max_faces: int) ->
     return _shape(positions, corners, sizes, max_faces)
 
 
-def read_obj(data: bytes, max_faces: int = MAX_FACES) -> Shape:
+def read_obj(data: bytes, max_faces: int = MAX_FACES) -> MeshArrays:
     """Read an OBJ file; its parts are joined.
 
     Args:
@@ -172,7 +172,7 @@ def _coordinates(words: list[bytes], vertex: int) -> Iterator[float]:
     return map(float, words[:3])
 
 
-def _shape(positions: array, corners: array, sizes: array, max_faces: int) -> Shape:
+def _shape(positions: array, corners: array, sizes: array, max_faces: int) -> MeshArrays:
     """Return vertices and triangles from flat coordinates and polygons; see ``triangulate``."""
     vertices = np.array(positions).reshape(-1, 3)
     return vertices, triangulate(
@@ -180,7 +180,7 @@ def _shape(positions: array, corners: array, sizes: array, max_faces: int) -> Sh
     )
 
 
-def read_glb(data: bytes, max_faces: int = MAX_FACES) -> Shape:
+def read_glb(data: bytes, max_faces: int = MAX_FACES) -> MeshArrays:
     """Read a GLB file, all its parts in place.
 
     Args:
@@ -259,7 +259,7 @@ def _check_glb(data: bytes) -> None:
             raise MeshError("it announces a negative number of elements")
 
 
-READERS: dict[str, Callable[[bytes, int], Shape]] = {  # by the suffix of a file's name
+READERS: dict[str, Callable[[bytes, int], MeshArrays]] = {  # by the suffix of a file's name
     ".off": read_off,
     ".obj": read_obj,
     ".ply": read_ply,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from nextview.errors import MeshError
 from nextview.types import Float, Index
 
-MARKS = (  # that editors put before a text, the longer first: UTF-32's begins as UTF-16's
+ENCODING_MARKS = (  # that editors put before a text, the longer first: UTF-32's begins as UTF-16's
     (codecs.BOM_UTF8, "utf-8"),
     (codecs.BOM_UTF32_LE, "utf-32-le"),
     (codecs.BOM_UTF32_BE, "utf-32-be"),
@@ -31,7 +31,7 @@ def encoding_of(data: bytes) -> tuple[str, int]:
         UTF-16 is told by the zero beside each of the first two letters; everything else is "utf-8",
         of which only ASCII is ever looked at, so that Latin-1 and its kin are read too.
     """
-    for mark, name in MARKS:
+    for mark, name in ENCODING_MARKS:
         if data.startswith(mark):
             return name, len(mark)
     first = data[:4]

@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 
 from nextview.checks import number, one_line
 from nextview.errors import ObservationError
-from nextview.geometry.depth import FARTHEST, headlight, object_depth, visible_points
+from nextview.geometry.depth import FARTHEST_SURFACE, headlight, object_depth, visible_points
 from nextview.types import Float, Float32, Mask
 
-LEAST_SHARE = 0.006
+LEAST_VISIBLE_SHARE = 0.006
 """An object is seen if one connected part of it fills this share of the image. In the networks'
 images of 112 pixels a side, less are specks of 8 x 9 pixels. The thinnest object of ModelNet10, a
 screen seen from its edge, fills 0.011."""
 SPECKS = 8  # or if all its parts together fill so many times as much
 LEAST_PIXELS = 9  # the least share in pixels, for small images
-LARGEST = 1e9  # numbers of poses and intrinsics are smaller
+LARGEST_ENTRY = 1e9  # numbers of poses and intrinsics are smaller
 # how far a pose may be from a rigid motion: numbers may have been written with four digits
 RIGID = 1e-3
 
@@ -105,7 +105,7 @@ class Observation:
         for name, value in checked.items():
             object.__setattr__(self, name, None if value is None else _own(value))
         if self.radius is not None:
-            if not (isinstance(self.radius, Real) and 0 < self.radius < LARGEST):
+            if not (isinstance(self.radius, Real) and 0 < self.radius < LARGEST_ENTRY):
                 shown = one_line(repr(self.radius))
                 raise ObservationError(
                     f"the object radius is a positive number of metres, or None, not {shown}"
@@ -148,8 +148,8 @@ def _own(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def enough_shows(mask: Mask) -> bool:
-    """Return whether enough pixels show the object, (H, W) bool; see LEAST_SHARE."""
-    least = max(LEAST_PIXELS, LEAST_SHARE * mask.size)
+    """Return whether enough pixels show the object, (H, W) bool; see LEAST_VISIBLE_SHARE."""
+    least = max(LEAST_PIXELS, LEAST_VISIBLE_SHARE * mask.size)
     n = np.count_nonzero(mask)
     if not least <= n < SPECKS * least:
         return bool(n >= least)
@@ -182,7 +182,7 @@ def checked_pose(pose: Any) -> Float:
         raise ObservationError(
             f"the pose is a camera-to-world matrix of the shape (4, 4), not {pose.shape}"
         )
-    if not (np.abs(pose) < LARGEST).all():  # not so if there is a NaN
+    if not (np.abs(pose) < LARGEST_ENTRY).all():  # not so if there is a NaN
         raise ObservationError("the pose holds NaN or infinity, or a number that no camera has")
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID:
         raise ObservationError(
@@ -200,7 +200,7 @@ def checked_pose(pose: Any) -> Float:
         )
 
     distance = float(np.sqrt((pose[:3, 3] ** 2).sum()))
-    if distance > 2 * FARTHEST:
+    if distance > 2 * FARTHEST_SURFACE:
         what = f"the camera stands {distance:.4g} object radii from the object"
         raise ObservationError(
             f"{what}: is its position in millimetres? Divide it by the object radius"
@@ -227,7 +227,7 @@ def checked_intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> Float:
         raise ObservationError(
             f"the intrinsics are a pinhole matrix of the shape (3, 3), not {intrinsics.shape}"
         )
-    if not (np.abs(intrinsics) < LARGEST).all():  # not so if there is a NaN
+    if not (np.abs(intrinsics) < LARGEST_ENTRY).all():  # not so if there is a NaN
         raise ObservationError("the intrinsics hold NaN, infinity or a number that no camera has")
     if np.abs(intrinsics[2] - (0, 0, 1)).max() > RIGID:
         last = intrinsics[2].tolist()
@@ -304,13 +304,13 @@ def _check_unit(given: Float32, near: int) -> None:
     """
     if 99 * near >= given.size:
         return
-    far = given[np.isfinite(given) & (given >= FARTHEST)]
+    far = given[np.isfinite(given) & (given >= FARTHEST_SURFACE)]
     varied = np.count_nonzero(far < far.max()) if len(far) else 0
     if varied > max(LEAST_PIXELS, 99 * near):
         raise ObservationError(
             "the depth looks like millimetres, or metres, not object radii (its median is"
-            f" {np.median(far):.4g}, and {FARTHEST:g} and more counts as nothing): divide it by the"
-            " object radius, and set all else to 0"
+            f" {np.median(far):.4g}, and {FARTHEST_SURFACE:g} and more counts as nothing): divide"
+            " it by the object radius, and set all else to 0"
         )
 
 
@@ -343,7 +343,7 @@ def pinhole(size: int, distance: float) -> Float:
         ObservationError: the camera is inside the sphere.
     """
     distance = number(distance, "the distance")
-    if not 1 < distance < LARGEST:
+    if not 1 < distance < LARGEST_ENTRY:
         raise ObservationError(
             f"the camera has to stand more than one object radius from the centre, not {distance:g}"
         )

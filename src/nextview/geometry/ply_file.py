@@ -17,7 +17,7 @@ from nextview.geometry.mesh_text import encoding_of, numbers, plain_text
 from nextview.geometry.triangles import MAX_FACES, check_faces, no_faces, triangulate
 from nextview.types import Float, Index
 
-KINDS = {  # the format's names of its numbers, and those that are found in the wild
+NUMBER_KINDS = {  # the format's names of its numbers, and those that are found in the wild
     "char": "i1",
     "uchar": "u1",
     "short": "i2",
@@ -217,9 +217,9 @@ def _property(words: list[str], is_text: bool, order: str) -> Property:
     """What a line "property KIND NAME" or "property list KIND KIND NAME" says."""
     is_list = words[1:2] == ["list"]
     kinds = words[2:-1] if is_list else words[1:-1]
-    if len(kinds) != (2 if is_list else 1) or not KINDS.keys() >= set(kinds):
+    if len(kinds) != (2 if is_list else 1) or not NUMBER_KINDS.keys() >= set(kinds):
         raise _bad_line(words)
-    types = [np.dtype("f8" if is_text else order + KINDS[kind]) for kind in kinds]
+    types = [np.dtype("f8" if is_text else order + NUMBER_KINDS[kind]) for kind in kinds]
     return Property(words[-1], types[-1], types[0] if is_list else None)
 
 

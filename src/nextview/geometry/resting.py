@@ -12,14 +12,14 @@ from nextview.geometry.viewsphere import Directions
 from nextview.types import Float
 
 LIKELY_POSE = 0.1  # resting poses less likely than this are left out
-MOST_POSES = 4  # and all but so many, the mesh's own among them
+MOST_RESTING_POSES = 4  # and all but so many, the mesh's own among them
 SAME_TILT = np.radians(20)  # resting poses whose directions up are within this angle are one
 RARE_REST = 0.05  # this share of the throws, those into the rarest poses, is not looked at
 # thickness, object radii, below which an object is a sheet: it has two sides and no convex hull
 FLAT_SHEET = 1e-4
 
 # Of the comparison of an object with itself, turned. Distances are in object radii.
-SURFACE_POINTS = 20_000
+RESTING_POINTS = 20_000
 COMPARED_POINTS = 150
 COMPARED_TURNS = np.radians(np.arange(0, 360, 10))[:, None]
 FITTING_ROUNDS = 10
@@ -59,7 +59,7 @@ def resting_poses(mesh: Mesh) -> Float:
 
     likely = [pose for pose in others if pose.share >= LIKELY_POSE]
     likely.sort(key=lambda pose: -pose.share)
-    return np.stack([_upright(pose.up) for pose in [own, *likely[: MOST_POSES - 1]]])
+    return np.stack([_upright(pose.up) for pose in [own, *likely[: MOST_RESTING_POSES - 1]]])
 
 
 def _stable_poses(mesh: Mesh) -> tuple[Float, Float]:
@@ -123,7 +123,7 @@ class _SelfComparison:
     @classmethod
     def of(cls, mesh: Mesh) -> "_SelfComparison":
         rng = np.random.default_rng(0)
-        surface = cKDTree(_points_on(mesh, SURFACE_POINTS, rng))
+        surface = cKDTree(_points_on(mesh, RESTING_POINTS, rng))
         return cls(surface, _points_on(mesh, COMPARED_POINTS, rng))
 
     def look_alike(self, first_up: Float, second_up: Float) -> bool:

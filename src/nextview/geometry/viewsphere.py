@@ -17,9 +17,9 @@ from nextview.checks import number, one_line, points, whole
 from nextview.errors import UsageError
 from nextview.types import Float, Index
 
-DISTANCE = 3.0  # distance of the camera from the object's centre, in object radii
+CAMERA_DISTANCE = 3.0  # distance of the camera from the object's centre, in object radii
 # elevation and azimuth of a cell, in which travel off any grid is counted
-CELL = np.radians((18.0, 45.0))
+TRAVEL_CELL = np.radians((18.0, 45.0))
 # viewpoints that there may be: distances between all of them are kept, 200 MB at this number
 MOST_VIEWPOINTS = 5_000
 # radians within which a camera stands at a candidate. What is more is a place of its own
@@ -39,7 +39,9 @@ def rotation_z(angle: ArrayLike) -> Float:
     return turned
 
 
-def look_at_origin(elevation: ArrayLike, azimuth: ArrayLike, distance: float = DISTANCE) -> Float:
+def look_at_origin(
+    elevation: ArrayLike, azimuth: ArrayLike, distance: float = CAMERA_DISTANCE
+) -> Float:
     """Return the poses of cameras that look at the origin with a level horizon.
 
     Args:
@@ -70,7 +72,7 @@ def look_at_origin(elevation: ArrayLike, azimuth: ArrayLike, distance: float = D
     return pose
 
 
-def level_pose(direction: Float, distance: float = DISTANCE) -> Float:
+def level_pose(direction: Float, distance: float = CAMERA_DISTANCE) -> Float:
     """Return the pose of a level camera that looks at the origin from a direction.
 
     Args:
@@ -189,7 +191,7 @@ class Viewpoints:
 
     def cells(self, directions: Float) -> tuple[Float, Float]:
         """Return row and column of directions, (..., 3), on the grid that travel is counted in."""
-        return elevation_of(directions) / CELL[0], azimuth_of(directions) / CELL[1]
+        return elevation_of(directions) / TRAVEL_CELL[0], azimuth_of(directions) / TRAVEL_CELL[1]
 
     def travel_between(self, a: Float, b: Float) -> Float:
         """Return the distance between directions in cells of the view grid.
@@ -209,7 +211,7 @@ class Viewpoints:
     @property
     def columns(self) -> float:
         """Cells of travel once round."""
-        return float(2 * np.pi / CELL[1])
+        return float(2 * np.pi / TRAVEL_CELL[1])
 
     def nearest(self, direction: Float) -> tuple[int, bool]:
         """The view nearest to a direction, (3,), and whether it is that direction."""
@@ -232,7 +234,7 @@ class Directions(Viewpoints):
     """
 
     directions: Float
-    distance: float = DISTANCE
+    distance: float = CAMERA_DISTANCE
 
     def __post_init__(self) -> None:
         given = points(self.directions, "directions")
@@ -273,7 +275,7 @@ class ViewSphere(Viewpoints):
 
     elevations: tuple[float, ...]
     azimuths: int
-    distance: float = DISTANCE
+    distance: float = CAMERA_DISTANCE
 
     def __post_init__(self) -> None:
         if not self.elevations:
@@ -290,11 +292,12 @@ class ViewSphere(Viewpoints):
 
         See section 4.1.1.
         """
-        if name not in LAYOUTS:
+        if name not in VIEW_LAYOUTS:
             raise UsageError(
-                f"no view sphere is called {one_line(repr(name))}; there are {', '.join(LAYOUTS)}"
+                f"no view sphere is called {one_line(repr(name))}; there are"
+                f" {', '.join(VIEW_LAYOUTS)}"
             )
-        return LAYOUTS[name]
+        return VIEW_LAYOUTS[name]
 
     def __len__(self) -> int:
         return self.rings * self.azimuths
@@ -375,7 +378,7 @@ class ViewSphere(Viewpoints):
         return self.azimuths
 
 
-LAYOUTS = {
+VIEW_LAYOUTS = {
     "40": ViewSphere(elevations=(0.0, 18.0, 36.0, 54.0, 72.0), azimuths=8),
     "12": ViewSphere(elevations=(45.0,), azimuths=12),
 }
@@ -408,10 +411,10 @@ def viewpoints_of(what: str | Viewpoints | Any) -> Viewpoints:
     if rings := re.fullmatch(r"rings:(-?\d+(?:\.\d+)?(?:,-?\d+(?:\.\d+)?)*)x(\d{1,4})", what):
         return ViewSphere(tuple(map(float, rings[1].split(","))), int(rings[2]))
 
-    if what not in LAYOUTS:
+    if what not in VIEW_LAYOUTS:
         others = "rings:ELEVATIONSxAZIMUTHS such as rings:0,30,60x12, and fibonacci:N"
         raise UsageError(
-            f"no viewpoints are called {what!r}; there are {', '.join(LAYOUTS)}, {others}"
+            f"no viewpoints are called {what!r}; there are {', '.join(VIEW_LAYOUTS)}, {others}"
         )
 
-    return LAYOUTS[what]
+    return VIEW_LAYOUTS[what]

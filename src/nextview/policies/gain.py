@@ -29,7 +29,7 @@ from nextview.policies.base import (
 )
 from nextview.policies.learned_tables import cells_from, cells_to
 from nextview.recognition.inference import OnnxFile, check_end, open_onnx, run_onnx
-from nextview.recognition.map_names import SPHERE, in_order, maps_among
+from nextview.recognition.map_names import SPHERE_SUFFIX, in_order, maps_among
 from nextview.types import Float, Index
 
 INPUTS = ("belief", "view", "place", "azimuth_bin")
@@ -132,7 +132,7 @@ def features(
         parts.append(state.visited[rows[:, None], cells_from(sphere)[start]])
     for name in maps_of(inputs):
         values = np.asarray(state.evidence.maps[name])
-        if name.endswith(SPHERE):  # its columns are counted from the camera
+        if name.endswith(SPHERE_SUFFIX):  # its columns are counted from the camera
             columns = (np.arange(n) - ahead[:, None]) % n
             values = np.take_along_axis(values, columns[:, None], 2)
         parts.append(values)
@@ -184,7 +184,10 @@ def mirrored_features(
             [k * n + -np.arange(n) % n for k in range(2 if frame == "camera" else 3)]
         ),
         VISIBILITY: mirrored(sphere),
-    } | {name: mirrored(sphere) if name.endswith(SPHERE) else window for name in maps_of(inputs)}
+    } | {
+        name: mirrored(sphere) if name.endswith(SPHERE_SUFFIX) else window
+        for name in maps_of(inputs)
+    }
 
     chosen = [blocks[name] for name in ordered(inputs)]
     begins = np.cumsum([0, *map(len, chosen)])

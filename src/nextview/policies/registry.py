@@ -22,7 +22,7 @@ from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.policies.gain import Gain, VisibleGain
 from nextview.policies.maps import MapPeak, SpherePeak
 from nextview.policies.policy_card import bundled_policies, read_policy, read_policy_card
-from nextview.recognition.map_names import SPHERE, in_order
+from nextview.recognition.map_names import SPHERE_SUFFIX, in_order
 from nextview.recognition.model_card import DISCRIMINATE, MAPS, is_memory
 from nextview.things.memory import open_memory
 
@@ -187,7 +187,7 @@ def map_policy(
         The policy; None if the name is not that of a map policy.
     """
     of = name.removesuffix("-peak")
-    window = of.removesuffix(SPHERE)
+    window = of.removesuffix(SPHERE_SUFFIX)
     always = of != name
     if window not in (*MAPS, *maps) or (of != window and not always):
         return None
@@ -200,8 +200,8 @@ def map_policy(
 
 def map_policy_names(maps: Collection[str]) -> list[str]:
     """Names of the policies that climb these maps and those of the bundled networks."""
-    windows = dict.fromkeys(name.removesuffix(SPHERE) for name in in_order((*MAPS, *maps)))
-    return [f"{name}{how}" for name in windows for how in ("", "-peak", f"{SPHERE}-peak")]
+    windows = dict.fromkeys(name.removesuffix(SPHERE_SUFFIX) for name in in_order((*MAPS, *maps)))
+    return [f"{name}{how}" for name in windows for how in ("", "-peak", f"{SPHERE_SUFFIX}-peak")]
 
 
 def with_cards(name: str, cards: Mapping[str, Path]) -> str:

@@ -164,7 +164,7 @@ class RiskBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         )
 
 
-LARGEST_NUMBER = (
+LARGEST_CALIBRATION = (
     # of a calibration, and the reciprocal of its least temperature; what is fitted is within 0.01
     # to 100
     1e4
@@ -204,8 +204,8 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
 
     def __post_init__(self) -> None:
         numbers = (self.correlation, self.bin_correlation or 0.0)
-        sound = LARGEST_NUMBER**-1 <= self.temperature <= LARGEST_NUMBER
-        if not sound or not all(0 <= x <= LARGEST_NUMBER for x in numbers):
+        sound = LARGEST_CALIBRATION**-1 <= self.temperature <= LARGEST_CALIBRATION
+        if not sound or not all(0 <= x <= LARGEST_CALIBRATION for x in numbers):
             given = f"temperature {self.temperature}, correlation {self.correlation}"
             raise ModelError(f"no calibration: {given}, of azimuth bins {self.bin_correlation}")
         if self.hypotheses and not (set(np.diff((-1, *self.hypotheses)).tolist()) <= {0, 1}):

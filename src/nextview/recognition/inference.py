@@ -14,8 +14,8 @@ from nextview.files import checked_bytes
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import direction_of, elevation_of
 from nextview.recognition.evidence import Evidence
-from nextview.recognition.map_names import SPHERE, maps_among
-from nextview.recognition.model_card import FEATURES, RECOGNISER, ModelCard, find_card
+from nextview.recognition.map_names import SPHERE_SUFFIX, maps_among
+from nextview.recognition.model_card import FEATURE_NETWORK, RECOGNISER, ModelCard, find_card
 from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import Novelty, Quantiles, ViewScore, novelty_path, read_novelty
 from nextview.recognition.protocol import Recogniser
@@ -29,10 +29,10 @@ EMBEDDING_OUTPUT = "embedding"
 """Ends of ONNX files; "features" are what the last layers of a recogniser make the logits of,
 (B, F).
 """
-LONGEST = 300  # letters of what the runtime says
+LONGEST_MESSAGE = 300  # letters of what the runtime says
 # of a network that is no usable one
 RUNTIME_ERRORS: tuple[type[Exception], ...] = (*DAMAGED, *RUNTIME_FAILURES)
-Shape = tuple[int | None, ...]  # without the batch; None for a size that is free
+InputShape = tuple[int | None, ...]  # without the batch; None for a size that is free
 
 
 class OnnxFile(ort.InferenceSession):
@@ -86,7 +86,7 @@ def open_onnx(path: Path, sha256: str, threads: int = 0) -> OnnxFile:
         return OnnxFile(content, options, (Path(path).absolute(), sha256, threads))
     except RUNTIME_ERRORS as error:
         raise ModelError(
-            f"{path}: not a usable ONNX model ({one_line(str(error), LONGEST)})"
+            f"{path}: not a usable ONNX model ({one_line(str(error), LONGEST_MESSAGE)})"
         ) from None
 
 
@@ -111,7 +111,7 @@ def run_onnx(
         answers = session.run(list(names), {session.get_inputs()[0].name: inputs})
     except RUNTIME_ERRORS as error:
         raise ModelError(
-            f"{path}: fails when it is run ({one_line(str(error), LONGEST)})"
+            f"{path}: fails when it is run ({one_line(str(error), LONGEST_MESSAGE)})"
         ) from None
 
     declared = {end.name: end.shape for end in session.get_outputs()}
@@ -130,7 +130,7 @@ def run_onnx(
     return answers
 
 
-def check_end(path: Path, end: ort.NodeArg, kind: str, shape: Shape) -> None:
+def check_end(path: Path, end: ort.NodeArg, kind: str, shape: InputShape) -> None:
     """Check the type and the shape of an input or output of a network.
 
     Args:
@@ -172,7 +172,7 @@ def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
     kind = "tensor(float)" if card.input.kind == "cloud" else "tensor(uint8)"
 
     ends = {end.name: end for end in session.get_outputs()}
-    shapes: dict[str, Shape] = {"map": (None, 3)} | (
+    shapes: dict[str, InputShape] = {"map": (None, 3)} | (
         {"sphere": (None, None)} if card.output == "sphere" else {}
     )
     if card.is_recogniser:
@@ -289,7 +289,7 @@ class Features:
     """The bundled network without classes; it maps views to embeddings, unit vectors."""
 
     def __init__(self, threads: int = 0) -> None:
-        self.card = find_card(FEATURES)
+        self.card = find_card(FEATURE_NETWORK)
         self._session = open_onnx(self.card.path, self.card.sha256, threads)
 
     @property
@@ -399,7 +399,7 @@ def open_maps(
         ModelError: no card predicts one of the maps, or a network cannot be opened.
     """
     wanted = maps_among(needs)
-    names = dict.fromkeys(name.removesuffix(SPHERE) for name in wanted)
+    names = dict.fromkeys(name.removesuffix(SPHERE_SUFFIX) for name in wanted)
     networks = {name: MapNetwork(cards[name], threads) for name in names if name in cards}
     missing = [name for name in wanted if name not in names_of(networks)]
     if missing:

@@ -12,7 +12,7 @@ LCM = "lcm"
 # the thesis's; all others are called as their measure
 MAP_NAMES = {"depth_entropy": LEM, CONFIDENCE: LCM}
 # how the name of a map of the whole sphere ends; without this it is the map of the local window
-SPHERE = "-sphere"
+SPHERE_SUFFIX = "-sphere"
 # what else a policy may need
 NO_MAPS = ("azimuth_bins", "joint", "observations", "outlook", "visibility")
 
@@ -40,7 +40,7 @@ def in_order(maps: Iterable[str]) -> list[str]:
     own = list(MAP_NAMES.values())
 
     def place(name: str) -> tuple[bool, int, str]:
-        window = name.removesuffix(SPHERE)
+        window = name.removesuffix(SPHERE_SUFFIX)
         return window != name, own.index(window) if window in own else len(own), window
 
     return sorted(set(maps), key=place)

@@ -12,26 +12,26 @@ from msgspec.structs import replace
 from nextview.errors import ModelError
 from nextview.files import LARGEST_RECORD, Sha256, read_record, regular_file, write_record
 from nextview.recognition.belief import PLAIN_SUM, Calibration, SizeEvidence
-from nextview.recognition.map_names import LCM, LEM, SPHERE, Good
+from nextview.recognition.map_names import LCM, LEM, SPHERE_SUFFIX, Good
 from nextview.recognition.network_input import InputSpec
 
-BUNDLED = Path(__file__).parent / "bundled"
+BUNDLED_MODELS = Path(__file__).parent / "bundled"
 RECOGNISER = "recogniser-modelnet10"
 # the bundled network that knows no classes: what taught things are remembered by
-FEATURES = "features"
+FEATURE_NETWORK = "features"
 MEMORY_SUFFIX = ".safetensors"
 DISCRIMINATE = "discriminate"  # the policy of a memory of things; its card is that of the memory
 # bundled recognisers, by the name of their models
 COLLECTIONS = {"modelnet10": RECOGNISER, "ycb": "ycb"}
 # the map networks that are bundled, by the name of the map
 MAPS = {LEM: "lem-modelnet10", LCM: "lcm-modelnet10"}
-NOWHERE = Path()
+NO_FOLDER = Path()
 SCHEMA = 2  # of the cards of models; those of policies have 1
-LARGEST_NUMBER = 1e9  # of a card; densities, gains and sizes are far smaller
+LARGEST_CARD_NUMBER = 1e9  # of a card; densities, gains and sizes are far smaller
 LARGEST_WEIGHT = 1e6  # of a cosine; what is fitted is below a hundred
 LARGEST_ORDER = 1000  # of a symmetry; what is found is below ten
 UNIT_LENGTH = 1e-3  # by which the axis of a symmetry may be too long: cards hold rounded numbers
-MOST_POSES = 1000  # of a thing; what is taught has a handful
+MOST_TAUGHT_POSES = 1000  # of a thing; what is taught has a handful
 SHORT_HASH = 16  # hexadecimal digits of the SHA-256 of a memory that its file's name holds
 
 
@@ -107,7 +107,7 @@ class Thing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     name: Annotated[str, msgspec.Meta(min_length=1)]
     source: str
-    poses: Annotated[int, msgspec.Meta(ge=1, le=MOST_POSES)]
+    poses: Annotated[int, msgspec.Meta(ge=1, le=MOST_TAUGHT_POSES)]
     symmetries: tuple[Symmetry, ...] = ()
 
 
@@ -209,7 +209,7 @@ class ModelCard(
     kind: str
     input: InputSpec
     sha256: Sha256
-    path: Path = NOWHERE
+    path: Path = NO_FOLDER
     network: str = ""
     classes: tuple[str, ...] = ()
     azimuth_bins: int = 0
@@ -284,7 +284,7 @@ class ModelCard(
     @property
     def maps(self) -> tuple[str, ...]:
         """Names of the maps that a map network predicts, of the window and of the sphere."""
-        return (self.kind, self.kind + SPHERE)[: 2 if self.output == "sphere" else 1]
+        return (self.kind, self.kind + SPHERE_SUFFIX)[: 2 if self.output == "sphere" else 1]
 
     def valleys(self, classes: Sequence[str]) -> tuple[str, ...]:
         """Return the classes for which the valley of its map is the better view.
@@ -327,8 +327,10 @@ def _check_numbers(path: Path, card: ModelCard) -> None:
             left += [(f"{name}.{key}".lstrip("."), item) for key, item in value.items()]
         elif isinstance(value, list | tuple):
             left += [(name, item) for item in value]
-        elif isinstance(value, int | float) and abs(value) > LARGEST_NUMBER:
-            raise ModelError(f"{path}: its {name} holds {value:g}, and {LARGEST_NUMBER:g} is most")
+        elif isinstance(value, int | float) and abs(value) > LARGEST_CARD_NUMBER:
+            raise ModelError(
+                f"{path}: its {name} holds {value:g}, and {LARGEST_CARD_NUMBER:g} is most"
+            )
 
 
 def memory_path(card: Path, sha256: str) -> Path:
@@ -403,19 +405,19 @@ def write_card(path: Path, card: ModelCard) -> None:
         path: of the card.
         card: its content.
     """
-    write_record(path, replace(card, path=NOWHERE), overwrite=True)
+    write_record(path, replace(card, path=NO_FOLDER), overwrite=True)
 
 
 def bundled_cards() -> dict[str, ModelCard]:
     """The models that ship with the package, by name."""
-    return {path.stem: read_card(path) for path in sorted(BUNDLED.glob("*.json"))}
+    return {path.stem: read_card(path) for path in sorted(BUNDLED_MODELS.glob("*.json"))}
 
 
 def find_card(model: str | Path) -> ModelCard:
     """A bundled model by name, or any model by the path of its card."""
-    names = [path.stem for path in sorted(BUNDLED.glob("*.json"))]
+    names = [path.stem for path in sorted(BUNDLED_MODELS.glob("*.json"))]
     if str(model) in names:
-        return read_card(BUNDLED / f"{model}.json")
+        return read_card(BUNDLED_MODELS / f"{model}.json")
     if Path(model).suffix != ".json":
         raise ModelError(f"no bundled model is called {str(model)!r}; there are {', '.join(names)}")
     return read_card(Path(model))
@@ -442,10 +444,12 @@ def find_models(models: str | Path) -> Collection:
     A folder holds the card of one recogniser. Maps that it lacks are the bundled ones: they know no
     classes.
     """
-    bundled = {name: BUNDLED / f"{card}.json" for name, card in MAPS.items()}
+    bundled = {name: BUNDLED_MODELS / f"{card}.json" for name, card in MAPS.items()}
     folder = Path(models)
     if str(models) in COLLECTIONS:
-        return _with_memory(Collection(BUNDLED / f"{COLLECTIONS[str(models)]}.json", bundled, {}))
+        return _with_memory(
+            Collection(BUNDLED_MODELS / f"{COLLECTIONS[str(models)]}.json", bundled, {})
+        )
 
     if not folder.is_dir():
         known = ", ".join(COLLECTIONS)

@@ -26,10 +26,10 @@ ARRAYS = ("quantiles", "objects", "neighbours", "standard")  # in the file of a 
 NEIGHBOUR = 10  # the distance to this one of the nearest known views counts
 ROUNDED = 0.01  # by how much the length of a unit vector in half precision may be off
 # novelty by the share of an outline that is hidden: the least that keeps half hidden objects known
-HIDDEN = 2.0
+NOVELTY_OF_HIDING = 2.0
 # what hides an outline is nearer by so much, object radii, in a window of so many pixels
-NEARER = 0.4
-WINDOW = 7
+OCCLUDER_STEP = 0.4
+OCCLUDER_WINDOW = 7
 
 
 @dataclass(frozen=True)
@@ -221,7 +221,7 @@ def values_of(scores: Sequence[ViewScore], whole: bool = False) -> list[float]:
         for score, value in zip(asked, judge([s.observation for s in asked]), strict=True):
             score.value = float(value)
             score.judge = None
-    return [s.value - whole * HIDDEN * hidden_share(s.observation.scene) for s in scores]
+    return [s.value - whole * NOVELTY_OF_HIDING * hidden_share(s.observation.scene) for s in scores]
 
 
 def hidden_share(scene: SceneView | None) -> float:
@@ -237,7 +237,8 @@ def hidden_share(scene: SceneView | None) -> float:
     outline = scene.target & ~binary_erosion(scene.target)
     others = np.where(scene.target | (scene.depth == 0), np.inf, scene.depth)
     hidden = outline & (
-        minimum_filter(others, WINDOW, mode="constant", cval=0) < scene.depth - NEARER
+        minimum_filter(others, OCCLUDER_WINDOW, mode="constant", cval=0)
+        < scene.depth - OCCLUDER_STEP
     )
     return float(hidden.sum() / max(outline.sum(), 1))
 

@@ -20,7 +20,7 @@ from nextview.recognition.poses import check_candidate
 from nextview.recognition.protocol import JointBelief, Recogniser
 from nextview.types import Floats
 
-LEAST_BELIEF = 1e-12  # in a class, where the logarithm of a belief is taken
+LEAST_CLASS_BELIEF = 1e-12  # in a class, where the logarithm of a belief is taken
 SUM_ERROR = 1e-3  # by how much the sum of a belief may be off
 
 
@@ -102,7 +102,7 @@ class OwnJointRecogniser(OwnRecogniser):
         for row, observation in enumerate(observations):
             if observation.seen:
                 belief = self.together([observation], logits[row], 1).belief
-                logits[row] = np.log(np.maximum(belief, LEAST_BELIEF))
+                logits[row] = np.log(np.maximum(belief, LEAST_CLASS_BELIEF))
         return Evidence(logits, seen=np.array([seen.seen for seen in observations]))
 
     def together(

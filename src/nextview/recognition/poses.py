@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import ModelError
+from nextview.geometry.observation import RIGID
 from nextview.types import Float, Float32
 
 ALIKE_TURN = 5.0  # degrees between poses that are taken for one
 ALIKE_SHIFT = 0.005  # metres between the centres of poses that are taken for one
-RIGID = 1e-3  # how far a pose may be from a rigid motion
 SAME_AXIS = 0.1  # sine of the angle between axes that are one
 SAME_TURN = 0.05  # difference of the matrices of turns that are one: axes are found to some degrees
 MOST_TURNS = 60  # of a symmetric thing: those of a dodecahedron

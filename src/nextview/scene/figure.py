@@ -20,7 +20,7 @@ from nextview.scene.objects import UNKNOWN, SceneObject
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.object_frame import upright_axes
 from nextview.sensing.tabletop import TableTop
-from nextview.session.style import ACCENT, BLUE, FAINT, GREY, INK, PAPER, STYLE, PlainFigure
+from nextview.session.style import ACCENT, BLUE, FAINT, FIGURE_STYLE, GREY, INK, PAPER, PlainFigure
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -71,7 +71,7 @@ def draw_scene(
         thing.number: GREY if thing.name == UNKNOWN else COLOURS[k % len(COLOURS)]
         for k, thing in enumerate(objects)
     }
-    rc = STYLE | {"axes.grid": False, "figure.facecolor": PAPER, "axes.facecolor": PAPER}
+    rc = FIGURE_STYLE | {"axes.grid": False, "figure.facecolor": PAPER, "axes.facecolor": PAPER}
     with matplotlib.rc_context(rc):
         rows, columns = _part(top.frame, [thing.pixels.get(number) for thing in objects])
         aspect = (columns.stop - columns.start) / (rows.stop - rows.start)

@@ -21,8 +21,8 @@ from scipy import ndimage
 from nextview.errors import ObservationError
 from nextview.recognition.poses import PoseCandidate
 from nextview.scene.tracks import Rendered, Track, render_track
-from nextview.sensing.observed_object import FEWEST, ObservedObject, Sighting
-from nextview.sensing.tabletop import NEAR_PLANE, TableTop
+from nextview.sensing.observed_object import FEWEST_OBJECT_PIXELS, ObservedObject, Sighting
+from nextview.sensing.tabletop import NEAR_TABLE, TableTop
 
 Mask = NDArray[np.bool_]
 
@@ -217,7 +217,7 @@ def _taken(loser: Track, taker: Track, bench: Bench) -> tuple[Track, Track] | No
 
     own = mask & rendered.explained(mask.shape)
     count = int(np.count_nonzero(own))
-    if count < FEWEST or count < LEAST_TAKEN * np.count_nonzero(mask):
+    if count < FEWEST_OBJECT_PIXELS or count < LEAST_TAKEN * np.count_nonzero(mask):
         return None
 
     rest = mask & ~rendered.around(mask.shape)
@@ -258,7 +258,7 @@ def _trimmed(tracks: Sequence[Track], bench: Bench, before: Mapping[int, Track])
         if named is not None:
             kept[rendered.part] &= ~(rendered.hidden | rendered.through)
         else:
-            kept |= mask & (bench.top.height > NEAR_PLANE)
+            kept |= mask & (bench.top.height > NEAR_TABLE)
         lost = 1 - float(kept.sum() / max(mask.sum(), 1))
         if LEAST_TRIMMED < lost < MOST_TRIMMED:
             with suppress(ObservationError):

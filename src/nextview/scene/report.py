@@ -15,7 +15,7 @@ from nextview.session.pose_json import pose_as_json
 
 COLUMNS = ("", "name", "belief", "place, m", "± mm, °", "frames", "touches")
 MOST_CANDIDATES = 3  # other things that are shown beside a name
-LEAST_BELIEF = 0.01  # of what is shown
+LEAST_LISTED = 0.01  # of what is shown
 
 
 def row_of(thing: SceneObject) -> list[str]:
@@ -76,7 +76,7 @@ def scene_as_json(
 
     for thing in scene.objects:
         likely = {
-            name: belief for name, belief in thing.result.beliefs.items() if belief >= LEAST_BELIEF
+            name: belief for name, belief in thing.result.beliefs.items() if belief >= LEAST_LISTED
         }
         one: dict[str, Any] = {
             "number": thing.number,

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from nextview.sensing.facets import ROWS, Noise, estimate_noise
+from nextview.sensing.facets import ROWS_MEASURED, Noise, estimate_noise
 from nextview.sensing.frame import Frame
 from nextview.sensing.segmentation import find_plane, sample
 from nextview.types import Float, Float32, Index, Mask
 
 POINT_GRID = 160  # columns of the grid from which surface points are drawn
-SURFACE_POINTS = 200  # points of each frame that are looked up in the others
+AGREEMENT_POINTS = 200  # points of each frame that are looked up in the others
 NOISE_TOLERANCE = 3.0  # standard deviations of the noise
 # part of the depth by which it may vary around a point that is looked up: no edges
 SMOOTH_STEP = 0.05
@@ -163,13 +163,13 @@ def surface_view(frame: Frame, rng: np.random.Generator) -> SurfaceView:
         frame: its pose is not used.
         rng: draws the points.
     """
-    few_rows = slice(None, None, max(1, frame.shape[0] // ROWS))
+    few_rows = slice(None, None, max(1, frame.shape[0] // ROWS_MEASURED))
     noise = estimate_noise(frame.depth[few_rows], frame.depth[few_rows] > 0)
     points = _surface_points(frame)
     if frame.mask is None:
         points, standing = _half_off_the_plane(points, frame, noise, rng)
     else:
-        points = _some(points, SURFACE_POINTS, rng)
+        points = _some(points, AGREEMENT_POINTS, rng)
         standing = np.ones(len(points), bool)
 
     depth = points[:, 2]
@@ -327,15 +327,15 @@ def _half_off_the_plane(
     unposed = Frame(frame.depth, frame.intrinsics, pixel_centre=0.5)
     plane = find_plane(sample(unposed, unposed.depth > 0, noise), rng)
     if plane is None or not len(points):
-        points = _some(points, SURFACE_POINTS, rng)
+        points = _some(points, AGREEMENT_POINTS, rng)
         return points, np.ones(len(points), bool)
 
     z = points[:, 2]
     above = plane.height(points) > ABOVE_PLANE * z + NOISE_TOLERANCE * noise.at(z) * z**2
-    half = SURFACE_POINTS // 2
-    on_it = _some(points[~above], max(half, SURFACE_POINTS - int(above.sum())), rng)
-    off_it = _some(points[above], SURFACE_POINTS - min(half, len(on_it)), rng)
-    chosen = np.concatenate([off_it, on_it[: SURFACE_POINTS - len(off_it)]])
+    half = AGREEMENT_POINTS // 2
+    on_it = _some(points[~above], max(half, AGREEMENT_POINTS - int(above.sum())), rng)
+    off_it = _some(points[above], AGREEMENT_POINTS - min(half, len(on_it)), rng)
+    chosen = np.concatenate([off_it, on_it[: AGREEMENT_POINTS - len(off_it)]])
     return chosen, np.arange(len(chosen)) < len(off_it)
 
 

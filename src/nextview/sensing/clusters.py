@@ -23,7 +23,7 @@ from nextview.types import Float, Index, Mask
 
 Joins = Literal["by their border", "never", "always"]  # whether things that touch are one thing
 
-CELL = 0.01  # side of a cell of the footprint, in distances of the camera from the object
+FOOTPRINT_CELL = 0.01  # side of a cell of the footprint, in distances of the camera from the object
 # share of the cells of a piece that lie over another one of the same frame, from which they are one
 OVERLAP = 0.25
 # strength of the link of two pieces that touch: what lies over each other in two frames is joined
@@ -31,18 +31,20 @@ OVERLAP = 0.25
 TOUCH = 0.45
 # share of the smaller of two clusters that a piece which joins them has at least: no leg joins two
 BRIDGE = 0.25
-FEWEST = 0.15  # of the area of a cell, as the camera sees it, that a piece shows over it, at least
-FEWEST_PIXELS = 2  # that show it
+LEAST_COVER = (
+    0.15  # of the area of a cell, as the camera sees it, that a piece shows over it, at least
+)
+FEWEST_CELL_PIXELS = 2  # that show it
 # share of the cells of a piece that lie over, or beside, one of another frame, from which they are
 # one
 LIES_OVER = 0.5
-BESIDE = 2  # cells up to which two pieces stand side by side
+CELLS_BESIDE = 2  # cells up to which two pieces stand side by side
 # share of the cells of a piece that lie within the outline of another one, from which they are one
 WITHIN = 0.8
 ON_OUTLINE = 0.5  # cells up to which one outside of an outline lies on it
 OUTLINED = 25  # cells of a piece with an outline, at least
-MOST_COMPARED = 50  # cells of a piece that are compared with those of another one
-DIRECTIONS = 24
+MOST_COMPARED_CELLS = 50  # cells of a piece that are compared with those of another one
+FOOTPRINT_DIRECTIONS = 24
 SURROUNDED = 0.85  # share of the directions from what lies within a piece in which it has cells
 TWO = 0.25  # share of the cells of an object that a part of it has which may be another thing
 # share of a thing's pixels over what is seen of the plane, at least: it may hide most of it
@@ -51,8 +53,8 @@ BOTTOM_ROWS = 2  # rows of that picture that are its lower edge
 AIM_WIDTH = 160  # columns of the picture in which is seen how far from the optical axis things lie
 # picture widths from the optical axis at which a thing counts for 1 / e of its pixels
 AIM_SPREAD = 0.08
-REACH = 250
-FAR = 1000
+CELLS_REACHED = 250
+BEYOND_REACH = 1000
 """Cells to each side of where the object is looked for: farther things are left out. And cells from
 those of the first frame beyond which nothing can be a part of the same object."""
 
@@ -103,7 +105,7 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Fl
         axes: upright, rows x, y and z in the world, (3, 3).
         cell: side of a cell, metres.
         middle: where the object is, or is looked for, along x and y, (2,), cells: what is more than
-            REACH cells from there is left out.
+            CELLS_REACHED cells from there is left out.
     """
     rows, columns = np.divmod(np.flatnonzero(pieces.label), pieces.label.shape[1])
     label = pieces.label[rows, columns]
@@ -118,7 +120,7 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Fl
         ij.append(np.floor(position).astype(np.int64))
     there = np.floor(middle).astype(np.int64)
     i, j = ij
-    within = (np.abs(i - there[0]) <= REACH) & (np.abs(j - there[1]) <= REACH)
+    within = (np.abs(i - there[0]) <= CELLS_REACHED) & (np.abs(j - there[1]) <= CELLS_REACHED)
     z = z[within]
     label = label[within]
     i = i[within]
@@ -133,7 +135,7 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Fl
     count = np.bincount(key, minlength=many * len(used))
     focal = frame.intrinsics[0, 0] * frame.intrinsics[1, 1]
     area = np.bincount(key, z * z, len(count)) / focal
-    pairs = np.flatnonzero((area > FEWEST * cell**2) & (count >= FEWEST_PIXELS))
+    pairs = np.flatnonzero((area > LEAST_COVER * cell**2) & (count >= FEWEST_CELL_PIXELS))
     area = area[pairs]
     at, piece = np.divmod(pairs, many)
     cells = np.stack(np.divmod(used[at], side), 1) + low
@@ -171,7 +173,7 @@ def clusters(
     first = np.cumsum([0, *(len(f.pieces.stands) for f in footprints)])
     node = np.concatenate([f.piece + start for f, start in zip(footprints, first, strict=False)])
     cells = np.concatenate([f.cells for f in footprints])
-    near = np.abs(cells - cells[0]).max(1) <= FAR
+    near = np.abs(cells - cells[0]).max(1) <= BEYOND_REACH
     here, around = _cells_over(cells[near], node[near], int(first[-1]))
     size = np.maximum(here.sum(1), 1)
     shared = here @ here.T / np.minimum.outer(size, size)
@@ -197,18 +199,20 @@ def clusters(
 
 
 def _cells_over(cells: Index, node: Index, nodes: int) -> tuple[Float, Float]:
-    """Which cells are over each node, and which lie up to BESIDE from it, (nodes, cells) each.
+    """Which cells are over each node, and which are near it, (nodes, cells) each.
+
+    Near is up to CELLS_BESIDE cells.
 
     Only cells over which anything lies are listed.
     """
-    at = cells - cells.min(0) + BESIDE
-    width = int(at[:, 1].max()) + 1 + BESIDE
+    at = cells - cells.min(0) + CELLS_BESIDE
+    width = int(at[:, 1].max()) + 1 + CELLS_BESIDE
     place = at[:, 0] * width + at[:, 1]
-    used = np.bincount(place, minlength=(int(at[:, 0].max()) + 1 + BESIDE) * width) > 0
+    used = np.bincount(place, minlength=(int(at[:, 0].max()) + 1 + CELLS_BESIDE) * width) > 0
     number = np.where(used, np.cumsum(used) - 1, -1)
     here, around = np.zeros((2, nodes, used.sum() + 1))  # the last is that of -1
     here[node, number[place]] = 1
-    steps = np.arange(-BESIDE, BESIDE + 1)
+    steps = np.arange(-CELLS_BESIDE, CELLS_BESIDE + 1)
     around[node[:, None], number[place[:, None] + np.add.outer(width * steps, steps).ravel()]] = 1
     return here[:, :-1], around[:, :-1]
 
@@ -253,16 +257,19 @@ def _surrounds(outer: Float, inner: Float) -> bool:
     """Whether some cells, (N, 2), lie in most directions from the middle of others, (M, 2)."""
     away = outer - np.median(inner, 0)
     direction = np.floor(
-        (np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) + 0.5) * DIRECTIONS
+        (np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) + 0.5) * FOOTPRINT_DIRECTIONS
     ).astype(np.int64)
-    seen = np.bincount(np.minimum(direction, DIRECTIONS - 1), minlength=DIRECTIONS) > 0
+    seen = (
+        np.bincount(np.minimum(direction, FOOTPRINT_DIRECTIONS - 1), minlength=FOOTPRINT_DIRECTIONS)
+        > 0
+    )
     return bool(seen.mean() >= SURROUNDED)
 
 
 def _lie_beside(some: Float, others: Float) -> bool:
     """Whether half of some cells, (N, 2), lie on others, (M, 2), or beside them."""
-    gap = np.abs(some[:: max(1, len(some) // MOST_COMPARED), None] - others).max(2).min(1)
-    return bool((gap <= BESIDE).mean() >= LIES_OVER)
+    gap = np.abs(some[:: max(1, len(some) // MOST_COMPARED_CELLS), None] - others).max(2).min(1)
+    return bool((gap <= CELLS_BESIDE).mean() >= LIES_OVER)
 
 
 def _links(
@@ -389,4 +396,4 @@ def nearest(footprints: Sequence[Footprint], labels: Sequence[Index], point: Flo
     if not label.any():
         return 0
     distance = np.where(label > 0, np.linalg.norm(cells + 0.5 - point, axis=1), np.inf)
-    return int(np.bincount(label[distance < distance.min() + BESIDE]).argmax())
+    return int(np.bincount(label[distance < distance.min() + CELLS_BESIDE]).argmax())

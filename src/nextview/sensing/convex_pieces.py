@@ -23,8 +23,8 @@ LAG = 4  # pixels from an edge at which the surfaces to both sides of it are loo
 VALLEY = 0.004  # depth of a concave edge, as a part of the distance, from which it cuts
 # part of the distance by which a pixel lies behind another one LAG away, from which it is cut at an
 # end
-STEP = 0.08
-LEAST = 12  # pixels of a piece
+CUT_STEP = 0.08
+FEWEST_PIECE_PIXELS = 12  # pixels of a piece
 GROWN = 12  # pixels that a piece grows at its edges, at most
 LED = 2, 5  # pixels from a border that tell to which depth a surface leads at it
 # height over the plane, as a part of the distance, down to which a piece is seen if it stands there
@@ -41,11 +41,11 @@ bottom of a bathtub.
 NEXT: Any = ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]))
 """All pairs of pixels side by side: the first of each, and the second."""
 HELD = 0.1
-HIDDEN = 0.1
+HIDING_STEP = 0.1
 """Share of the lower edge of a piece under which what holds it shows, at least; and behind a
 nearer one, at most.
 """
-LOWEST = 5  # pixels of a piece that may be so low by noise
+LOW_PIXELS = 5  # pixels of a piece that may be so low by noise
 LOW = 2  # pixels, that low, of the border of two things that stand side by side
 
 
@@ -109,7 +109,7 @@ def cut(
     tolerance = (VALLEY + error) / usual
     found: Any
     found, count = ndimage.label(mask & ~_concave(inverse, tolerance))
-    kept = np.bincount(found.ravel(), minlength=count + 1) >= LEAST
+    kept = np.bincount(found.ravel(), minlength=count + 1) >= FEWEST_PIECE_PIXELS
     kept[0] = False
     found = np.asarray(np.cumsum(kept) * kept)[found]
     # A pixel of an edge goes to the nearest piece that is as near to the camera.
@@ -121,7 +121,7 @@ def cut(
         joins = mask & close & (np.abs(inverse[tuple(nearest)] - inverse) < 4 * tolerance)
     found = np.where(joins, found_near, 0)
     low = mask & (high / usual - 2 * error < STANDS)
-    stands = np.bincount(found[low], minlength=kept.sum() + 1) > LOWEST
+    stands = np.bincount(found[low], minlength=kept.sum() + 1) > LOW_PIXELS
     stands[0] = False
     shape = above[part].shape
     kept_pixels = above[part] | _enlarged(bottom, step, shape) if bottom.any() else above[part]
@@ -190,7 +190,7 @@ def _concave(inverse: Float32, tolerance: Float32) -> Mask:
     padded = np.pad(inverse, LAG, constant_values=np.nan)
     height, width = inverse.shape
     limit = 2 * (inverse + tolerance)
-    step = (1 + np.float32(STEP)) * inverse + tolerance
+    step = (1 + np.float32(CUT_STEP)) * inverse + tolerance
     with np.errstate(invalid="ignore"):
         for dy, dx in ((0, LAG), (LAG, 0), (LAG, LAG), (LAG, -LAG)):
             one = padded[LAG + dy : LAG + dy + height, LAG + dx : LAG + dx + width]
@@ -272,7 +272,7 @@ def _hanging(label: Index, inverse: Float32, tolerance: Float32, stands: Mask) -
     holder = held.argmax(1)
     enough = held[np.arange(n), holder] >= np.maximum(HELD * length, LOW)
     hangs = np.zeros((n, n), bool)
-    hangs[np.arange(n), holder] = enough & (hidden < HIDDEN * length) & ~stands
+    hangs[np.arange(n), holder] = enough & (hidden < HIDING_STEP * length) & ~stands
     hangs[0] = hangs[:, 0] = False
     return hangs
 

@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 CAMERA_PLACE = 0.003  # metres, standard deviation of a camera's place
 CAMERA_AIM = 0.006  # radians, standard deviation of the direction in which it looks
 FARTHEST_SHIFT = 5.0  # standard deviations from which it is no error of an arm
-POINTS = 200  # of a surface that are looked up in another frame
+DISPLACEMENT_POINTS = 200  # of a surface that are looked up in another frame
 FACETS = 3000  # of a surface in which points are looked up
-COMPARED = 2  # earlier frames, those from the nearest directions
+COMPARED_FRAMES = 2  # earlier frames, those from the nearest directions
 ALIKE = 60.0  # so many points are as good as all that are looked up: neighbours err together
-SURFACE_ERROR = 0.003  # of a depth, as a part of it, beside the noise
+RELATIVE_DEPTH_ERROR = 0.003  # of a depth, as a part of it, beside the noise
 PLANE_ERROR = 0.002  # of the height of a support plane, as a part of the distance
 OUTLINE_PITCHES = 1.5  # distances of facets that an outline is blurred by
 NOT_HIDDEN = 0.02  # part of the depth by which a frame has to look past a point
@@ -49,10 +49,12 @@ DEPTH_ERROR = 0.01
 common for all pixels; they grow with the square of the distance. Of a real Kinect whose poses are
 exact a twentieth of the shifts is larger than twice that.
 """
-MENDED = 3.0  # standard deviations that noise does not explain, from which a shift is allowed for
+MENDED_DEVIATIONS = (
+    3.0  # standard deviations that noise does not explain, from which a shift is allowed for
+)
 LEAST_MENDED = 0.006  # parts of the distance from the camera: smaller shifts are left as they are
 NOT_WORTH = 0.3  # parts of the least shift that is mended
-NOTICED = 2.5  # standard deviations that noise and depth errors do not explain
+DISPLACEMENT_NOTICED = 2.5  # standard deviations that noise and depth errors do not explain
 
 
 @dataclass(frozen=True)
@@ -83,13 +85,18 @@ class Displacement:
     def mended(self) -> bool:
         """Whether it is more than the noise of the frames explains, and is to be allowed for."""
         large = float(np.linalg.norm(self.shift)) > LEAST_MENDED * self.distance
-        return large and (self.lasting or _deviations(self.shift, self.covariance) > MENDED)
+        return large and (
+            self.lasting or _deviations(self.shift, self.covariance) > MENDED_DEVIATIONS
+        )
 
     @property
     def noticed(self) -> bool:
         """Whether ``further`` is more than noise and the errors of depth cameras explain."""
         common = (DEPTH_ERROR * self.distance**2) ** 2 * np.eye(3)
-        return self.mended and _deviations(self.further, self.covariance + common) > NOTICED
+        return (
+            self.mended
+            and _deviations(self.further, self.covariance + common) > DISPLACEMENT_NOTICED
+        )
 
 
 def _deviations(shift: Float, covariance: Float) -> float:
@@ -98,7 +105,7 @@ def _deviations(shift: Float, covariance: Float) -> float:
 
 
 @dataclass(frozen=True)
-class _Pulls:
+class _ShiftEquations:
     """Equations ``directions @ shift = distances`` of some points, with standard deviations.
 
     ``directions`` is (N, 3), the others (N,); metres.
@@ -127,7 +134,7 @@ def displacement(latest: Sighting, earlier: Sequence[Sighting]) -> Displacement 
     ahead = latest.frame.camera_to_world[:3, 2]
     there.sort(key=lambda one: -float(ahead @ one.frame.camera_to_world[:3, 2]))
     surface = _Surface.of(latest)
-    others = [_Surface.of(sighting) for sighting in there[:COMPARED]]
+    others = [_Surface.of(sighting) for sighting in there[:COMPARED_FRAMES]]
     last = -earlier[-1].shift
     starts = [np.zeros(3), last] if last.any() else [last]
     found = [_searched(surface, others, start) for start in starts]
@@ -164,14 +171,14 @@ class _Surface:
         depth = points[:, 2]
         normals = -facets.planes / np.linalg.norm(facets.planes, axis=1, keepdims=True)
         noise = sighting.noise.at(depth) * depth**2
-        every = max(1, len(depth) // POINTS)
+        every = max(1, len(depth) // DISPLACEMENT_POINTS)
 
         return cls(
             sighting=sighting,
             facets=facets,
             points=points @ turn.T + sighting.frame.camera_to_world[:3, 3],
             normals=normals @ turn.T,
-            deviations=np.hypot(noise, SURFACE_ERROR * depth),
+            deviations=np.hypot(noise, RELATIVE_DEPTH_ERROR * depth),
             rays=cKDTree(facets.rays[:, :2]),
             pitch=float(facets.pitch.mean()),
             sample=np.arange(every // 2, len(depth), every),
@@ -183,7 +190,7 @@ class _Surface:
         camera = self.sighting.frame.camera_to_world[:3, 3]
         return float(np.linalg.norm(np.median(self.points, 0) - camera))
 
-    def pulls(self, other: _Surface, shift: Float, reach: float) -> _Pulls:
+    def pulls(self, other: _Surface, shift: Float, reach: float) -> _ShiftEquations:
         """Return how the points of another surface, moved by a shift, disagree with this one.
 
         Args:
@@ -213,7 +220,7 @@ class _Surface:
         length = np.maximum(np.linalg.norm(aside, axis=1), 1e-9)
         towards = (aside / length[:, None]) @ pose[:3, :2].T
         slack = OUTLINE_PITCHES * self.pitch * z
-        return _Pulls(
+        return _ShiftEquations(
             np.concatenate([normals[on], towards[outside]]),
             np.concatenate([off[on], (length - slack)[outside]]),
             np.concatenate([deviations[on], np.hypot(slack, deviations)[outside]]),
@@ -277,20 +284,20 @@ def _searched(latest: _Surface, earlier: Sequence[_Surface], start: Float) -> _F
     return _Fit(shift, np.asarray(np.linalg.inv(information), np.float64), cost)
 
 
-def _reversed(pulls: _Pulls) -> _Pulls:
+def _reversed(pulls: _ShiftEquations) -> _ShiftEquations:
     """The same pulls on the other surface."""
-    return _Pulls(-pulls.directions, pulls.distances, pulls.deviations)
+    return _ShiftEquations(-pulls.directions, pulls.distances, pulls.deviations)
 
 
-def _heights(latest: _Surface, earlier: Sequence[_Surface], moved: Float) -> _Pulls:
+def _heights(latest: _Surface, earlier: Sequence[_Surface], moved: Float) -> _ShiftEquations:
     """How far the support plane of a frame, moved so, is below those of earlier ones."""
     plane = latest.sighting.plane
     here = latest.points.mean(0)
     others = [one.sighting.plane for one in earlier if one.sighting.plane is not None]
     if plane is None or not others:
-        return _Pulls(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+        return _ShiftEquations(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
     foot = here - plane.height(here) * plane.normal + moved
     below = -np.array([float(other.height(foot)) for other in others])
     normals = np.array([other.normal for other in others])
     leans = np.array([float(np.hypot(plane.lean_error, other.lean_error)) for other in others])
-    return _Pulls(normals, below, latest.distance * np.hypot(PLANE_ERROR, leans))
+    return _ShiftEquations(normals, below, latest.distance * np.hypot(PLANE_ERROR, leans))

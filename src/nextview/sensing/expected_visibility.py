@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.checks import number, whole
-from nextview.geometry.depth import FARTHEST
+from nextview.geometry.depth import FARTHEST_SURFACE
 from nextview.geometry.observation import SceneView
 from nextview.types import Float, Float32, Floats, Index, Mask
 
@@ -129,7 +129,9 @@ class Occupancy:
         cells = self.cells.copy().reshape(-1)
         # what was free before is so without being looked at again
         unseen = np.flatnonzero(cells == UNSEEN)
-        reach = np.where(depth > 0, depth, FARTHEST if background_free else 0).astype(np.float32)
+        reach = np.where(depth > 0, depth, FARTHEST_SURFACE if background_free else 0).astype(
+            np.float32
+        )
         cells[unseen[_in_front(grid.middles[:, unseen], reach, pose, intrinsics)]] = FREE
         rows, columns = np.nonzero(depth)
         k = intrinsics
@@ -167,15 +169,15 @@ def _in_front(points: Float32, reach: Float32, pose: Floats, intrinsics: Floats)
 
 
 # around the object, in object radii: what stands beside it has a place there
-GRID = VoxelGrid(64, 2.0)
+VISIBILITY_GRID = VoxelGrid(64, 2.0)
 BLOCK = 4  # voxels along the side of the blocks that stand for parts of the object
 UNSEEN_PART = 0.01
 """Weight of an unseen voxel of the object's unit ball, where one of the object has 1: before
 anything of the object was seen they are all there is."""
 DENSITY = 0.2  # how often unseen space is filled, per object radius: between the two bounds
 SOLID = 1e3  # a density, per voxel, through which nothing is seen
-TOGETHER = 400  # lines that are drawn at once
-LOWEST = 0.02  # share of a frame's points that may lie below the height of the table: noise
+LINES_TOGETHER = 400  # lines that are drawn at once
+LOW_POINTS = 0.02  # share of a frame's points that may lie below the height of the table: noise
 
 
 @dataclass(frozen=True)
@@ -196,12 +198,12 @@ class SeenScene:
     floor: float = np.inf
 
     @classmethod
-    def unseen(cls, grid: VoxelGrid = GRID) -> Self:
+    def unseen(cls, grid: VoxelGrid = VISIBILITY_GRID) -> Self:
         """Before the first frame."""
         return cls(Occupancy.unseen(grid))
 
     @classmethod
-    def of(cls, views: Iterable[SceneView], grid: VoxelGrid = GRID) -> Self:
+    def of(cls, views: Iterable[SceneView], grid: VoxelGrid = VISIBILITY_GRID) -> Self:
         """Return what some frames show of a scene.
 
         Args:
@@ -226,7 +228,8 @@ class SeenScene:
         )
         near = heights[np.abs(heights) <= 1.2]
         return type(self)(
-            occupancy, min(self.floor, float(np.quantile(near, LOWEST)) if len(near) else np.inf)
+            occupancy,
+            min(self.floor, float(np.quantile(near, LOW_POINTS)) if len(near) else np.inf),
         )
 
     def and_also(self, other: "SeenScene") -> Self:
@@ -331,7 +334,9 @@ class SightLines:
         along = np.arange(0.5, np.sqrt(3) * grid.n)
         voxels = []
         steps = []
-        for some in np.array_split(np.arange(len(start)), -(-len(start) * len(eyes) // TOGETHER)):
+        for some in np.array_split(
+            np.arange(len(start)), -(-len(start) * len(eyes) // LINES_TOGETHER)
+        ):
             ahead = (towards[some] / length[some, :, None])[:, :, None]
             at = np.floor(start[some, None, None] + along[:, None] * ahead)
             inside = (along < length[some, :, None]) & ((at >= 0) & (at < grid.n)).all(3)

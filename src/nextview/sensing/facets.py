@@ -15,25 +15,25 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.geometry.observation import pinhole
-from nextview.geometry.viewsphere import DISTANCE
+from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.types import Float, Float32, Floats, Index, Mask
 
 CLOSE_ENOUGH = 1.5  # standard deviations of noise that a window may deviate from its plane
 STEEPEST_ERROR = 0.1  # error of the slope (tangent) that noise may leave: six degrees of the normal
-FINEST = 2e-4  # relative noise of depth that even the best frame is taken to have
+LEAST_NOISE = 2e-4  # relative noise of depth that even the best frame is taken to have
 # slope towards the ray beyond which neighbouring pixels are taken for two surfaces
-STEEPEST = np.tan(np.radians(85.0))
+STEEPEST_FACET = np.tan(np.radians(85.0))
 BINS = 4  # ranges of depth in which the noise is measured, with equally many pixels
-ROWS = 20  # about so many rows of a picture are enough to measure it
+ROWS_MEASURED = 20  # about so many rows of a picture are enough to measure it
 # distances of the pixels that are compared: in many sensors neighbours err together
 LAGS = (1, 2, 4, 6)
 # depth of what can be shown, object radii; all of the object is between 2 and 4
-NEAREST = 0.5
-FARTHEST = 100.0
+NEAREST_FACET = 0.5
+FARTHEST_FACET = 100.0
 # half of what one sensor pixel covers here at most, as a part of the image: it bounds the time
-WIDEST = 1 / 16
+WIDEST_FACET = 1 / 16
 # object radii of depth within which facets are of one surface; the nearest to a pixel is shown
-LAYER = 0.03
+SURFACE_LAYER = 0.03
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def drop_flying(depth: Float32, usable: Mask, noise: float, pitch: float) -> Mas
     Returns:
         The remaining pixels, (H, W) bool.
     """
-    tolerance = 5 * noise * depth**2 + STEEPEST * pitch * depth
+    tolerance = 5 * noise * depth**2 + STEEPEST_FACET * pitch * depth
     return usable & (count_beside(depth, tolerance) >= 3)
 
 
@@ -231,7 +231,7 @@ def fit_facets(
     count = sums[0, rows, columns]
     own = np.where(count > 0, sums[6, rows, columns] / np.maximum(count, 1e-9), np.nan)
     if denoise:
-        noise = max(noise, FINEST * float(middle[2]))
+        noise = max(noise, LEAST_NOISE * float(middle[2]))
         radii = _radii(noise, float(middle[2]), pitch, max(1, grain / coarse))
         planes = _choose(sums, own, rows, columns, here, noise, radii)
     else:
@@ -251,7 +251,7 @@ def fit_facets(
 
 def _typical_noise(depth: Float32, usable: Mask, frame_noise: Noise | None) -> tuple[float, int]:
     """Return the noise at the object's median depth, and its grain."""
-    few = slice(None, None, max(1, len(depth) // ROWS))
+    few = slice(None, None, max(1, len(depth) // ROWS_MEASURED))
     typical = float(np.median(depth[usable]))
     measured = estimate_noise(depth[few], usable[few])
     if frame_noise is not None and measured.at(typical) >= frame_noise.at(typical):
@@ -406,7 +406,7 @@ def virtual_pose(pose: Float) -> Float:
     right /= np.linalg.norm(right)
     virtual = np.eye(4)
     virtual[:3, :3] = np.stack([right, np.cross(-outward, right), -outward], 1)
-    virtual[:3, 3] = DISTANCE * outward
+    virtual[:3, 3] = CAMERA_DISTANCE * outward
     return virtual
 
 
@@ -426,7 +426,7 @@ def look_again(facets: Facets, pose: Float, radius: float, size: int) -> tuple[F
         Depth, (size, size) float32, object radii, and the facet of each pixel, int64, -1 for none.
     """
     target = virtual_pose(pose)
-    focal = pinhole(size, DISTANCE)[0, 0]
+    focal = pinhole(size, CAMERA_DISTANCE)[0, 0]
     turn = target[:3, :3].T @ pose[:3, :3]
     shift = target[:3, :3].T @ (pose[:3, 3] - target[:3, 3])
     seen_from = facets.points[:, 2] / radius  # depth in the sensor's own image
@@ -435,18 +435,22 @@ def look_again(facets: Facets, pose: Float, radius: float, size: int) -> tuple[F
     normals = facets.planes @ (radius * turn.T)
     offset = 1 + normals @ shift
     z = points[:, 2]
-    front = np.flatnonzero((z > NEAREST) & (z < FARTHEST))
+    front = np.flatnonzero((z > NEAREST_FACET) & (z < FARTHEST_FACET))
     x, y = focal * points[front, :2].T / z[front] + size / 2
     # A facet is as wide as a sensor's pixel: so many pixels here, half to each side; somewhat more
     # where it is turned. A sensor that stands within the object has wider ones; they fill gaps no
-    # farther than WIDEST.
+    # farther than WIDEST_FACET.
     half = (
-        np.clip(0.6 * focal * facets.pitch.mean() * seen_from[front] / z[front], 0.5, WIDEST * size)
+        np.clip(
+            0.6 * focal * facets.pitch.mean() * seen_from[front] / z[front],
+            0.5,
+            WIDEST_FACET * size,
+        )
         + 0.05
     )
     # The first column and row whose centres it covers:
     left, top = (np.clip(np.ceil(at - half - 0.5), -size, size).astype(np.int64) for at in (x, y))
-    layer = (z[front] / LAYER).astype(np.int64) << 48 | front
+    layer = (z[front] / SURFACE_LAYER).astype(np.int64) << 48 | front
     best = np.full(size * size, np.iinfo(np.int64).max)
     covered = range(int(2 * half.max()) + 1) if len(front) else range(0)
     for down in covered:
@@ -474,5 +478,5 @@ def look_again(facets: Facets, pose: Float, radius: float, size: int) -> tuple[F
         meets = offset[chosen] / towards
     depth = np.zeros(size * size, np.float32)
     # A plane seen edge-on runs away within a pixel: stay near the facet.
-    depth[shown] = np.where(np.abs(meets - z[chosen]) < LAYER, meets, z[chosen])
+    depth[shown] = np.where(np.abs(meets - z[chosen]) < SURFACE_LAYER, meets, z[chosen])
     return depth.reshape(size, size), facet.reshape(size, size)

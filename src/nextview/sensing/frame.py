@@ -9,18 +9,18 @@ from scipy import ndimage
 
 from nextview.checks import one_line
 from nextview.errors import ObservationError
-from nextview.geometry.observation import LARGEST, array_of, numbers
+from nextview.geometry.observation import LARGEST_ENTRY, array_of, numbers
 from nextview.sensing.holes import fill_regular_gaps, filled_mask
 from nextview.types import Float, Float32, Floats, Index, Mask
 
 Part = tuple[slice, slice]  # rows and columns of a picture
 WHOLE = slice(None), slice(None)
-FARTHEST = 65.0  # metres: float depth beyond is nothing; uint16 millimetres reach as far
+FARTHEST_DEPTH = 65.0  # metres: float depth beyond is nothing; uint16 millimetres reach as far
 # metres; a depth image beyond is of another unit: inches are 39 times as many
 LARGEST_MEDIAN = 20.0
 NEAREST_MEDIAN = 0.01  # metres; no depth camera measures nearer
 ASPECTS = (4 / 3, 16 / 9, 16 / 10, 512 / 424, 640 / 576)  # width over height of whole pictures
-AXES = {
+CAMERA_AXES = {
     "opencv": np.eye(3),
     "opengl": np.diag([1.0, -1.0, -1.0]),
     "ros": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
@@ -51,7 +51,7 @@ class Frame:
         image: grey (H, W) or colour (H, W, 3) uint8, registered to the depth; becomes grey.
         counted: whether the depth was handed in as uint16, in steps that may be other than
             millimetres.
-        axes: of the pose handed in: "opencv", "opengl" or "ros", see AXES.
+        axes: of the pose handed in: "opencv", "opengl" or "ros", see CAMERA_AXES.
         pixel_centre: of the first pixel in the intrinsics handed in: 0 for OpenCV and ROS, 0.5 for
             OpenGL and for nextview's own ``Observation``.
     """
@@ -78,13 +78,13 @@ class Frame:
         intrinsics[:2, 2] += 0.5 - pixel_centre
         object.__setattr__(self, "depth", depth)
         object.__setattr__(self, "intrinsics", intrinsics)
-        if not isinstance(axes, str) or axes not in AXES:
+        if not isinstance(axes, str) or axes not in CAMERA_AXES:
             raise ObservationError(
-                f"the axes of a pose are {', '.join(AXES)}, not {one_line(repr(axes))}"
+                f"the axes of a pose are {', '.join(CAMERA_AXES)}, not {one_line(repr(axes))}"
             )
         if self.pose is not None:
             pose = check_pose(self.pose)
-            pose[:3, :3] = pose[:3, :3] @ AXES[axes]
+            pose[:3, :3] = pose[:3, :3] @ CAMERA_AXES[axes]
             object.__setattr__(self, "pose", pose)
         if self.mask is not None:
             mask = array_of(self.mask, "the mask")
@@ -239,7 +239,7 @@ def _metres(depth: NDArray) -> Float32:
     seen = metres[::4, ::4]
     middle = float(np.median(seen[seen > 0])) if (seen > 0).any() else 0.0
     wrong = ""
-    if middle > FARTHEST:
+    if middle > FARTHEST_DEPTH:
         wrong = (
             "where metres are expected: millimetres? Divide them by 1000, or hand them in as uint16"
         )
@@ -249,7 +249,7 @@ def _metres(depth: NDArray) -> Float32:
         wrong = "m: scaled to 0 .. 1, divided twice, or uint16 of another unit?"
     if wrong:
         raise ObservationError(f"the depth has a median of {middle:.4g} {wrong}")
-    metres = np.where(metres < FARTHEST, metres, np.float32(0))
+    metres = np.where(metres < FARTHEST_DEPTH, metres, np.float32(0))
     if not metres.any():
         raise ObservationError("nothing is seen: no pixel has a depth")
     return metres
@@ -257,7 +257,7 @@ def _metres(depth: NDArray) -> Float32:
 
 def _matrix(values: ArrayLike, what: str, shape: tuple[int, int]) -> Float:
     matrix = numbers(values, what).astype(np.float64)
-    if matrix.shape != shape or not (np.abs(matrix) < LARGEST).all():
+    if matrix.shape != shape or not (np.abs(matrix) < LARGEST_ENTRY).all():
         given = (
             f"of the shape {matrix.shape}"
             if matrix.shape != shape

@@ -17,7 +17,7 @@ or more, and a tenth by 2.7.
 """
 FRAME_LEAN = np.radians(0.5)  # by how much the pose of a single frame leans it, beside its noise
 UNKNOWN_LEAN = np.radians(30.0)  # deviation of a lean of which nothing is known
-NOTICED = 3.0  # standard deviations that errors do not explain
+LEAN_NOTICED = 3.0  # standard deviations that errors do not explain
 LEAST_LEAN = np.radians(1.0)  # below which it does not matter
 
 
@@ -42,7 +42,7 @@ class Lean:
     def noticed(self) -> bool:
         """Whether it is more than errors of the camera explain, and matters."""
         size = float(np.linalg.norm(self.lean))
-        return size > max(NOTICED * self.deviation, LEAST_LEAN)
+        return size > max(LEAN_NOTICED * self.deviation, LEAST_LEAN)
 
 
 def lean_of(planes: Sequence[Plane], cameras: Sequence[Float], axes: Float) -> Lean:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from nextview.checks import number, points
 from nextview.errors import ObservationError, UsageError
-from nextview.geometry.observation import LARGEST
+from nextview.geometry.observation import LARGEST_ENTRY
 from nextview.types import Float
 
 
@@ -31,7 +31,7 @@ class ObjectFrame:
     axes: Float
 
     def __post_init__(self) -> None:
-        number(self.radius, "the object radius, metres,", most=LARGEST, above=0)
+        number(self.radius, "the object radius, metres,", most=LARGEST_ENTRY, above=0)
         object.__setattr__(self, "centre", three(self.centre, "the object's centre"))
         object.__setattr__(self, "axes", _rotation(self.axes, "the object's axes"))
 
@@ -112,7 +112,7 @@ def three(values: Any, what: str) -> Float:
         UsageError: they are not three such numbers.
     """
     given = points([values], f"{what}, in a list,")[0]
-    if not (np.abs(given) < LARGEST).all():
+    if not (np.abs(given) < LARGEST_ENTRY).all():
         raise UsageError(f"{what} is three numbers, metres, not {given.tolist()}")
     return given
 

@@ -15,13 +15,13 @@ from scipy.spatial import ConvexHull, QhullError
 from nextview.checks import one_line
 from nextview.errors import ObservationError, UsageError
 from nextview.geometry.observation import Observation, SceneView, pinhole
-from nextview.geometry.viewsphere import DISTANCE
+from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.sensing import clusters, plausibility, segmentation, support
 from nextview.sensing.clusters import Footprint
 from nextview.sensing.convex_pieces import STANDS, cut
 from nextview.sensing.displacement import Displacement, displacement
 from nextview.sensing.facets import (
-    ROWS,
+    ROWS_MEASURED,
     Noise,
     estimate_noise,
     fit_facets,
@@ -43,19 +43,21 @@ from nextview.types import Float, Index, Mask
 Found = tuple[list["Sighting"], float, bool]
 
 SIZE = 224  # side of the observations' images: what the bundled networks take
-FEWEST = 60  # pixels that an object has to have in a frame
+FEWEST_OBJECT_PIXELS = 60  # pixels that an object has to have in a frame
 # metres between the camera and the point that names an object: nothing nearer can be measured
-NEAREST = 0.01
+NEAREST_POINT = 0.01
 # share of an object's pixels in an earlier frame that has to change before they are looked at again
-MENDED = 0.03
-PART = 0.1  # of the most pixels that a frame shows of an object: others say too little of its size
+MENDED_SHARE = 0.03
+LEAST_VIEW_PART = (
+    0.1  # of the most pixels that a frame shows of an object: others say too little of its size
+)
 # the novelty score has to be so much lower for an object to be joined or taken apart otherwise
 LESS_NOVEL = 1.0
 SIZE_CHANGE = 2.0  # factor by which the radius may change where an object is looked at anew
 # object radii that a pixel of the scene may show: half a voxel of ``expected_visibility``
-FINEST = 1 / 32
+FINEST_PITCH = 1 / 32
 # change of the centre or the radius, in object radii, below which the object frame is left as it is
-SAME = 0.01
+SAME_FRAME = 0.01
 # metres below the support plane at which the point of an object may lie: on it, but for a pose's
 # error
 BELOW = 0.02
@@ -523,7 +525,7 @@ class ObservedObject:
                 )
             if plane is not None:
                 mask &= segmentation.above_plane(frame, plane, noise)
-            if np.count_nonzero(mask) < FEWEST:
+            if np.count_nonzero(mask) < FEWEST_OBJECT_PIXELS:
                 raise ObservationError(
                     "nothing is seen where the object should be: a wrong pose, or a wrong box?"
                 )
@@ -555,7 +557,7 @@ class ObservedObject:
         if find_plane(level, np.random.default_rng(0), up) is None:
             return None
         lowest = float(np.quantile(samples.points @ up, LOWEST_SEEN))
-        margin = segmentation.ASIDE * float(np.median(samples.tolerance))
+        margin = segmentation.TOLERANCES_ASIDE * float(np.median(samples.tolerance))
         return Plane(up, -min(lowest, float(self.point @ up) - margin))
 
     def _above_the_base(
@@ -582,7 +584,7 @@ class ObservedObject:
         above &= free
         ground = base.extent(samples) @ axes[:2].T
         if not cell:
-            cell = clusters.CELL * self._distance(frame, axes, above, ground, noise)
+            cell = clusters.FOOTPRINT_CELL * self._distance(frame, axes, above, ground, noise)
 
         pieces = cut(frame.depth, above, height, noise, free if walls else None)
         middle = axes[:2] @ (_ahead(frame) if place is None else place)
@@ -606,7 +608,7 @@ class ObservedObject:
         mask = foot.pixels_of(chosen)
         if (labels[-1][~chosen] > 0).any():  # cells at the border may hold pixels of a neighbour
             mask = trimmed(frame.depth, mask, noise, height > STANDS * frame.depth)
-        if target == 0 or np.count_nonzero(mask) < FEWEST:
+        if target == 0 or np.count_nonzero(mask) < FEWEST_OBJECT_PIXELS:
             where = "of the object known so far" if earlier else "on the support plane"
             raise ObservationError(
                 f"this frame shows nothing {where}: check its pose, or aim the camera at the object"
@@ -623,7 +625,7 @@ class ObservedObject:
         camera = frame.camera_to_world[:3, 3]
         if self.point is not None:
             distance = float(np.linalg.norm(self.point - camera))
-            if distance < NEAREST:
+            if distance < NEAREST_POINT:
                 raise ObservationError(
                     f"the object's point is {distance:.2g} m from the camera: of the world?"
                 )
@@ -715,7 +717,7 @@ class ObservedObject:
         Raises:
             ObservationError: too little is seen of the object.
         """
-        if np.count_nonzero(mask) < FEWEST:
+        if np.count_nonzero(mask) < FEWEST_OBJECT_PIXELS:
             raise ObservationError(TOO_LITTLE)
 
         part = within(mask, 2)
@@ -726,7 +728,7 @@ class ObservedObject:
         )
         if self.denoise and len(facets.planes):
             facets = without_outliers(facets, noise, coarse)
-        if len(facets.planes) * coarse**2 < FEWEST:
+        if len(facets.planes) * coarse**2 < FEWEST_OBJECT_PIXELS:
             raise ObservationError(TOO_LITTLE)
 
         pose = frame.camera_to_world
@@ -743,7 +745,11 @@ class ObservedObject:
             return self.known
         shown = np.array([np.count_nonzero(s.mask) for s in sightings])
         points = np.concatenate(
-            [s.hull for s, n in zip(sightings, shown, strict=True) if n >= PART * shown.max()]
+            [
+                s.hull
+                for s, n in zip(sightings, shown, strict=True)
+                if n >= LEAST_VIEW_PART * shown.max()
+            ]
         )
         planes = [s.plane for s in sightings if s.plane is not None]
         floor = None
@@ -765,14 +771,16 @@ class ObservedObject:
             image = np.where(facet >= 0, image[facets.rows[facet], facets.columns[facet]], 0)
         radius = latest.radius if self.life_size else None
         scene = _scene(sighting, pose, latest.radius)
-        return Observation(depth, virtual_pose(pose), pinhole(SIZE, DISTANCE), radius, image, scene)
+        return Observation(
+            depth, virtual_pose(pose), pinhole(SIZE, CAMERA_DISTANCE), radius, image, scene
+        )
 
 
 def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
     """Return all that a frame shows, in the object frame and object radii."""
     k = sighting.frame.intrinsics.copy()
     step = max(
-        1, int(FINEST * min(k[0, 0], k[1, 1]) / max(float(np.linalg.norm(pose[:3, 3])), 1.0))
+        1, int(FINEST_PITCH * min(k[0, 0], k[1, 1]) / max(float(np.linalg.norm(pose[:3, 3])), 1.0))
     )
     k[:2] /= step
     k[:2, 2] += 0.5 - (step // 2 + 0.5) / step
@@ -789,7 +797,7 @@ def _target_in(frame: Frame, samples: Samples, place: Float | None) -> support.T
 
 def noise_of(frame: Frame) -> Noise:
     """The noise of all that a frame shows."""
-    few = slice(None, None, max(1, frame.shape[0] // ROWS))
+    few = slice(None, None, max(1, frame.shape[0] // ROWS_MEASURED))
     return estimate_noise(frame.depth[few], frame.depth[few] > 0)
 
 
@@ -809,11 +817,13 @@ def _ahead(frame: Frame) -> Float:
 
 def _changed(foot: Footprint, old: Mask, new: Mask) -> bool:
     """Whether so much of an object changes in a frame that it is to be looked at again."""
-    return bool(foot.pixels[new != old].sum() > MENDED * foot.pixels[old].sum())
+    return bool(foot.pixels[new != old].sum() > MENDED_SHARE * foot.pixels[old].sum())
 
 
 def _same(new: ObjectFrame, old: ObjectFrame) -> bool:
     moved = np.linalg.norm(new.centre - old.centre) / old.radius
     return bool(
-        moved < SAME and abs(new.radius / old.radius - 1) < SAME and np.allclose(new.axes, old.axes)
+        moved < SAME_FRAME
+        and abs(new.radius / old.radius - 1) < SAME_FRAME
+        and np.allclose(new.axes, old.axes)
     )

@@ -13,7 +13,7 @@ from scipy import ndimage
 from nextview.sensing.facets import Facets, Noise, count_beside
 from nextview.types import Float, Index, Mask
 
-WINDOW = 2  # pixels to each side among which the neighbours of a point are looked for
+NEIGHBOUR_WINDOW = 2  # pixels to each side among which the neighbours of a point are looked for
 FEWEST_NEIGHBOURS = 5  # of 24: at the tip of a thing that is two pixels thin there are as many
 STEEPEST_SLOPE = 4.0  # of a surface towards the ray, between neighbours
 NOISE_GAP = 4.0  # standard deviations of depth that neighbours may differ by
@@ -21,7 +21,7 @@ SMALLEST_GROUP = 0.01  # share of all points that a group away from the others h
 GAP_PIXELS = 6  # pixels that two groups are apart
 # share of the nearest and the farthest points left out, by the noise as a part of the size
 TRIMMED_BY_NOISE = 0.1
-MOST_TRIMMED = 0.01
+MOST_OUTLIERS = 0.01
 
 
 def without_outliers(facets: Facets, noise: Noise, coarse: int) -> Facets:
@@ -67,7 +67,7 @@ def _within_its_depths(points: Float, error: Float) -> Mask:
         return np.zeros(0, bool)
     depth = points[:, 2]
     size = float(max(np.ptp(points[:, 0]), np.ptp(points[:, 1])))
-    share = min(MOST_TRIMMED, TRIMMED_BY_NOISE * float(np.median(error)) / max(size, 1e-9))
+    share = min(MOST_OUTLIERS, TRIMMED_BY_NOISE * float(np.median(error)) / max(size, 1e-9))
     nearest, farthest = np.quantile(depth, [share, 1 - share])
     return np.asarray((depth >= nearest) & (depth <= farthest))
 
@@ -81,11 +81,19 @@ def _enough_neighbours(
     among the eight beside them; the wider window is looked at for the others only.
     """
     picture = np.full(
-        (int(np.ptp(rows)) + 1 + 2 * WINDOW, int(np.ptp(columns)) + 1 + 2 * WINDOW),
+        (
+            int(np.ptp(rows)) + 1 + 2 * NEIGHBOUR_WINDOW,
+            int(np.ptp(columns)) + 1 + 2 * NEIGHBOUR_WINDOW,
+        ),
         np.nan,
         np.float32,
     )
-    at = (rows - rows.min() + WINDOW) * picture.shape[1] + columns - columns.min() + WINDOW
+    at = (
+        (rows - rows.min() + NEIGHBOUR_WINDOW) * picture.shape[1]
+        + columns
+        - columns.min()
+        + NEIGHBOUR_WINDOW
+    )
     picture.ravel()[at] = depth
     limit = np.zeros_like(picture)
     limit.ravel()[at] = slope + error
@@ -94,7 +102,7 @@ def _enough_neighbours(
     left = np.flatnonzero(~enough)
     here = at[left]
     many = np.zeros(len(left), np.int64)
-    steps = range(-WINDOW, WINDOW + 1)
+    steps = range(-NEIGHBOUR_WINDOW, NEIGHBOUR_WINDOW + 1)
     for down in steps:
         for right in steps:
             if down == right == 0:

@@ -7,12 +7,12 @@ import numpy as np
 from nextview.errors import ObservationError
 from nextview.geometry.observation import Observation
 from nextview.sensing.displacement import Displacement
-from nextview.sensing.frame import AXES, Frame
+from nextview.sensing.frame import CAMERA_AXES, Frame
 from nextview.sensing.lean import Lean
 from nextview.types import Float, Index
 
-SAMPLE = 500  # pixels that are looked at
-FEWEST = 20  # pixels with a depth below which nothing is seen
+PIXELS_SAMPLED = 500  # pixels that are looked at
+FEWEST_DEPTHS = 20  # pixels with a depth below which nothing is seen
 # how far from the origin a surface may be, object radii: centre and radius are estimates
 OUTERMOST = 1.15
 INNERMOST = 0.4  # how far from the origin the outermost of what is seen has to be
@@ -22,7 +22,7 @@ OFF_CENTRE = 0.25
 # metres: few depth cameras measure farther, and nothing fills a picture from there
 FAR_DEPTH = 10.0
 # how far from a thing, object radii, the point that asks for it may be, seen from above
-ASIDE = 3.0
+FARTHEST_POINT_ASIDE = 3.0
 # so many times as far as a frame shows anything an object cannot be: of a near one only the front
 # shows
 TOO_FAR = 2.5
@@ -229,7 +229,7 @@ def _times_too_large(frame: Frame, last: Frame) -> float:
 
 def _agreeing(first: Frame, second: Frame, scale: float) -> tuple[int, float]:
     """Return the number and the share of the points of a frame that another confirms."""
-    step = max(1, int(np.sqrt(first.depth.size / SAMPLE)))
+    step = max(1, int(np.sqrt(first.depth.size / PIXELS_SAMPLED)))
     rows, columns = np.nonzero(first.depth[::step, ::step])
     points = scale * first.positions_in_camera(step * rows, step * columns)
     there = second.camera_to_world
@@ -296,7 +296,7 @@ def check_point(aside: Float, radius: float) -> list[ViewWarning]:
         The warning, if any.
     """
     distance = float(np.linalg.norm(aside))
-    if distance <= ASIDE * radius:
+    if distance <= FARTHEST_POINT_ASIDE * radius:
         return []
     message = (
         f"the thing nearest to the point is {distance:.2g} m away from it, of {radius:.2g} m radius"
@@ -393,7 +393,7 @@ def check_observation(observation: Observation) -> list[ViewWarning]:
     """
     seen = np.flatnonzero(observation.depth)
     pose = np.asarray(observation.pose, np.float64)
-    if len(seen) < FEWEST:
+    if len(seen) < FEWEST_DEPTHS:
         message = (
             f"only {len(seen)} pixels have a depth: is the object in the picture, and the depth in"
             " object radii?"
@@ -405,7 +405,9 @@ def check_observation(observation: Observation) -> list[ViewWarning]:
 
 def _surface(observation: Observation, seen: Index) -> Float:
     """Some of the surface that pixels, by index, show, (N, 3), camera frame."""
-    rows, columns = np.divmod(seen[:: max(1, len(seen) // SAMPLE)], observation.depth.shape[1])
+    rows, columns = np.divmod(
+        seen[:: max(1, len(seen) // PIXELS_SAMPLED)], observation.depth.shape[1]
+    )
     k = observation.intrinsics
     z = observation.depth[rows, columns].astype(np.float64)
     return np.stack(
@@ -440,7 +442,7 @@ def _diagnose(points: Float, pose: Float) -> tuple[str, str]:
         ("ros", "a ROS body's (x forward, z up)"),
     ):
         turned = pose.copy()
-        turned[:3, :3] = pose[:3, :3] @ AXES[name]
+        turned[:3, :3] = pose[:3, :3] @ CAMERA_AXES[name]
         if _plausible(points, turned):
             wrong = (
                 f"the camera's axes are {said}, OpenCV's (x right, y down, z forward) are expected"

@@ -8,7 +8,7 @@ from numpy.random import Generator
 from scipy import ndimage
 
 from nextview.sensing.facets import Noise
-from nextview.sensing.frame import AXES, WHOLE, Frame, Part
+from nextview.sensing.frame import CAMERA_AXES, WHOLE, Frame, Part
 from nextview.sensing.object_frame import Box
 from nextview.types import Float, Floats, Index, Mask
 
@@ -21,18 +21,18 @@ STEEPEST_SUPPORT = np.cos(np.radians(15.0))
 # a quarter turn of a camera about its optical axis
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 # share of what is seen that lies on a support plane, at least; more if gravity is not known
-LEAST = 0.04
+LEAST_SUPPORT = 0.04
 LEAST_ALONE = 0.15
 # times as much of a frame lies on a plane as range, if it is range: narrow lenses hardly bend one
 RANGE = 1.05
-SAMPLES = 1500  # blocks of pixels in which planes are searched
+BLOCKS_SAMPLED = 1500  # blocks of pixels in which planes are searched
 LARGE_SIDE = 8  # pixels across such a block from which on every second one is looked at
 STEEP_LAG = 2  # samples between two that tell how steep a surface is
 # error of a camera's pose, at most: by it a plane known from earlier frames is moved in this one
 POSE_SHIFT = 0.02  # metres
 POSE_TURN = np.radians(2.0)
 # tolerances from a plane up to which few samples lie beside it, if it is a surface that is seen
-ASIDE = 3.0
+TOLERANCES_ASIDE = 3.0
 STEEP_RISE = 0.7  # rise of a steep surface, as a part of the way
 # times by which the mean over a block is more exact than a pixel, at most: the lens errs, too
 MOST_ALONE = 4.0
@@ -83,7 +83,7 @@ def sample(frame: Frame, pixels: Mask, noise: Noise) -> Samples:
         The samples.
     """
     step = 1
-    side = max(1, int(np.sqrt(np.count_nonzero(pixels) / SAMPLES)))
+    side = max(1, int(np.sqrt(np.count_nonzero(pixels) / BLOCKS_SAMPLED)))
     if side >= LARGE_SIDE:  # every second pixel is enough: those side by side err together anyway
         step = 2
         side //= step
@@ -230,7 +230,7 @@ def find_plane(
     best = int(count.argmax())
     plane = refine_plane(Plane(normals[best], float(offsets[best])), samples)
     level = up is None or plane.normal @ up > TILT
-    least = LEAST_ALONE if up is None else LEAST
+    least = LEAST_ALONE if up is None else LEAST_SUPPORT
     return plane if level and plane.holds(samples).mean() > least else None
 
 
@@ -295,7 +295,7 @@ def _is_seen(plane: Plane, samples: Samples) -> bool:
     """Whether more samples lie on a plane than closely beside it, as those of a surface do."""
     away = np.abs(plane.height(samples.points)) / samples.tolerance
     on = np.count_nonzero(away < 1)
-    beside = np.count_nonzero(away < ASIDE) - on
+    beside = np.count_nonzero(away < TOLERANCES_ASIDE) - on
     return bool(on > beside)
 
 
@@ -369,8 +369,8 @@ def mistake_in_pose(plane: Plane, pose: Float, up: Float) -> str | None:
 
     rotation = pose[:3, :3]
     mistakes = {
-        "the camera's axes are OpenGL's?": rotation @ AXES["opengl"],
-        "the camera's axes are those of a ROS body?": rotation @ AXES["ros"],
+        "the camera's axes are OpenGL's?": rotation @ CAMERA_AXES["opengl"],
+        "the camera's axes are those of a ROS body?": rotation @ CAMERA_AXES["ros"],
         "the pose is inverse, world-to-camera?": rotation.T,
         "the picture is turned to the left?": rotation @ QUARTER,
         "the picture is turned to the right?": rotation @ QUARTER.T,

@@ -18,11 +18,11 @@ from scipy.spatial import ConvexHull, QhullError
 from nextview.sensing.segmentation import Plane, Samples, refine_plane, steep
 from nextview.types import Float, Index, Mask
 
-LEAST_SHARE = 0.03  # share of all samples on a further level plane, at least
+LEAST_LEVEL_SHARE = 0.03  # share of all samples on a further level plane, at least
 MOST_PLANES = 5
 HEIGHTS_TRIED = 300
 # cosine of the angle up to which two planes are parallel, but for noise
-PARALLEL = np.cos(np.radians(3.0))
+PARALLEL_SUPPORTS = np.cos(np.radians(3.0))
 # distances of the camera from what it is aimed at: no object is so wide, so the plane is no part
 GROUND_WIDTH = 1.5
 # picture widths between the optical axis and what stands on a plane, at most, if the camera is
@@ -30,7 +30,9 @@ GROUND_WIDTH = 1.5
 AIM = 0.12
 # distances of the camera between the object's point and what stands on a plane, at most
 POINT_ASIDE = 0.08
-LARGEST_SHARE = 0.25  # area, seen from above, of what stands on a plane, as a part of the plane's
+LARGEST_AREA_ABOVE = (
+    0.25  # area, seen from above, of what stands on a plane, as a part of the plane's
+)
 # what stands on a plane has its middle in the plane's outline, drawn together to so much of it
 WELL_INSIDE = 0.85
 # samples of a part of a level surface, of those of its largest part: smaller ones are scraps
@@ -64,7 +66,7 @@ def level_planes(samples: Samples, first: Plane) -> list[Plane]:
     height = first.height(samples.points)
     left = ~steep(samples, first.normal) & (np.abs(height) > samples.tolerance)
     left &= height < first.height(samples.camera)  # ceilings carry nothing
-    wanted = max(LEAST_SHARE * len(height), 2)
+    wanted = max(LEAST_LEVEL_SHARE * len(height), 2)
 
     planes = [first]
     while len(planes) < MOST_PLANES and left.sum() >= wanted:
@@ -78,7 +80,7 @@ def level_planes(samples: Samples, first: Plane) -> list[Plane]:
         offset = first.offset - float(weight @ height[on] / weight.sum())
         parallel = replace(first, offset=offset)
         better = refine_plane(parallel, samples.some(_only(on, len(height))), loose=2)
-        planes.append(better if better.normal @ first.normal > PARALLEL else parallel)
+        planes.append(better if better.normal @ first.normal > PARALLEL_SUPPORTS else parallel)
         left &= np.abs(planes[-1].height(samples.points)) > 2 * samples.tolerance
     return sorted(planes, key=lambda plane: plane.offset)
 
@@ -330,7 +332,7 @@ def _stands_within(samples: Samples, plane: Plane, thing: Index, outline: Convex
         area = float(ConvexHull(shown).volume) if len(shown) > 2 else 0.0
     except QhullError:
         area = 0.0
-    return (inside or narrow) and area < LARGEST_SHARE * float(outline.volume)
+    return (inside or narrow) and area < LARGEST_AREA_ABOVE * float(outline.volume)
 
 
 def _goes_on_below(samples: Samples, plane: Plane, thing: Index) -> bool:

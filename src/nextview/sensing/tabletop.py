@@ -15,7 +15,7 @@ from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, upright_axes
-from nextview.sensing.observed_object import FEWEST, ObservedObject, noise_of
+from nextview.sensing.observed_object import FEWEST_OBJECT_PIXELS, ObservedObject, noise_of
 from nextview.sensing.segmentation import Plane, Samples, sample
 from nextview.sensing.walls import before_walls, find_walls
 from nextview.types import Float, Float32, Index, Mask
@@ -25,8 +25,8 @@ LOWEST_SHARE = 0.012  # the same as a part of its distance, where the depth is l
 TOP_SHARE = 0.9  # share of a thing's pixels that are below its top, flying pixels left out
 SMALLEST_AREA = 1.5e-4  # square metres that are seen of a thing, at least: of a die a little more
 THINNEST = 0.006  # metres across a thing at its thickest, at least: scraps of edges are thinner
-NEAR_PLANE = 0.015  # metres from the plane within which what is seen is likely to be the plane's
-UNEVEN = 3.0  # deviations of the plane's own pixels above which something stands on it
+NEAR_TABLE = 0.015  # metres from the plane within which what is seen is likely to be the plane's
+UNEVEN_DEVIATIONS = 3.0  # deviations of the plane's own pixels above which something stands on it
 MEDIAN_DEVIATION = 1.4826  # of a Gaussian, by the median of what it deviates
 TOUCHING_GAP = 0.006  # metres between two things that touch, at most
 TOUCHING_STEP = 0.015  # metres between their depths where they are nearest, at most
@@ -100,7 +100,7 @@ class TableTop:
         if region is not None:
             above &= segmentation.inside_box(frame, region)
         height = frame.along(plane.normal, plane.offset)
-        above &= height > UNEVEN * _unevenness(frame, height)
+        above &= height > UNEVEN_DEVIATIONS * _unevenness(frame, height)
         upwards = plane.normal if up is None or frame.pose is None else up
         return cls(frame, noise, plane, upwards, above, free, height)
 
@@ -116,13 +116,13 @@ class TableTop:
             scraps of edges are left out.
         """
         above = self.above if pixels is None else self.above & pixels
-        if np.count_nonzero(above) < FEWEST:
+        if np.count_nonzero(above) < FEWEST_OBJECT_PIXELS:
             return []
         frame = self.frame
         pieces = cut(frame.depth, above, self.height, self.noise, self.free)
         axes = upright_axes(self.up)
         away = float(np.median(frame.depth[above]))
-        cell = clusters.CELL * away
+        cell = clusters.FOOTPRINT_CELL * away
         rows, columns = np.nonzero(above)
         few = slice(None, None, max(1, len(rows) // 1000))
         middle = np.median(frame.positions(rows[few], columns[few]), axis=0) @ axes[:2].T
@@ -133,7 +133,7 @@ class TableTop:
         found = []
         for label in range(1, int(of_piece.max(initial=0)) + 1):
             mask = (of_piece == label)[pieces.grown]
-            if np.count_nonzero(mask) >= FEWEST:
+            if np.count_nonzero(mask) >= FEWEST_OBJECT_PIXELS:
                 mask = trimmed(frame.depth, mask, self.noise, self.height > STANDS * frame.depth)
             if self.is_thing(mask):
                 found.append(mask)
@@ -164,7 +164,7 @@ class TableTop:
         part = within(mask)
         own = mask[part] & (self.frame.depth[part] > 0)
         count = np.count_nonzero(own)
-        if count < FEWEST:
+        if count < FEWEST_OBJECT_PIXELS:
             return False
         away = float(np.median(self.frame.depth[part][own]))
         top = float(np.quantile(self.height[part][own], TOP_SHARE))
@@ -217,7 +217,7 @@ class TableTop:
 def _unevenness(frame: Frame, height: Float32) -> float:
     """How far the plane's own pixels deviate from it, metres: noise that they have in common."""
     few = (slice(None, None, 4), slice(None, None, 4))
-    seen = height[few][(frame.depth[few] > 0) & (np.abs(height[few]) < NEAR_PLANE)]
+    seen = height[few][(frame.depth[few] > 0) & (np.abs(height[few]) < NEAR_TABLE)]
     return MEDIAN_DEVIATION * float(np.median(np.abs(seen))) if len(seen) else 0.0
 
 

@@ -22,16 +22,18 @@ from nextview.types import Float, Index, Mask
 LINE_TRIALS = 150  # lines that are tried for each wall
 MOST_LINES = 6  # upright planes that are looked at, the largest first
 FEWEST_SAMPLES = 0.02  # share of all samples that lie on a wall, at least
-WIDE = 1.5  # metres: an upright plane that reaches a side of the picture and is as wide is a wall
-WIDEST = 3.0  # metres: no object is so wide
+WIDE_WALL = (
+    1.5  # metres: an upright plane that reaches a side of the picture and is as wide is a wall
+)
+WIDEST_OBJECT = 3.0  # metres: no object is so wide
 # share of the columns of the picture over which a narrower wall extends, from side to side
 WIDE_SHARE = 0.8
 SIDE_CELLS = 1  # columns of the grid of samples that count as the side of the picture
 # samples behind a wall, as a part of those on it, at most: flying pixels and doors ajar
-MOST_BEHIND = 0.1
+MOST_SAMPLES_BEHIND = 0.1
 OVER_CAMERA = 0.3  # metres of a ceiling over the camera, at least
 CEILINGS_TRIED = 50  # heights
-PARALLEL = np.cos(np.radians(25.0))  # cosine of the angle up to which two planes are parallel
+PARALLEL_WALLS = np.cos(np.radians(25.0))  # cosine of the angle up to which two planes are parallel
 COARSE_WIDTH = 320  # columns of the picture in which pixels are compared with walls
 # pixels of that picture across the square over which the distance from a wall is averaged
 MEAN_SIDE = 3
@@ -50,7 +52,7 @@ def find_walls(
     plane: Plane,
     rng: Generator,
     place: Float | None = None,
-    narrowest: float = WIDE,
+    narrowest: float = WIDE_WALL,
 ) -> list[Plane]:
     """Find the walls in a frame, as planes whose normals point into the room.
 
@@ -112,7 +114,7 @@ def _ceiling(samples: Samples, plane: Plane, place: Float | None) -> Plane | Non
     if samples.rows[on].min() > samples.rows.min() + SIDE_CELLS:
         return None
     beyond = ceiling.height(samples.points) < -2 * samples.tolerance
-    return None if beyond.sum() > MOST_BEHIND * len(on) else ceiling
+    return None if beyond.sum() > MOST_SAMPLES_BEHIND * len(on) else ceiling
 
 
 def before_walls(frame: Frame, walls: Sequence[Plane], noise: Noise) -> Mask:
@@ -219,7 +221,7 @@ def _is_wall(
     )
     gap = CORNER_GAP * away + float(np.median(samples.tolerance[on]))
     met = [wall for wall in walls if (np.abs(wall.height(samples.points[on])) < gap).any()]
-    corners = sum(abs(wall.normal @ up) < PARALLEL for wall in met)
+    corners = sum(abs(wall.normal @ up) < PARALLEL_WALLS for wall in met)
     to_the_top = (
         len(met) > corners  # as high as the ceiling
         or samples.rows[on].min() <= samples.rows.min() + SIDE_CELLS
@@ -228,7 +230,7 @@ def _is_wall(
     between_walls = to_the_top and corners > 1
     wide = width > narrowest or in_corner
     at_side = wide and (at_left or at_right)
-    return bool(width > WIDEST or at_side or from_side_to_side or between_walls)
+    return bool(width > WIDEST_OBJECT or at_side or from_side_to_side or between_walls)
 
 
 def _hides_much(samples: Samples, upright: Plane, walls: Sequence[Plane], many: int) -> bool:
@@ -238,6 +240,6 @@ def _hides_much(samples: Samples, upright: Plane, walls: Sequence[Plane], many: 
     """
     behind = upright.height(samples.points) < -2 * samples.tolerance
     for wall in walls:
-        if abs(wall.normal @ upright.normal) < PARALLEL:
+        if abs(wall.normal @ upright.normal) < PARALLEL_WALLS:
             behind &= np.abs(wall.height(samples.points)) > samples.tolerance
-    return bool(behind.sum() > MOST_BEHIND * many)
+    return bool(behind.sum() > MOST_SAMPLES_BEHIND * many)

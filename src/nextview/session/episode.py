@@ -21,7 +21,7 @@ from nextview.sensing.expected_visibility import SeenScene, expected_visibility
 from nextview.types import Float, Floats, Index, Mask
 
 # views within this angle of where a camera stood count as visited: it saw what they show
-VISITED = np.radians(6.0)
+VISITED_ANGLE = np.radians(6.0)
 
 
 @dataclass(frozen=True)
@@ -167,9 +167,9 @@ class Episodes:
 
         Where nothing is seen, the view counts as taken, but changes no belief and ends no episode
         with confidence. If this raises, nothing is taken in, and the same view can be passed again.
-        Where the cameras stood elsewhere, the nearest views count as taken, those within VISITED as
-        visited too, and azimuths and travel are measured from the places. An episode without a free
-        view ends.
+        Where the cameras stood elsewhere, the nearest views count as taken, those within
+        VISITED_ANGLE as visited too, and azimuths and travel are measured from the places. An
+        episode without a free view ends.
 
         Args:
             evidence: of the views of the A running episodes.
@@ -377,7 +377,7 @@ class Episodes:
             azimuth = np.where(there, self.sphere.azimuth[views], azimuth_of(directions))
             place = np.where(there[:, None], self.sphere.directions[views], directions)[:, None]
             places = np.concatenate([*earlier, place], 1)
-            visited |= arc <= VISITED
+            visited |= arc <= VISITED_ANGLE
         visited[np.arange(len(now)), views] = True
         said = np.asarray(
             log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), np.float64

@@ -21,15 +21,15 @@ from nextview.geometry.ray_caster import RayCaster, Triangles, pixel_rays
 from nextview.geometry.viewsphere import Viewpoints, ViewSphere, great_circle, look_at_origin
 from nextview.recognition.belief import Stopping
 from nextview.session.soft_light import SoftLight
-from nextview.session.style import ACCENT, BLUE, FAINT, GREY, INK, PAPER, STYLE, PlainFigure
+from nextview.session.style import ACCENT, BLUE, FAINT, FIGURE_STYLE, GREY, INK, PAPER, PlainFigure
 from nextview.session.view import View
 from nextview.types import Float, Floats, Index, Mask
 
 # inches: of a column, between two, and of the large picture at most
-WIDE = 2.2
-GAP = 0.3
-LARGE = 6.0
-SHOWN = 4  # classes
+COLUMN_WIDTH = 2.2
+COLUMN_GAP = 0.3
+LARGE_PICTURE = 6.0
+CLASSES_SHOWN = 4  # classes
 FIGURE_FORMATS = (".png", ".pdf", ".svg")
 # of the silhouette: parts and holes below this share of it are specks of the scan
 SPECK_SHARE = 0.002
@@ -39,7 +39,7 @@ RIM = "#a8977a"
 VALUES = LinearSegmentedColormap.from_list("value", ["#f1e9da", "#9cc3dc", BLUE])
 # how far from the object its candidate views are drawn, and the eye is, object radii
 DOME = 1.35
-AWAY = 10.0
+FIGURE_DISTANCE = 10.0
 NUMBER: dict[str, Any] = {
     "ha": "center",
     "va": "center_baseline",
@@ -69,7 +69,7 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 @matplotlib.rc_context(
-    STYLE | {"axes.grid": False, "figure.facecolor": PAPER, "axes.facecolor": PAPER}
+    FIGURE_STYLE | {"axes.grid": False, "figure.facecolor": PAPER, "axes.facecolor": PAPER}
 )
 def draw_episode(
     views: Sequence[View],
@@ -104,10 +104,10 @@ def draw_episode(
     light = SoftLight([view.observation for view in views])
     path = np.array([view.direction for view in views])
     seen_from = _best_side(path)
-    rows = [("", WIDE), ("what it believes", 1.5), ("values of views", WIDE)]
+    rows = [("", COLUMN_WIDTH), ("what it believes", 1.5), ("values of views", COLUMN_WIDTH)]
     rows = rows if valued else rows[:2]
-    large = LARGE if valued else LARGE - 1
-    width = GAP + len(views) * (WIDE + GAP) + large + GAP
+    large = LARGE_PICTURE if valued else LARGE_PICTURE - 1
+    width = COLUMN_GAP + len(views) * (COLUMN_WIDTH + COLUMN_GAP) + large + COLUMN_GAP
     said, _, more = heading.rpartition(" (") if heading.endswith(")") else (heading, "", "")
     said = fill(said, int(7.6 * width))
     more = fill(more[:-1], int(11 * width))
@@ -115,10 +115,14 @@ def draw_episode(
     height = top + sum(0.42 + high for _, high in rows) + 0.2
     figure = PlainFigure(figsize=(width, height))
     figure.text(
-        GAP / width, 1 - 0.2 / height, said, fontsize=16, weight="bold", color=BLUE, va="top"
+        COLUMN_GAP / width, 1 - 0.2 / height, said, fontsize=16, weight="bold", color=BLUE, va="top"
     )
-    figure.text(GAP / width, 1 - (top - 0.08) / height, more, fontsize=10, color=GREY, va="bottom")
-    shown = np.argsort(-np.max([view.belief for view in views], axis=0), kind="stable")[:SHOWN]
+    figure.text(
+        COLUMN_GAP / width, 1 - (top - 0.08) / height, more, fontsize=10, color=GREY, va="bottom"
+    )
+    shown = np.argsort(-np.max([view.belief for view in views], axis=0), kind="stable")[
+        :CLASSES_SHOWN
+    ]
 
     def axes(x: float, y: float, wide: float, high: float) -> Axes:
         made = figure.add_axes((x / width, y / height, wide / width, high / height))
@@ -128,11 +132,11 @@ def draw_episode(
     y = height - top
     for title, high in rows:
         y -= 0.42 + high
-        figure.text(GAP / width, (y + high + 0.1) / height, title, fontsize=10, color=GREY)
+        figure.text(COLUMN_GAP / width, (y + high + 0.1) / height, title, fontsize=10, color=GREY)
         if title == rows[-1][0] and valued:
-            _draw_scale(axes(GAP + 1.1, y + high + 0.08, 1.3, 0.15))
+            _draw_scale(axes(COLUMN_GAP + 1.1, y + high + 0.08, 1.3, 0.15))
         for k, view in enumerate(views):
-            axis = axes(GAP + k * (WIDE + GAP), y, WIDE, high)
+            axis = axes(COLUMN_GAP + k * (COLUMN_WIDTH + COLUMN_GAP), y, COLUMN_WIDTH, high)
             if title == rows[0][0]:
                 _draw_image(axis, view, k + 1, light)
                 if caster is not None:
@@ -141,7 +145,7 @@ def draw_episode(
                 _draw_belief(axis, view, float(stopping.threshold_at(k + 1)), classes, shown)
             else:
                 _draw_values(axis, views[: k + 1], sphere, seen_from)
-    x = GAP + len(views) * (WIDE + GAP)
+    x = COLUMN_GAP + len(views) * (COLUMN_WIDTH + COLUMN_GAP)
     figure.text(
         x / width, (height - top - 0.32) / height, "where it looked from", fontsize=10, color=GREY
     )
@@ -153,8 +157,8 @@ def _best_side(path: Float) -> float:
     """Return the azimuth, radians, from which the path is seen best."""
     found = []
     for azimuth in np.radians(np.arange(20, 380, 45)):
-        pose = look_at_origin(np.radians(25), azimuth, AWAY)
-        facing = path @ pose[:3, 3] / AWAY
+        pose = look_at_origin(np.radians(25), azimuth, FIGURE_DISTANCE)
+        facing = path @ pose[:3, 3] / FIGURE_DISTANCE
         flat = path @ pose[:3, :2]
         apart = [float(np.linalg.norm(a - b)) for a, b in itertools.combinations(flat, 2)]
         found.append((min([*apart, 0.6]) - ((facing - 0.8) ** 2).mean(), azimuth))
@@ -255,7 +259,7 @@ def _draw_belief(
     if np.isfinite(threshold):  # a rule of your own need not stop at a belief
         enough = f"enough: {100 * threshold:.0f} %"
         axis.text(min(at + 0.02, 1), row + 0.72, enough, fontsize=8.5, color=GREY, ha="right")
-    axis.set(xlim=(0, 1), ylim=(SHOWN - 0.2, -0.62))
+    axis.set(xlim=(0, 1), ylim=(CLASSES_SHOWN - 0.2, -0.62))
 
 
 def _draw_values(axis: Axes, views: Sequence[View], sphere: Viewpoints, seen_from: float) -> None:
@@ -362,8 +366,8 @@ def _draw_path(
     wide = axis.get_position().width * figure.get_figwidth()
     high = axis.get_position().height * figure.get_figheight()
     shape = round(130 * high), round(130 * wide)
-    pose = look_at_origin(np.radians(25), seen_from, AWAY)
-    focal = 0.5 * AWAY / 1.5 * min(shape)
+    pose = look_at_origin(np.radians(25), seen_from, FIGURE_DISTANCE)
+    focal = 0.5 * FIGURE_DISTANCE / 1.5 * min(shape)
     intrinsics = np.array([[focal, 0, shape[1] / 2], [0, focal, 0.56 * shape[0]], [0, 0, 1.0]])
     pixels, far = light.picture(light.surfaces, pose, intrinsics, shape)
     axis.imshow(pixels, interpolation="antialiased", aspect="auto")

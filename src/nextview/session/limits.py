@@ -15,7 +15,7 @@ from nextview.types import Float, Mask
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject
 
-LOWEST = 0.08
+LOWEST_VIEW = 0.08
 """Metres above the support plane: a camera on a wrist, its mount and the fingers beside it do
 not touch it.
 """
@@ -27,11 +27,11 @@ HIGHEST = 2.0
 """Metres above the support plane that no camera of a robot reaches."""
 MOST_METRES = 10.0
 """Heights and clearances beyond are of another unit: no candidate view would be left."""
-CLEARANCE = 0.1  # metres between the camera and what the frames show
+VIEW_CLEARANCE = 0.1  # metres between the camera and what the frames show
 TOO_LOW = "too low"
 TOO_HIGH = "too high"
 TOO_NEAR = "too near to something"
-HIDDEN = "behind something"
+BEHIND_SOMETHING = "behind something"
 BEHIND_WALL = "behind a wall"
 
 
@@ -83,8 +83,8 @@ class Limits:
             surroundings: what each frame of it shows.
 
         Returns:
-            (V,) of ``TOO_LOW``, ``TOO_HIGH``, ``TOO_NEAR``, ``HIDDEN``, ``BEHIND_WALL``, or ""
-            where none applies.
+            (V,) of ``TOO_LOW``, ``TOO_HIGH``, ``TOO_NEAR``, ``BEHIND_SOMETHING``, ``BEHIND_WALL``,
+            or "" where none applies.
         """
         places = poses[:, :3, 3]
         found = np.full(len(poses), "", f"<U{len(TOO_NEAR)}")
@@ -97,7 +97,9 @@ class Limits:
 
         height = np.median([plane.height(places) for plane in planes], axis=0)
         away = np.linalg.norm(places - object.object_frame.centre, axis=1)
-        lowest = np.maximum(LOWEST, GRAZING * away) if self.min_height is None else self.min_height
+        lowest = (
+            np.maximum(LOWEST_VIEW, GRAZING * away) if self.min_height is None else self.min_height
+        )
         highest = self.max_height
         if highest is None:
             stood = [sighting.frame.camera_to_world[:3, 3] for sighting in object.sightings]
@@ -112,7 +114,7 @@ class Limits:
         """Return reasons by what the frames show, with their places; the last one counts most."""
         clearance = self.clearance
         if clearance is None:
-            clearance = CLEARANCE if object.support else 0.0
+            clearance = VIEW_CLEARANCE if object.support else 0.0
         if clearance == 0:
             return []
 
@@ -130,7 +132,7 @@ class Limits:
             looked_through, not_seen = shown.look_at(places, around, clearance / 2)
             free = free | looked_through
             hidden = hidden | not_seen
-        return [(HIDDEN, hidden & ~free), (BEHIND_WALL, walls), (TOO_NEAR, near)]
+        return [(BEHIND_SOMETHING, hidden & ~free), (BEHIND_WALL, walls), (TOO_NEAR, near)]
 
 
 def in_words(reasons: Sequence[str]) -> str:

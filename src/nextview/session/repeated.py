@@ -10,7 +10,7 @@ from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import angle_between, direction_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.plausibility import ViewWarning, check_views
-from nextview.session.episode import VISITED
+from nextview.session.episode import VISITED_ANGLE
 
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObjectState
@@ -20,7 +20,7 @@ ADVICE = (
 )
 REPEATED = ViewWarning("repeated", ADVICE)
 # difference of the third rows of two poses that differ by a turn about the vertical alone
-LEVEL = 1e-4
+SAME_THIRD_ROW = 1e-4
 
 
 def is_repeated(seen: Observation, earlier: Sequence[Observation]) -> bool:
@@ -73,9 +73,9 @@ def _is_one_picture(first: Observation, second: Observation) -> bool:
     """
     if not first.seen:
         return False
-    near = angle_between(direction_of(first.pose), direction_of(second.pose)) <= VISITED
+    near = angle_between(direction_of(first.pose), direction_of(second.pose)) <= VISITED_ANGLE
     return bool(
         near
-        or not np.allclose(first.pose[2], second.pose[2], atol=LEVEL)
+        or not np.allclose(first.pose[2], second.pose[2], atol=SAME_THIRD_ROW)
         or check_views(first, second)
     )

@@ -13,12 +13,12 @@ from nextview.types import Floats
 
 TORN = 0.08  # a surface ends where depth jumps by more from pixel to pixel, object radii
 # half a side of the ground that may lie in shadow, object radii, and its points along it
-REACH = 2.6
-GRID = 72
+SHADOW_REACH = 2.6
+SHADOW_GRID = 72
 SKY = np.random.default_rng(0).normal(size=(150, 3))  # directions of a ball, of any length
 SHADE = np.array([0.52, 0.57, 0.64])  # how much darker the ground is in full shadow: warm
 # towards the lamp, camera frame: from above, left, behind the camera
-LAMP = np.array([-0.45, -0.75, -0.8])
+LAMP_DIRECTION = np.array([-0.45, -0.75, -0.8])
 
 
 def surface(seen: Observation) -> Triangles:
@@ -60,10 +60,10 @@ class SoftLight:
         # sensors see one surface at several places
         self._off = 0.02 if all(o.exact for o in observations) else 0.15
         self.floor = float(np.percentile(np.concatenate(seen)[:, 2], 0.5)) - 0.01
-        x, y = np.meshgrid(*[np.linspace(-REACH, REACH, GRID)] * 2)
+        x, y = np.meshgrid(*[np.linspace(-SHADOW_REACH, SHADOW_REACH, SHADOW_GRID)] * 2)
         ground = np.stack([x, y, np.full_like(x, self.floor)], -1).reshape(-1, 3)
         light = self._sky(ground, np.tile([0.0, 0.0, 1.0], (len(ground), 1)), SKY).reshape(
-            GRID, GRID
+            SHADOW_GRID, SHADOW_GRID
         )
         self._ground = gaussian_filter(light, 1.2, mode="nearest")
 
@@ -103,7 +103,7 @@ class SoftLight:
         with np.errstate(divide="ignore", invalid="ignore"):
             down = (self.floor - pose[2, 3]) / rays[:, 2]
         below = np.where((down > 0) & np.isfinite(down), down, 0)[:, None] * rays + origins
-        at = (below[:, 1::-1] / REACH + 1) * (GRID - 1) / 2
+        at = (below[:, 1::-1] / SHADOW_REACH + 1) * (SHADOW_GRID - 1) / 2
         light = map_coordinates(self._ground, at.T, order=1, cval=1.0)
         colours *= 1 - np.outer((down > 0) * np.clip(0.97 - light, 0, 1), SHADE)
 
@@ -111,7 +111,9 @@ class SoftLight:
             np.linalg.norm(hits["Ng"][hit], axis=1, keepdims=True), 1e-12
         )
         normals *= -np.sign((normals * rays[hit]).sum(1, keepdims=True))
-        facing = 0.5 + 0.5 * normals @ (pose[:3, :3] @ LAMP) / np.linalg.norm(LAMP)
+        facing = 0.5 + 0.5 * normals @ (pose[:3, :3] @ LAMP_DIRECTION) / np.linalg.norm(
+            LAMP_DIRECTION
+        )
         points = origins[hit] + hits["tfar"][hit, None] * rays[hit]
         bright = (0.35 + 0.65 * self._sky(points, normals, SKY[:24])) * (0.5 + 0.62 * facing)
         colours[hit] = np.array(rgb(WOOD)) * bright[:, None]

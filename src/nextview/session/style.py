@@ -30,8 +30,8 @@ GROUND = "#f5efe4"
 WOOD = "#e0ab6c"
 # of several things of one kind, in turn
 SERIES = ("#0b6e99", "#c4532d", "#4b8b3b", "#7a5195", "#b8860b", "#555555")
-UNKNOWN = 201, 210, 218  # the colour of what has no value
-STYLE = {
+UNKNOWN_COLOUR = 201, 210, 218  # the colour of what has no value
+FIGURE_STYLE = {
     "font.family": "sans-serif",
     "font.sans-serif": ["Helvetica Neue", "Arial", "Liberation Sans", "DejaVu Sans"],
     "font.size": 9.5,
@@ -75,7 +75,7 @@ def new_figure(width: float, height: float) -> tuple[Figure, Axes]:
     Returns:
         The figure and its axes.
     """
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(FIGURE_STYLE):
         figure = PlainFigure((width, height))
         axes = figure.add_subplot()
         for axis in (axes.xaxis, axes.yaxis):
@@ -95,7 +95,7 @@ def legend(axes: Axes, title: str | None = None) -> None:
         axes: the axes.
         title: of the legend; None for none.
     """
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(FIGURE_STYLE):
         axes.legend(
             loc="upper center",
             bbox_to_anchor=(0.45, -0.17),
@@ -117,13 +117,13 @@ def heat(values: Floats) -> NDArray[np.uint8]:
     low, high = (values[known].min(), values[known].max()) if known.any() else (0.0, 1.0)
     scaled = np.where(known, values - low, 0.0) / (high - low if high > low else 1.0)
     colours = (255 * matplotlib.colormaps["viridis"](scaled)[..., :3] + 0.5).astype(np.uint8)
-    return np.where(known[..., None], colours, np.array(UNKNOWN, np.uint8))
+    return np.where(known[..., None], colours, np.array(UNKNOWN_COLOUR, np.uint8))
 
 
 def to_svg(figure: Figure) -> str:
     """A figure as SVG text, the same every time."""
     text = StringIO()
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(FIGURE_STYLE):
         figure.savefig(
             text, format="svg", bbox_inches="tight", pad_inches=0.05, metadata={"Date": None}
         )
@@ -138,5 +138,5 @@ def to_png(figure: Figure, path: Path) -> None:
         figure: the figure.
         path: of the file.
     """
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(FIGURE_STYLE):
         figure.savefig(path, dpi=160, facecolor="white", bbox_inches="tight", pad_inches=0.1)

@@ -12,19 +12,19 @@ from nextview.sensing.sighting import Sighting
 from nextview.sensing.walls import find_walls
 from nextview.types import Float, Index, Mask
 
-MOST_POINTS = 6000  # of a frame that are looked at
+MOST_SURROUNDING_POINTS = 6000  # of a frame that are looked at
 # parts of the depth between neighbouring pixels, at an edge, where a sensor makes up points
 JUMP = 0.03
 # metres above the support plane, beside the noise, up to which a point lies on it
-NEAR_PLANE = 0.02
-AROUND = 1.1  # object radii around the centre within which a surface counts as the object's own
-FEWEST_POINTS = 3  # that are measured near a place before it counts as occupied
-WINDOW = 2  # pixels to each side that tell what lies on the line of sight to a place
+NEAR_SUPPORT = 0.02
+OWN_RADIUS = 1.1  # object radii around the centre within which a surface counts as the object's own
+FEWEST_NEAR_POINTS = 3  # that are measured near a place before it counts as occupied
+SIGHT_WINDOW = 2  # pixels to each side that tell what lies on the line of sight to a place
 NARROWEST_WALL = 0.5  # metres that a frame shows of a wall, at least
 WALL_TOLERANCE = 0.02  # metres, beside the noise
 BEHIND = 0.15  # metres behind a wall from which on a point does not belong to it
 # share of a frame's points that may lie behind a wall: reflections, a door that stands open
-MOST_BEHIND = 0.03
+MOST_POINTS_BEHIND = 0.03
 
 
 @dataclass(frozen=True)
@@ -81,17 +81,17 @@ class Surroundings:
         reach = np.linalg.norm(places - around.centre, axis=1)
         away = np.linalg.norm(self.points - around.centre, axis=1)
         kept = (away > reach.min() - clearance) & (away < reach.max() + clearance)
-        kept &= away > AROUND * around.radius
-        kept &= _height(self.points, self.plane) > NEAR_PLANE + self.tolerance
+        kept &= away > OWN_RADIUS * around.radius
+        kept &= _height(self.points, self.plane) > NEAR_SUPPORT + self.tolerance
 
         apart = np.linalg.norm(places[:, None] - self.points[kept][None], axis=2)
-        return (apart < clearance).sum(1) >= FEWEST_POINTS
+        return (apart < clearance).sum(1) >= FEWEST_NEAR_POINTS
 
     def shows_behind(self, wall: Plane) -> bool:
         """Whether the camera stood behind the wall of another frame, or sees something there."""
         if wall.height(self.frame.camera_to_world[:3, 3]) < 0:
             return True
-        return _share_behind(wall.height(self.points), self.tolerance) > MOST_BEHIND
+        return _share_behind(wall.height(self.points), self.tolerance) > MOST_POINTS_BEHIND
 
     def look_at(self, places: Float, around: ObjectFrame, margin: float) -> tuple[Mask, Mask]:
         """Which places the frame looks through, and which are hidden by other things.
@@ -117,9 +117,9 @@ class Surroundings:
 
         share = np.where(blocked, measured / np.where(blocked, away, 1), 0)
         surface = camera + (places - camera) * share[:, None]
-        own = np.linalg.norm(surface - around.centre, axis=1) < AROUND * around.radius
+        own = np.linalg.norm(surface - around.centre, axis=1) < OWN_RADIUS * around.radius
         depth = np.where(blocked, measured, 1)
-        on_plane = _height(surface, self.plane) < NEAR_PLANE + _tolerance(self.noise, depth)
+        on_plane = _height(surface, self.plane) < NEAR_SUPPORT + _tolerance(self.noise, depth)
         return free, blocked & ~own & ~on_plane
 
     def _depth_towards(self, seen_at: Float) -> Float:
@@ -135,7 +135,7 @@ class Surroundings:
         row = np.floor(seen_at[:, 1] / z * k[1, 1] + k[1, 2])
         inside = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
 
-        around = np.arange(-WINDOW, WINDOW + 1)
+        around = np.arange(-SIGHT_WINDOW, SIGHT_WINDOW + 1)
         rows = np.clip(row[inside, None, None].astype(int) + around[:, None], 0, height - 1)
         columns = np.clip(column[inside, None, None].astype(int) + around, 0, width - 1)
         windows = self.frame.depth[rows, columns].astype(np.float64)
@@ -165,7 +165,7 @@ def _tolerance(noise: Noise, depth: Float) -> Float:
 def _smooth_pixels(frame: Frame) -> tuple[Index, Index]:
     """Rows and columns of a grid of pixels with a depth, but for those at an edge."""
     height, width = frame.shape
-    step = max(1, int(np.sqrt(height * width / MOST_POINTS)))
+    step = max(1, int(np.sqrt(height * width / MOST_SURROUNDING_POINTS)))
     rows, columns = np.nonzero(frame.depth[step // 2 :: step, step // 2 :: step])
     rows = step // 2 + step * rows
     columns = step // 2 + step * columns
@@ -185,7 +185,7 @@ def _walls(sighting: Sighting, around: ObjectFrame) -> tuple[Plane, ...]:
     frame = sighting.frame
     samples = sample(frame, frame.depth > 0, sighting.noise)
     away = np.linalg.norm(samples.points - around.centre, axis=1)
-    others = samples.some(away > AROUND * around.radius)
+    others = samples.some(away > OWN_RADIUS * around.radius)
     plane = sighting.plane
     if plane is None:  # all that is seen is above
         up = around.axes[2]

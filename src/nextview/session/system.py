@@ -15,14 +15,14 @@ from nextview.checks import number, one_line, whole
 from nextview.errors import MeshError, ModelError, OtherUseError, PolicyError, UsageError
 from nextview.geometry.mesh import Mesh, load_mesh, mesh_warnings
 from nextview.geometry.observation import Camera
-from nextview.geometry.viewsphere import LAYOUTS, Viewpoints, ViewSphere, viewpoints_of
+from nextview.geometry.viewsphere import VIEW_LAYOUTS, Viewpoints, ViewSphere, viewpoints_of
 from nextview.policies.base import Policy
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.policies.maps import MapPeak, SpherePeak
 from nextview.policies.registry import make_policy_anywhere, with_cards
 from nextview.recognition.belief import Stopping
 from nextview.recognition.inference import MapNetwork, Models, open_maps
-from nextview.recognition.map_names import SPHERE
+from nextview.recognition.map_names import SPHERE_SUFFIX
 from nextview.recognition.model_card import DISCRIMINATE, Collection, find_models
 from nextview.recognition.own_recogniser import own_recogniser
 from nextview.recognition.own_stopping import Rule, own_stopping
@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 
 MOST_THREADS = 1024
 # the models that ship with the package, and their share of false alarms
-DEFAULT = "modelnet10"
-UNKNOWN = 0.02
+DEFAULT_MODELS = "modelnet10"
+UNKNOWN_ALPHA = 0.02
 FRAME_FILES = (".mcap", ".db3", ".bag", ".png")  # files of captured frames, not of meshes
 
 
@@ -255,7 +255,7 @@ def simulated(mesh: Mesh, sensor: "str | Sensor | None" = None, seed: int = 0) -
 
 
 def load(
-    models: str | Path | Sequence[str | Path] = DEFAULT,
+    models: str | Path | Sequence[str | Path] = DEFAULT_MODELS,
     policy: str | None = None,
     threshold: float = 0.97,
     risk: float | None = None,
@@ -344,7 +344,8 @@ def load(
         )
     if isinstance(made, MapPeak | SpherePeak):
         made = replace(
-            made, sphere=_grid_of(opened.maps[made.map_name.removesuffix(SPHERE)], made.sphere)
+            made,
+            sphere=_grid_of(opened.maps[made.map_name.removesuffix(SPHERE_SUFFIX)], made.sphere),
         )
     rule = _rule(stopping, Stopping.of(knows.calibration, threshold, risk, max_views), risk)
     return System(opened, made, name, sphere, rule, share, given)
@@ -392,7 +393,7 @@ def _unknown_share(asked: float | None, recogniser: Recogniser, called: str) -> 
     if asked and not can_tell:
         raise ModelError(f"{called}: cannot tell unknown objects; nextview fit unknown teaches it")
     if asked is None:
-        return UNKNOWN if can_tell else 0.0
+        return UNKNOWN_ALPHA if can_tell else 0.0
     return asked
 
 
@@ -408,7 +409,7 @@ def _rule(given: Stopping | Rule | str | None, usual: Stopping, risk: float | No
 
 def _grid_of(network: MapNetwork, sphere: ViewSphere) -> ViewSphere:
     """Return the grid of a network's maps: that of the views, or the 40 views."""
-    for grid in (sphere, *LAYOUTS.values()):
+    for grid in (sphere, *VIEW_LAYOUTS.values()):
         if network.rings in (None, grid.rings):
             return grid
     there = f"the {len(sphere)} viewpoints {sphere.rings}"

@@ -8,7 +8,7 @@ import numpy as np
 from nextview.checks import one_line
 from nextview.errors import NoViewLeftError, ObservationError, UsageError
 from nextview.geometry.viewsphere import (
-    DISTANCE,
+    CAMERA_DISTANCE,
     ViewSphere,
     angle_between,
     direction_of,
@@ -16,13 +16,13 @@ from nextview.geometry.viewsphere import (
 )
 from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.object_frame import Box, ObjectFrame
-from nextview.simulation.scene import TABLE, Scene
+from nextview.simulation.scene import SCENE_TABLE, Scene
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import Sensor, SensorMix, sensor_named
 from nextview.types import Float
 
 Named = Literal["point", "box", "known", "mask"]
-SAME = 1e-6  # radians between directions that are the same
+SAME_DIRECTION = 1e-6  # radians between directions that are the same
 
 
 def sensed_camera(
@@ -39,8 +39,10 @@ def sensed_camera(
         The camera.
     """
     drawn = sensor_named(sensor).draw(rng.spawn(1)[0])
-    drawn = replace(drawn, radius=drawn.distance / DISTANCE, boxes=0.0)
-    return SensedCamera(scene.target, drawn, rng, around=scene.around, table=TABLE, true_size=False)
+    drawn = replace(drawn, radius=drawn.distance / CAMERA_DISTANCE, boxes=0.0)
+    return SensedCamera(
+        scene.target, drawn, rng, around=scene.around, table=SCENE_TABLE, true_size=False
+    )
 
 
 class RobotCamera:
@@ -74,7 +76,7 @@ class RobotCamera:
         corners = scene.target.vertices * self._truth.radius
         asked = {
             "point": {"point": np.zeros(3)},
-            "box": {"box": Box(corners.min(0) - SAME, corners.max(0) + SAME)},
+            "box": {"box": Box(corners.min(0) - SAME_DIRECTION, corners.max(0) + SAME_DIRECTION)},
             "known": {"known": self._camera.object_frame, "support": False},
             "mask": {},
         }[named]
@@ -99,7 +101,7 @@ class RobotCamera:
         for direction in (asked, *self._directions[order]):
             there = level_pose(direction)
             tried = self._refused if direction is asked else [*self._refused, *self._taken]
-            used = any(angle_between(direction, other) < SAME for other in tried)
+            used = any(angle_between(direction, other) < SAME_DIRECTION for other in tried)
             if used or not self.scene.reachable(there[None, :3, 3])[0]:
                 continue
 

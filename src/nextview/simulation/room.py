@@ -17,15 +17,15 @@ from nextview.simulation.scene import cached_mesh, mesh_hash, upright_boxes
 from nextview.simulation.sensor import Sensor
 from nextview.types import Float, Mask
 
-UNEVEN = 0.001  # metres, standard deviation of the height of a floor or a table top
+UNEVEN_HEIGHT = 0.001  # metres, standard deviation of the height of a floor or a table top
 WAVES = 12  # that an uneven top is made of
 SHORTEST_WAVE = 0.25  # metres
 LONGEST_WAVE = 2.0
-STEP = 0.1  # metres between the corners of an uneven top; fewer than MOST_CORNERS a side
+CORNER_SPACING = 0.1  # metres between the corners of an uneven top; fewer than MOST_CORNERS a side
 MOST_CORNERS = 60
 LOWEST_CAMERA = 0.06  # metres above what the target stands on: the camera's own housing
 HIGHEST_CAMERA = 1.8  # metres above the floor: what a mobile robot reaches
-CLEARANCE = 0.1  # metres that a camera keeps from walls and things
+ROOM_CLEARANCE = 0.1  # metres that a camera keeps from walls and things
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Room:
         """Return whether a mobile robot's camera can reach a pose, (4, 4)."""
         place = np.asarray(pose)[:3, 3]
         layout = self.layout
-        half = np.array([layout.width, layout.depth]) / 2 - CLEARANCE
+        half = np.array([layout.width, layout.depth]) / 2 - ROOM_CLEARANCE
         ground = layout.target.z if layout.kind == "table" else 0.0
 
         if (np.abs(place[:2]) > half).any() or place[2] > HIGHEST_CAMERA:
@@ -74,11 +74,11 @@ class Room:
         if place[2] < ground + LOWEST_CAMERA:
             return False
 
-        in_slab = any(_inside(slab, place, CLEARANCE) for slab in layout.slabs)
+        in_slab = any(_inside(slab, place, ROOM_CLEARANCE) for slab in layout.slabs)
         furniture = self.things[1 : 1 + len(layout.objects)]
         return not in_slab and not any(
-            (place > corners.min(0) - CLEARANCE).all()
-            and (place < corners.max(0) + CLEARANCE).all()
+            (place > corners.min(0) - ROOM_CLEARANCE).all()
+            and (place < corners.max(0) + ROOM_CLEARANCE).all()
             for corners, _ in furniture
         )
 
@@ -156,7 +156,7 @@ def _uneven_top(width: float, depth: float, rng: np.random.Generator) -> Triangl
 
     Its heights are a sum of waves in all directions.
     """
-    across, along = (min(MOST_CORNERS, 2 + round(side / STEP)) for side in (width, depth))
+    across, along = (min(MOST_CORNERS, 2 + round(side / CORNER_SPACING)) for side in (width, depth))
     x, y = np.meshgrid(
         np.linspace(-width / 2, width / 2, across),
         np.linspace(-depth / 2, depth / 2, along),
@@ -165,7 +165,7 @@ def _uneven_top(width: float, depth: float, rng: np.random.Generator) -> Triangl
     wave = 2 * np.pi / rng.uniform(SHORTEST_WAVE, LONGEST_WAVE, WAVES)
     towards, phase = rng.uniform(0, 2 * np.pi, (2, WAVES))
     angle = wave * (np.cos(towards) * x[..., None] + np.sin(towards) * y[..., None]) + phase
-    height = UNEVEN * np.sqrt(2 / WAVES) * np.sin(angle).sum(-1)
+    height = UNEVEN_HEIGHT * np.sqrt(2 / WAVES) * np.sin(angle).sum(-1)
 
     corners = np.stack([x, y, height], -1).reshape(-1, 3)
     number = np.arange(across * along).reshape(across, along)
@@ -177,7 +177,7 @@ def _uneven_top(width: float, depth: float, rng: np.random.Generator) -> Triangl
 
 def _walls(layout: RoomLayout) -> Triangles:
     """Walls and ceiling: a box about the room; its bottom lies below the uneven floor."""
-    below = 10 * UNEVEN
+    below = 10 * UNEVEN_HEIGHT
     size = np.array([[layout.width, layout.depth, layout.height + below]])
     box = upright_boxes(size, np.zeros(1), np.zeros((1, 2)), -below)
     return box.vertices, box.faces
@@ -190,7 +190,7 @@ def _slab_things(slab: Slab, rng: np.random.Generator) -> list[Triangles]:
     if slab.even:
         return [(box.vertices, box.faces)]
 
-    lower = box.vertices - (0, 0, 5 * UNEVEN)
+    lower = box.vertices - (0, 0, 5 * UNEVEN_HEIGHT)
     corners, faces = _uneven_top(slab.width, slab.depth, rng)
     top = corners @ rotation_z(slab.azimuth).T + (slab.x, slab.y, slab.z + slab.height)
     return [(lower, box.faces), (top, faces)]

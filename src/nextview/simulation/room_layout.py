@@ -11,7 +11,7 @@ from msgspec import Meta, Struct
 
 from nextview.errors import DatasetError
 from nextview.files import read_record, write_record
-from nextview.simulation.scene_layout import MOST, Hash, Length, Size, below_the_meshes
+from nextview.simulation.scene_layout import LAYOUT_LENGTH, Hash, Length, Size, below_the_meshes
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 Rotation = Annotated[tuple[Length, ...], Meta(min_length=9, max_length=9)]
@@ -95,8 +95,8 @@ class RoomLayout(Struct, frozen=True, forbid_unknown_fields=True):
     depth: Size
     height: Size
     pose: Pose
-    objects: Annotated[tuple[Standing, ...], MOST] = ()
-    slabs: Annotated[tuple[Slab, ...], MOST] = ()
+    objects: Annotated[tuple[Standing, ...], LAYOUT_LENGTH] = ()
+    slabs: Annotated[tuple[Slab, ...], LAYOUT_LENGTH] = ()
 
     def save(self, path: Path) -> None:
         """Write its file, whole or not at all. The same room makes the same bytes."""

@@ -17,17 +17,17 @@ from nextview.simulation.scene_layout import Block, Placement, SceneLayout
 from nextview.types import Float, Mask
 
 # half the side of the square table, object radii: what stands around the target stands on it
-TABLE = 3.4
-CLEARANCE = 0.2  # what a camera needs to each side, object radii
+SCENE_TABLE = 3.4
+SCENE_CLEARANCE = 0.2  # what a camera needs to each side, object radii
 # of a box: from the object's circle, sides, height
-GAP = (0.02, 0.3)
+BLOCK_GAP = (0.02, 0.3)
 FOOTPRINT = (0.3, 0.9)
-HEIGHT = (0.6, 2.6)
+BLOCK_HEIGHT = (0.6, 2.6)
 _CORNERS = np.array([[x, y, z] for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
 _FACES = np.reshape([int(i) for i in "021123456576014154263367042246135375"], (-1, 3))
 # every footprint is wider by this on each side, object radii: so the thinnest sheet has one too
-EDGE = 1e-3
-_AROUND = EDGE * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+FOOTPRINT_EDGE = 1e-3
+_AROUND = FOOTPRINT_EDGE * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Scene:
     @cached_property
     def table(self) -> Mesh:
         """Its top, a square."""
-        return Mesh(*square(TABLE, self.floor), np.zeros(3), 1.0, "table")
+        return Mesh(*square(SCENE_TABLE, self.floor), np.zeros(3), 1.0, "table")
 
     def clearance(self, positions: Float) -> Float:
         """Return the distance of cameras, (V, 3), from the nearest item or the table, (V,).
@@ -95,11 +95,11 @@ class Scene:
     def reachable(self, positions: Float) -> Mask:
         """Return whether a camera can be at each position, (V, 3), object radii; (V,) bool.
 
-        Not nearer than CLEARANCE to an item or the table, nor to where a wall stands before the
-        target from above.
+        Not nearer than SCENE_CLEARANCE to an item or the table, nor to where a wall stands before
+        the target from above.
         """
         positions = points(positions, "the positions of cameras")
-        free = self.clearance(positions) >= CLEARANCE
+        free = self.clearance(positions) >= SCENE_CLEARANCE
         for wall in (item.footprint for item in self.items if item.wall):
             free &= [separation(np.array([p, (0.0, 0.0)]), wall) > 0 for p in positions[:, :2]]
         return free
@@ -202,10 +202,10 @@ def boxes_around(vertices: Float, count: int, rng: np.random.Generator) -> Mesh:
     floor = vertices[:, 2].min()
     reach = np.hypot(vertices[:, 0], vertices[:, 1]).max()
     size = np.concatenate(
-        [rng.uniform(*FOOTPRINT, (count, 2)), rng.uniform(*HEIGHT, (count, 1))], 1
+        [rng.uniform(*FOOTPRINT, (count, 2)), rng.uniform(*BLOCK_HEIGHT, (count, 1))], 1
     )
     azimuth, towards = rng.uniform(0, 2 * np.pi, (2, count))
-    away = reach + np.hypot(size[:, 0], size[:, 1]) / 2 + rng.uniform(*GAP, count)
+    away = reach + np.hypot(size[:, 0], size[:, 1]) / 2 + rng.uniform(*BLOCK_GAP, count)
     at = away[:, None] * np.stack([np.cos(towards), np.sin(towards)], 1)
     return upright_boxes(size, azimuth, at, float(floor))
 

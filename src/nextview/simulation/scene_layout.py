@@ -9,15 +9,19 @@ from msgspec import Meta, Struct
 from nextview.errors import DatasetError
 from nextview.files import read_record, write_record
 
-LEVELS = {"light": 0.85, "medium": 0.65, "heavy": 0.45}  # mean share of the target that shows
+CLUTTER_LEVELS = {
+    "light": 0.85,
+    "medium": 0.65,
+    "heavy": 0.45,
+}  # mean share of the target that shows
 NAMED = re.compile(r".*@(\w+)-\d+")  # names of scenes that were drawn: target, level and number
 SUFFIX = ".json"
-VIEWS = 40
+LAYOUT_VIEWS = 40
 # or radians: what is computed with more has no precision left
 Length = Annotated[float, Meta(ge=-1000, le=1000)]
 Size = Annotated[float, Meta(gt=0, le=1000)]
 Hash = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]
-MOST = Meta(max_length=1000)
+LAYOUT_LENGTH = Meta(max_length=1000)
 
 
 def clutter_level(name: str) -> str:
@@ -83,7 +87,7 @@ class SceneLayout(Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         name: unique in its folder, "chair_0890@medium-1".
-        level: level of clutter, one of LEVELS, or a word of your own.
+        level: level of clutter, one of CLUTTER_LEVELS, or a word of your own.
         seed: seed that the scene was drawn with.
         target: in the middle of the table, not rotated.
         objects: the other objects.
@@ -97,18 +101,20 @@ class SceneLayout(Struct, frozen=True, forbid_unknown_fields=True):
     level: str
     seed: int
     target: Placement
-    objects: Annotated[tuple[Placement, ...], MOST] = ()
-    blocks: Annotated[tuple[Block, ...], MOST] = ()
-    visible: Annotated[tuple[Annotated[float, Meta(ge=0, le=1)], ...], Meta(max_length=VIEWS)] = ()
+    objects: Annotated[tuple[Placement, ...], LAYOUT_LENGTH] = ()
+    blocks: Annotated[tuple[Block, ...], LAYOUT_LENGTH] = ()
+    visible: Annotated[
+        tuple[Annotated[float, Meta(ge=0, le=1)], ...], Meta(max_length=LAYOUT_VIEWS)
+    ] = ()
     unreachable: Annotated[
-        tuple[Annotated[int, Meta(ge=0, lt=VIEWS)], ...], Meta(max_length=VIEWS)
+        tuple[Annotated[int, Meta(ge=0, lt=LAYOUT_VIEWS)], ...], Meta(max_length=LAYOUT_VIEWS)
     ] = ()
 
     def __post_init__(self) -> None:
         if self.target != Placement(self.target.mesh, self.target.sha256):
             raise ValueError("the target stands in the middle as it is")
-        if len(self.visible) not in (0, VIEWS):
-            raise ValueError(f"visible has {VIEWS} numbers")
+        if len(self.visible) not in (0, LAYOUT_VIEWS):
+            raise ValueError(f"visible has {LAYOUT_VIEWS} numbers")
 
     def save(self, path: Path) -> None:
         """Write its file, whole or not at all. The same scene makes the same bytes."""

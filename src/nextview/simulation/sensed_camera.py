@@ -9,25 +9,27 @@ from scipy.spatial.transform import Rotation
 from nextview.errors import ObservationError
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.observation import Observation, pinhole
-from nextview.geometry.viewsphere import DISTANCE
+from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.sensing import Frame, ObjectFrame, ObservedObject
 from nextview.sensing.facets import virtual_pose
 from nextview.sensing.frame import Part, spans, within
-from nextview.sensing.observed_object import FEWEST, SIZE
+from nextview.sensing.observed_object import FEWEST_OBJECT_PIXELS, SIZE
 from nextview.sensing.segmentation import inside_sphere
 from nextview.simulation.scene import boxes_around
 from nextview.simulation.sensor import Sensor, SensorMix, sensor_named, uniform_field
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.types import Float, Float32, Mask
 
-TABLE = 1.5  # radius of the table that the object stands on, if nothing else is said, object radii
+BARE_TABLE_RADIUS = (
+    1.5  # radius of the table that the object stands on, if nothing else is said, object radii
+)
 # the object is looked for in a sphere so many radii large: with a wrong pose it sticks out of its
 # own
-REACH = 1.3
+OBJECT_REACH = 1.3
 LEFTOVER = 4.0  # size of the patches of the table that are taken for the object, pixels
 # what a pixel shows; where it shows nothing, the first
-OBJECT = 0
-TABLE_TOP = 1
+OBJECT_SURFACE = 0
+TABLE_SURFACE = 1
 BOX = 2
 
 
@@ -52,7 +54,7 @@ class SensedCamera:
         rng: np.random.Generator,
         denoise: bool = True,
         around: Mesh | None = None,
-        table: float = TABLE,
+        table: float = BARE_TABLE_RADIUS,
         true_size: bool = True,
     ) -> None:
         known = sensor_named(sensor)
@@ -105,7 +107,7 @@ class SensedCamera:
         except ObservationError:
             asked = virtual_pose(self.object_frame.pose_in_object(self._truth.pose_in_world(pose)))
             observation = Observation(
-                np.zeros((SIZE, SIZE), np.float32), asked, pinhole(SIZE, DISTANCE)
+                np.zeros((SIZE, SIZE), np.float32), asked, pinhole(SIZE, CAMERA_DISTANCE)
             )
         if self._metres is None:
             return observation
@@ -131,24 +133,24 @@ class SensedCamera:
         part = within(measured)  # nothing is measured beside it
         shown = whose.ravel()[source[part]]
         mask = measured > 0
-        other = (shown != OBJECT) & (source[part] >= 0)
+        other = (shown != OBJECT_SURFACE) & (source[part] >= 0)
         if self.sensor.table:
             left_in = uniform_field(rng, depth.shape, LEFTOVER, part) < self.sensor.table
-            other &= (shown != TABLE_TOP) | ~left_in
+            other &= (shown != TABLE_SURFACE) | ~left_in
         mask[part] &= ~other
         if self.sensor.crop:
             measured = self._cropped(measured, mask, rng)
-        if np.count_nonzero(measured) < FEWEST:
+        if np.count_nonzero(measured) < FEWEST_OBJECT_PIXELS:
             return None
 
         frame = Frame(measured, self.sensor.intrinsics, believed, pixel_centre=0.5)
         mask[part] &= inside_sphere(
-            frame, self.object_frame.centre, REACH * self.object_frame.radius, part
+            frame, self.object_frame.centre, OBJECT_REACH * self.object_frame.radius, part
         )
 
         return (
             replace(frame, mask=mask, pixel_centre=0.5)
-            if np.count_nonzero(mask) >= FEWEST
+            if np.count_nonzero(mask) >= FEWEST_OBJECT_PIXELS
             else None
         )
 
@@ -177,11 +179,11 @@ class SensedCamera:
         """True depth of object, boxes and table, metres, and what each pixel shows."""
         inside = self._truth.pose_in_object(pose)
         depth = self._camera.observe(inside).depth.copy()
-        whose = np.full(depth.shape, OBJECT, np.uint8)
+        whose = np.full(depth.shape, OBJECT_SURFACE, np.uint8)
         part, table = self._table(inside)
         shown = np.isfinite(table) & (depth[part] == 0)
         depth[part][shown] = table[shown]
-        whose[part][shown] = TABLE_TOP
+        whose[part][shown] = TABLE_SURFACE
         if self._around is not None:
             boxes = self._around.observe(inside).depth
             nearer = (boxes > 0) & ((depth == 0) | (boxes < depth))

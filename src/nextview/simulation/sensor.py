@@ -14,25 +14,25 @@ from scipy.special import ndtr
 from nextview.checks import number, whole
 from nextview.errors import UsageError
 from nextview.geometry.observation import pinhole
-from nextview.geometry.viewsphere import DISTANCE
+from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.sensing.frame import Part, within
 from nextview.types import Float, Float32, Floats, Index, Mask
 
 # two surfaces differ so much from pixel to pixel, as a part of q, beyond the surface's own slope
-EDGE = 0.02
+DEPTH_EDGE = 0.02
 # the laws of noise are held here: they grow without bound towards 90 degrees
-STEEPEST = np.radians(80.0)
+STEEPEST_INCIDENCE = np.radians(80.0)
 # pixels: a window that holds one pixel; the narrowest shadow
 NO_GRAIN = 0.1
 NARROWEST = 1.0
-WIDEST = 8  # projector columns that two neighbouring pixels of one surface may lie apart
+WIDEST_STEP = 8  # projector columns that two neighbouring pixels of one surface may lie apart
 # limits of numbers, sides of pictures, grain and strength
-LARGEST = 10_000
+LARGEST_SETTING = 10_000
 SIDE = 4096
 GRAIN = 100
 STRONGEST = 100
-MARGIN = 16  # how far beside what there is a pixel may show it, pixels
-CLEARANCE = 0.25  # metres that a camera keeps from an object of known size
+SENSOR_MARGIN = 16  # how far beside what there is a pixel may show it, pixels
+SENSOR_CLEARANCE = 0.25  # metres that a camera keeps from an object of known size
 FRAMED = 1.1  # so many times as far as where an object just fits into the picture
 MOST_RADII = 40.0  # object radii from which an object is looked at at most
 ARM_LENGTH = 0.45  # metres from its centre at which it usually stands at most
@@ -117,7 +117,7 @@ class Sensor:
             if name in ("height", "width"):
                 whole(value, what, 1, SIDE)
             else:
-                number(value, what, 0, GRAIN if name == "grain" else LARGEST)
+                number(value, what, 0, GRAIN if name == "grain" else LARGEST_SETTING)
 
         if not min(self.focal, self.baseline, self.farthest, self.radius) > 0:
             raise UsageError(
@@ -158,7 +158,7 @@ class Sensor:
 
         It stands as many object radii away as otherwise, but ARM_LENGTH at most. Farther only where
         the object does not fit into its picture, is nearer than what it can measure, or comes
-        closer than CLEARANCE. Of what is smaller than a few millimetres it measures nothing.
+        closer than SENSOR_CLEARANCE. Of what is smaller than a few millimetres it measures nothing.
 
         Args:
             radius: of the object, metres.
@@ -166,7 +166,7 @@ class Sensor:
         usual = min(self.distance / self.radius * radius, ARM_LENGTH)
         half_picture = np.arctan(min(self.shape) / 2 / self.focal)
         whole_object = FRAMED * radius / np.sin(half_picture)
-        clear = radius + max(CLEARANCE, self.nearest)
+        clear = radius + max(SENSOR_CLEARANCE, self.nearest)
         distance = min(max(usual, whole_object, clear), MOST_RADII * radius)
         return replace(self, radius=radius, distance=float(distance))
 
@@ -191,7 +191,7 @@ class Sensor:
         """
         measured = depth.copy()
         sources = np.arange(depth.size).reshape(depth.shape)
-        part = within(depth, MARGIN)
+        part = within(depth, SENSOR_MARGIN)
         depth = depth[part]
         source = sources[part]
         if not depth.size:
@@ -309,9 +309,9 @@ is "stereo" in such a setup."""
 
 _SIDE = 224
 _RADIUS = SENSORS["none"].radius
-_FOCAL = float(pinhole(_SIDE, DISTANCE)[0, 0])
+_FOCAL = float(pinhole(_SIDE, CAMERA_DISTANCE)[0, 0])
 # the networks' own camera
-RENDER = Sensor("render", _SIDE, _SIDE, _FOCAL, distance=DISTANCE * _RADIUS, radius=_RADIUS)
+RENDER = Sensor("render", _SIDE, _SIDE, _FOCAL, distance=CAMERA_DISTANCE * _RADIUS, radius=_RADIUS)
 
 
 @dataclass(frozen=True)
@@ -465,7 +465,7 @@ def across_edges(q: Float, slope: tuple[Float, Float]) -> Float:
     """
     padded = np.pad(q, 1)
     other = q.copy()
-    highest = EDGE * q
+    highest = DEPTH_EDGE * q
     height, width = q.shape
     for dy, dx in ((0, -1), (0, 1), (-1, 0), (1, 0)):
         beside = padded[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
@@ -502,7 +502,7 @@ def in_shadow(q: Float, focal: float, baseline: float) -> Mask:
     along = _slope(q)
     joined = np.zeros(q.shape, bool)
     bend = np.abs(q[:, 1:] - q[:, :-1] - along[:, :-1])
-    joined[:, :-1] = seen[:, :-1] & seen[:, 1:] & (bend <= EDGE * q[:, :-1])
+    joined[:, :-1] = seen[:, :-1] & seen[:, 1:] & (bend <= DEPTH_EDGE * q[:, :-1])
     last = np.where(joined, np.roll(column, -1, 1), column)
     # One index into all rows: NumPy takes half the time.
     first_index, last_index = (first_in_row + np.rint(at).astype(int) for at in (column, last))
@@ -510,7 +510,7 @@ def in_shadow(q: Float, focal: float, baseline: float) -> Mask:
     at = first_index[seen]
     end = last_index[seen]
     value = disparity[seen]
-    for _ in range(WIDEST):
+    for _ in range(WIDEST_STEP):
         np.maximum.at(flat, at, value)
         wider = at + 1 < end
         at = at[wider] + 1
@@ -534,7 +534,7 @@ def kinect_axial(depth: Floats, angle: Floats) -> Float:
     Returns:
         Standard deviation along the optical axis, metres.
     """
-    angle = np.minimum(angle, STEEPEST)
+    angle = np.minimum(angle, STEEPEST_INCIDENCE)
     return (
         0.0012
         + 0.0019 * (depth - 0.4) ** 2
@@ -544,7 +544,7 @@ def kinect_axial(depth: Floats, angle: Floats) -> Float:
 
 def kinect_lateral(angle: Floats) -> Float:
     """Standard deviation of where a Kinect (v1) sees an edge, pixels; same source."""
-    angle = np.minimum(angle, STEEPEST)
+    angle = np.minimum(angle, STEEPEST_INCIDENCE)
     return 0.8 + 0.035 * angle / (np.pi / 2 - angle)
 
 

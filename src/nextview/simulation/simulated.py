@@ -11,7 +11,7 @@ from nextview.geometry.depth import AMBIENT
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.observation import Observation, checked_intrinsics, checked_pose, pinhole
 from nextview.geometry.ray_caster import RayCaster, embree_scene, pixel_rays
-from nextview.geometry.viewsphere import DISTANCE
+from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.types import Float, Float32, Mask
 
 if TYPE_CHECKING:
@@ -31,10 +31,12 @@ def _dot(a: Float32, b: Float32) -> Float32:
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
-NOTHING, TARGET, OTHER, TABLE_TOP = np.arange(4, dtype=np.uint8)  # what a pixel shows
+SHOWS_NOTHING, SHOWS_TARGET, SHOWS_OTHER, SHOWS_TABLE = np.arange(
+    4, dtype=np.uint8
+)  # what a pixel shows
 # how much nearer than the target something has to be to hide it, object radii: the table touches it
-NEARER = 1e-4
-LARGEST = 16_384  # pixels that an image may be high or wide
+OCCLUDER_GAP = 1e-4
+LARGEST_IMAGE = 16_384  # pixels that an image may be high or wide
 
 
 class SimulatedCamera:
@@ -59,14 +61,14 @@ class SimulatedCamera:
         self,
         mesh: Mesh,
         size: int = 224,
-        distance: float = DISTANCE,
+        distance: float = CAMERA_DISTANCE,
         intrinsics: Float | None = None,
         shape: tuple[int, int] | None = None,
     ) -> None:
         height, width = shape or (size, size)
         self.shape = (
-            whole(height, "the height of the image", 1, LARGEST),
-            whole(width, "its width", 1, LARGEST),
+            whole(height, "the height of the image", 1, LARGEST_IMAGE),
+            whole(width, "its width", 1, LARGEST_IMAGE),
         )
         self.intrinsics = (
             pinhole(size, distance)
@@ -137,7 +139,7 @@ class SimulatedCamera:
 class OccludedCamera:
     """A camera in front of the target of a scene; what hides it is cut out."""
 
-    def __init__(self, scene: "Scene", size: int = 224, distance: float = DISTANCE) -> None:
+    def __init__(self, scene: "Scene", size: int = 224, distance: float = CAMERA_DISTANCE) -> None:
         self.scene = scene
         self._target = SimulatedCamera(scene.target, size, distance)
         self._others = RayCaster(
@@ -167,7 +169,7 @@ class OccludedCamera:
         rays = self._rays[there] @ seen.pose[:3, :3].T.astype(np.float32)
         depth, _ = self._others.cast(seen.pose[:3, 3], rays)
         hidden = np.zeros(there.shape, bool)
-        hidden[there] = depth < seen.depth[there] - NEARER
+        hidden[there] = depth < seen.depth[there] - OCCLUDER_GAP
         return hidden
 
 
@@ -178,13 +180,13 @@ class SceneCamera:
         meshes = (scene.target, scene.table, scene.around)
         self._caster = RayCaster([(mesh.vertices, mesh.faces) for mesh in meshes if mesh])
         self._rays = pixel_rays(checked_intrinsics(intrinsics, shape), shape)
-        self._owners = np.array([TARGET, TABLE_TOP, OTHER, NOTHING])
+        self._owners = np.array([SHOWS_TARGET, SHOWS_TABLE, SHOWS_OTHER, SHOWS_NOTHING])
 
     def look(self, pose: Float) -> tuple[Float32, NDArray[np.uint8]]:
         """Render the scene from a camera-to-world pose, (4, 4), object frame and radii.
 
-        Depth, (H, W) float32, object radii, 0 = nothing; and NOTHING, TARGET, OTHER or TABLE_TOP,
-        (H, W) uint8.
+        Depth, (H, W) float32, object radii, 0 = nothing; and SHOWS_NOTHING, SHOWS_TARGET,
+        SHOWS_OTHER or SHOWS_TABLE, (H, W) uint8.
         """
         pose = checked_pose(pose)
         rays = self._rays.reshape(-1, 3) @ pose[:3, :3].T.astype(np.float32)

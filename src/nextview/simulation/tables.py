@@ -31,8 +31,8 @@ TABLE_HEIGHT = 0.75  # metres above the floor
 FLOOR_SIDE = 8.0  # metres
 STEP_OUTWARDS = 0.005  # metres by which a thing is moved outwards until it fits
 MOST_STEPS = 200
-TRIES = 100
-REACH = 0.36  # metres from the middle of the table within which things stand
+PLACEMENTS_TRIED = 100
+TABLE_REACH = 0.36  # metres from the middle of the table within which things stand
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ def _free_place(
     """Where a thing with an outline, (K, 2), about the origin has a gap to all others, (2,)."""
     if not others:
         return rng.uniform(-0.05, 0.05, 2)
-    for _ in range(TRIES):
+    for _ in range(PLACEMENTS_TRIED):
         wanted = rng.uniform(0, gap)
         beside = others[int(rng.integers(len(others)))].mean(0)
         angle = rng.uniform(0, 2 * np.pi)
@@ -126,7 +126,7 @@ def _free_place(
             place = beside + step * STEP_OUTWARDS * way
             if min(separation(outline + place, other) for other in others) >= wanted:
                 break
-        if np.linalg.norm(place) < REACH:
+        if np.linalg.norm(place) < TABLE_REACH:
             return place
     raise UsageError("the things do not fit on the table: take fewer, or smaller ones")
 

@@ -23,7 +23,7 @@ from nextview.files import check_new, command, new_file, new_folder, only_one, s
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import Features
 from nextview.recognition.model_card import (
-    FEATURES,
+    FEATURE_NETWORK,
     MEMORY_SUFFIX,
     SHORT_HASH,
     ModelCard,
@@ -37,7 +37,7 @@ from nextview.recognition.model_card import (
     write_card,
 )
 from nextview.teaching.learned_picture import draw_learned
-from nextview.teaching.memory_fit import VIEWS, Fit, fit_memory, size_evidence
+from nextview.teaching.memory_fit import VIEWS_FITTED, Fit, fit_memory, size_evidence
 from nextview.teaching.sizes import check_sizes
 from nextview.teaching.thing_sources import Found, ThingSource, find_things
 from nextview.teaching.thing_views import (
@@ -67,8 +67,8 @@ from nextview.types import Index
 
 MEMORY_NAME = "memory"  # of the card in a folder of taught things, and of the file beside it
 CARD = f"{MEMORY_NAME}.json"
-WEIGHTS = f"{MEMORY_NAME}{MEMORY_SUFFIX}"
-PICTURE = "learned.png"
+MEMORY_FILE = f"{MEMORY_NAME}{MEMORY_SUFFIX}"
+LEARNED_PICTURE = "learned.png"
 # folder beside these things, of the memory that things are shown to before it is finished
 JUDGED = "judged"
 # the key of the things that a run that was stopped has taught, see ``files.unfinished``
@@ -142,7 +142,7 @@ class Learned:
     def _how_often(self) -> str:
         """How often views are named right, in words."""
         shown = self.accuracy[:3]
-        views = ", ".join(str(k) for k in VIEWS[: len(shown)])
+        views = ", ".join(str(k) for k in VIEWS_FITTED[: len(shown)])
         named = f"named right after {views} views: {_percent(shown)}"
         if not self.by_features:
             return named
@@ -307,7 +307,7 @@ def _check_places(out: Path, keeps: bool, overwrite: bool) -> None:
             f"{out}: already knows things; --add adds others, --overwrite replaces them"
         )
     check_new(out, keeps or overwrite, folder=True)
-    for place in (card, out / PICTURE):
+    for place in (card, out / LEARNED_PICTURE):
         check_new(place, overwrite=True)
 
 
@@ -416,7 +416,7 @@ def _stamp(source: ThingSource, how: TeachingOptions) -> str:
             seen = f"{file}\0{error.errno}\0"
         content.update(seen.encode(errors="surrogateescape"))
 
-    features = find_card(FEATURES).sha256
+    features = find_card(FEATURE_NETWORK).sha256
     return repr(
         (str(source.path.resolve()), content.hexdigest(), replace(how, any_size=False), features)
     )
@@ -497,7 +497,9 @@ def _write(
     with new_folder(out, overwrite=True, last=CARD) as part:
         weights = _save(part, card, memory)
         draw_learned(
-            part / PICTURE, {source.name: arrays["pictures"] for source, arrays in taught}, fit
+            part / LEARNED_PICTURE,
+            {source.name: arrays["pictures"] for source, arrays in taught},
+            fit,
         )
         # the very same memory again
         if _is_intact(out / weights.name, read_card(part / CARD).sha256):
@@ -522,9 +524,9 @@ def _write(
 
 def _save(folder: Path, card: ModelCard, memory: Memory) -> Path:
     """Write a memory and its card, which gets its hash; returns the path of the memory."""
-    sha256 = memory.save(folder / WEIGHTS)
+    sha256 = memory.save(folder / MEMORY_FILE)
     weights = memory_path(folder / CARD, sha256)
-    (folder / WEIGHTS).rename(weights)
+    (folder / MEMORY_FILE).rename(weights)
     write_card(folder / CARD, replace_record(card, sha256=sha256))
     return weights
 
@@ -603,7 +605,7 @@ def _with_verification(card: ModelCard, memory: Memory, verified: VerifiedFit) -
 
 def _by_views(shares: Sequence[float]) -> dict[str, float]:
     """Shares after 1, 2, ... views, as a card holds them."""
-    return {str(k): round(share, 4) for k, share in zip(VIEWS, shares, strict=False)}
+    return {str(k): round(share, 4) for k, share in zip(VIEWS_FITTED, shares, strict=False)}
 
 
 def _fitted(taught: Sequence[Pair], label: Index) -> tuple[Memory, Fit]:
@@ -652,7 +654,7 @@ def _card(
         for (source, arrays), count in zip(taught, poses, strict=True)
     )
 
-    features = find_card(FEATURES)
+    features = find_card(FEATURE_NETWORK)
     novelty, usual = (
         tuple(map(tuple, np.round(rows, 4).tolist())) for rows in (fit.quantiles, fit.usual)
     )
@@ -672,7 +674,7 @@ def _card(
         training=Training(f"{len(taught)} things", commands=commands),
         scores={
             "held-out views": {
-                str(k): round(a, 4) for k, a in zip(VIEWS, fit.accuracy, strict=True)
+                str(k): round(a, 4) for k, a in zip(VIEWS_FITTED, fit.accuracy, strict=True)
             }
         },
         memory=Taught(things, features.sha256, fit.weight, novelty=novelty, usual=usual),
@@ -705,7 +707,7 @@ def _remove_old(out: Path, kept: str) -> None:
         ):
             file.unlink()
 
-    earlier = out / WEIGHTS
+    earlier = out / MEMORY_FILE
     if earlier.is_file() and _holds_views(earlier):
         earlier.unlink()
 

@@ -8,24 +8,24 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from nextview.teaching.memory_fit import VIEWS, Fit
+from nextview.teaching.memory_fit import VIEWS_FITTED, Fit
 
 PAGE_WIDTH = 11.0  # inches
 PICTURE_WIDTH = 1.05  # inches, and as high
-GAP = 0.11  # between pictures, inches
+PICTURE_GAP = 0.11  # between pictures, inches
 LINE = 0.22  # height of a name below a picture, inches
-MARGIN = 0.33
+PICTURE_MARGIN = 0.33
 # of things beside the bars
-COLUMNS = 6
-ROWS = 2
+THING_COLUMNS = 6
+THING_ROWS = 2
 ALL_COLUMNS = 9  # of things below the bars
-ROW = PICTURE_WIDTH + LINE + GAP
+ROW = PICTURE_WIDTH + LINE + PICTURE_GAP
 TITLE_HEIGHT = 0.75
-MOST_THINGS = 120  # of more an even choice is shown
+MOST_THINGS_SHOWN = 120  # of more an even choice is shown
 MOST_PAIRS = 4
-LONGEST_NAME = 18  # letters
+LONGEST_LABEL = 18  # letters
 PIXELS_PER_INCH = 120
-INK = "#1d1d1f"
+PICTURE_INK = "#1d1d1f"
 QUIET = "#8a8a8e"
 BAR = "#2f6fde"
 
@@ -45,9 +45,9 @@ def draw_learned(path: Path, pictures: Pictures, fit: Fit) -> None:
     names = list(pictures)
     shown = _even_choice(names)
     pairs = [(names[a], names[b], share) for a, b, share in fit.confused[:MOST_PAIRS]]
-    rows = max(ROWS, 1 + _place(len(shown) - 1)[0])
+    rows = max(THING_ROWS, 1 + _place(len(shown) - 1)[0])
     pairs_height = LINE + (LINE + ROW if pairs else 0)
-    height = TITLE_HEIGHT + rows * ROW + pairs_height + MARGIN
+    height = TITLE_HEIGHT + rows * ROW + pairs_height + PICTURE_MARGIN
 
     figure = Figure(figsize=(PAGE_WIDTH, height), dpi=PIXELS_PER_INCH, facecolor="white")
     # one for all pictures: axes take longer than what is in them
@@ -62,50 +62,52 @@ def draw_learned(path: Path, pictures: Pictures, fit: Fit) -> None:
 
 
 def _even_choice(names: list[str]) -> list[str]:
-    """All names, or an even choice of MOST_THINGS."""
-    if len(names) <= MOST_THINGS:
+    """All names, or an even choice of MOST_THINGS_SHOWN."""
+    if len(names) <= MOST_THINGS_SHOWN:
         return names
-    return [names[k * len(names) // MOST_THINGS] for k in range(MOST_THINGS)]
+    return [names[k * len(names) // MOST_THINGS_SHOWN] for k in range(MOST_THINGS_SHOWN)]
 
 
 def _draw_things(page: Axes, pictures: Pictures, shown: list[str]) -> None:
     title = "1 thing learned" if len(pictures) == 1 else f"{len(pictures)} things learned"
-    page.text(MARGIN, 0.45, title, size=17, color=INK, weight="bold")
+    page.text(PICTURE_MARGIN, 0.45, title, size=17, color=PICTURE_INK, weight="bold")
     if len(shown) < len(pictures):
-        page.text(MARGIN, 0.66, f"{len(shown)} of them, evenly chosen:", size=9, color=QUIET)
+        page.text(
+            PICTURE_MARGIN, 0.66, f"{len(shown)} of them, evenly chosen:", size=9, color=QUIET
+        )
     for k, name in enumerate(shown):
         row, column = _place(k)
-        left = MARGIN + column * (PICTURE_WIDTH + GAP)
+        left = PICTURE_MARGIN + column * (PICTURE_WIDTH + PICTURE_GAP)
         _draw_picture(page, left, TITLE_HEIGHT + row * ROW, pictures[name], name)
 
 
 def _place(k: int) -> tuple[int, int]:
     """Row and column of a thing, by its number: the rows below the bars are longer."""
-    beside = COLUMNS * ROWS
+    beside = THING_COLUMNS * THING_ROWS
     if k < beside:
-        return divmod(k, COLUMNS)
+        return divmod(k, THING_COLUMNS)
     row, column = divmod(k - beside, ALL_COLUMNS)
-    return ROWS + row, column
+    return THING_ROWS + row, column
 
 
 def _draw_bars(figure: Figure, fit: Fit, height: float) -> None:
-    left = MARGIN + COLUMNS * (PICTURE_WIDTH + GAP) + 0.4
-    size = ROWS * ROW - 2 * LINE - 0.5
+    left = PICTURE_MARGIN + THING_COLUMNS * (PICTURE_WIDTH + PICTURE_GAP) + 0.4
+    size = THING_ROWS * ROW - 2 * LINE - 0.5
     bottom = height - TITLE_HEIGHT - 0.3 - size
-    width = PAGE_WIDTH - MARGIN - left
+    width = PAGE_WIDTH - PICTURE_MARGIN - left
     axes = figure.add_axes((left / PAGE_WIDTH, bottom / height, width / PAGE_WIDTH, size / height))
 
-    views = [str(k) for k in VIEWS[: len(fit.accuracy)]]
+    views = [str(k) for k in VIEWS_FITTED[: len(fit.accuracy)]]
     bars = axes.bar(views, [100 * a for a in fit.accuracy], color=BAR, width=0.6)
-    axes.bar_label(bars, fmt="%.0f", color=INK, size=11)
+    axes.bar_label(bars, fmt="%.0f", color=PICTURE_INK, size=11)
     axes.set_ylim(0, 110)
     axes.set_yticks([])
     for side in ("top", "left", "right"):
         axes.spines[side].set_visible(False)
     axes.spines["bottom"].set_color(QUIET)
-    axes.tick_params(axis="x", length=0, colors=INK)
-    axes.set_title("named right, % of cases", size=10, color=INK, loc="left")
-    axes.set_xlabel("views", size=10, color=INK)
+    axes.tick_params(axis="x", length=0, colors=PICTURE_INK)
+    axes.set_title("named right, % of cases", size=10, color=PICTURE_INK, loc="left")
+    axes.set_xlabel("views", size=10, color=PICTURE_INK)
 
 
 def _draw_pairs(
@@ -116,15 +118,17 @@ def _draw_pairs(
         if pairs
         else "no two things are confused"
     )
-    page.text(MARGIN, top, heading, size=11, color=INK, weight="bold")
+    page.text(PICTURE_MARGIN, top, heading, size=11, color=PICTURE_INK, weight="bold")
 
-    each = (PAGE_WIDTH - 2 * MARGIN + GAP) / MOST_PAIRS
+    each = (PAGE_WIDTH - 2 * PICTURE_MARGIN + PICTURE_GAP) / MOST_PAIRS
     for k, (first, second, share) in enumerate(pairs):
-        left = MARGIN + k * each
+        left = PICTURE_MARGIN + k * each
         _draw_picture(page, left, top + 1.6 * LINE, pictures[first], first)
-        _draw_picture(page, left + PICTURE_WIDTH + GAP, top + 1.6 * LINE, pictures[second], second)
+        _draw_picture(
+            page, left + PICTURE_WIDTH + PICTURE_GAP, top + 1.6 * LINE, pictures[second], second
+        )
         page.text(
-            left + PICTURE_WIDTH + GAP / 2,
+            left + PICTURE_WIDTH + PICTURE_GAP / 2,
             top + 1.3 * LINE,
             f"{share:.0%}",
             size=10,
@@ -141,8 +145,14 @@ def _draw_picture(
     extent = (left, left + PICTURE_WIDTH, top + PICTURE_WIDTH, top)
     page.imshow(shade, cmap="gray", vmin=0, vmax=255, interpolation="bilinear", extent=extent)
     words = name.replace("_", " ")
-    short = words if len(words) <= LONGEST_NAME else f"{words[: LONGEST_NAME - 3]}..."
+    short = words if len(words) <= LONGEST_LABEL else f"{words[: LONGEST_LABEL - 3]}..."
     middle = left + PICTURE_WIDTH / 2
     page.text(
-        middle, top + PICTURE_WIDTH + LINE / 2, short, size=7.5, color=INK, ha="center", va="center"
+        middle,
+        top + PICTURE_WIDTH + LINE / 2,
+        short,
+        size=7.5,
+        color=PICTURE_INK,
+        ha="center",
+        va="center",
     )

@@ -9,15 +9,15 @@ from nextview.recognition.belief import Calibration, SizeEvidence, log_evidence_
 from nextview.things.memory import AZIMUTHS, by_ring, similarities
 from nextview.types import Float, Float32, Floats, Index, Mask
 
-WEIGHTS = (20.0, 30.0, 40.0, 60.0, 90.0)  # of a cosine, as a log-likelihood
-CORRELATIONS = (0.1, 0.3, 0.6)  # of two views, see ``Calibration.bin_correlation``
+COSINE_WEIGHTS = (20.0, 30.0, 40.0, 60.0, 90.0)  # of a cosine, as a log-likelihood
+BIN_CORRELATIONS = (0.1, 0.3, 0.6)  # of two views, see ``Calibration.bin_correlation``
 HEADS = (0.0, 5.0, 15.0)  # weights of the head beside the nearest views
 RIDGE = 1.0
-MOST_THINGS = 150  # things whose held-out views are judged: a drawn part of more
+MOST_THINGS_JUDGED = 150  # things whose held-out views are judged: a drawn part of more
 DRAWS = 4
-VIEWS = (1, 2, 3, 5)
+VIEWS_FITTED = (1, 2, 3, 5)
 FOLDS = 5
-LEVELS = 101
+QUANTILE_COUNT = 101
 SIZE_ERROR = 0.05  # deviation of the logarithm of a radius that a sensor measures
 NO_LIKENESS = -1e3
 
@@ -33,7 +33,7 @@ class Fit:
         head_bias: biases of the head.
         quantiles: of the novelty score, see ``recognition.novelty.Quantiles``.
         usual: see ``recognition.novelty.Quantiles``.
-        accuracy: share of right answers after each number of views in VIEWS.
+        accuracy: share of right answers after each number of views in VIEWS_FITTED.
         confused: pairs that are most often confused: (thing, thing, share).
     """
 
@@ -73,7 +73,7 @@ def fit_memory(
     held_out = np.asarray(held_out, np.float32)
     rng = np.random.default_rng(0)
     several = np.bincount(label)[label] > 1
-    judged = np.sort(rng.permutation(len(label))[:MOST_THINGS])
+    judged = np.sort(rng.permutation(len(label))[:MOST_THINGS_JUDGED])
     fold = rng.permutation(len(label)) % FOLDS
     alike = _judged(views, thing, held_out[judged], held_out_views[judged])
 
@@ -92,10 +92,10 @@ def fit_memory(
     scored = []
 
     for h in HEADS if several.any() else (0.0,):
-        for w in WEIGHTS:
-            sums = _sums(w * alike, h * heads + sizes, where, drawn, VIEWS)
+        for w in COSINE_WEIGHTS:
+            sums = _sums(w * alike, h * heads + sizes, where, drawn, VIEWS_FITTED)
             scored += [
-                (_belief(sums, heads.shape[-1], of_class, c), (w, c, h)) for c in CORRELATIONS
+                (_belief(sums, heads.shape[-1], of_class, c), (w, c, h)) for c in BIN_CORRELATIONS
             ]
     truth = label[judged]
     loss = [
@@ -103,11 +103,13 @@ def fit_memory(
     ]
     beliefs, (weight, correlation, head) = scored[int(np.argmin(loss))]
     accuracy = tuple(float((logs.argmax(-1) == truth[:, None]).mean()) for logs in beliefs)
-    sums = _sums(weight * alike, head * heads + sizes, where, drawn, range(1, 1 + max(VIEWS)))
+    sums = _sums(
+        weight * alike, head * heads + sizes, where, drawn, range(1, 1 + max(VIEWS_FITTED))
+    )
     each = _belief(sums, heads.shape[-1], of_class, correlation)
     usual = np.stack([_usual(logs, truth) for logs in each])
     scores = [-logs.max(-1) - own[logs.argmax(-1)] for logs, own in zip(each, usual, strict=True)]
-    quantiles = np.quantile(scores, np.linspace(0, 1, LEVELS), axis=(1, 2)).T
+    quantiles = np.quantile(scores, np.linspace(0, 1, QUANTILE_COUNT), axis=(1, 2)).T
     confused = _confused(beliefs[1], truth, judged, label)
 
     return Fit(

@@ -11,7 +11,9 @@ from nextview.types import Floats
 
 # a thing so many times larger or smaller than the median of the others is asked about
 ODD_SIZE = 300
-LARGEST_RADIUS = 20.0  # metres, of the median thing: no camera looks at larger ones from all around
+LARGEST_MEDIAN_RADIUS = (
+    20.0  # metres, of the median thing: no camera looks at larger ones from all around
+)
 SMALLEST_RADIUS = 0.001  # and at smaller ones no depth camera
 USUAL_RADII = (0.01, 3.0)  # metres, of things of which one takes views
 
@@ -32,7 +34,7 @@ def check_sizes(paths: Sequence[Path], radii: Floats, unit: str | None) -> None:
     if not known.any():
         return
     median = float(np.median(radii[known]))
-    if unit is not None and not SMALLEST_RADIUS < median < LARGEST_RADIUS:
+    if unit is not None and not SMALLEST_RADIUS < median < LARGEST_MEDIAN_RADIUS:
         raise DatasetError(_all_odd(paths, radii, unit, median))
 
     for path, times in zip(paths, radii / median, strict=True):

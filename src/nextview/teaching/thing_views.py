@@ -39,7 +39,7 @@ from nextview.types import Float, Float32
 Arrays = dict[str, NDArray]
 HELD_OUT = 8  # views of each thing that are not remembered
 SETUP = 8  # views that share the errors of one setup: a wrong centre, a wrong size
-BATCH = 20
+VIEWS_PER_BATCH = 20
 NEAR_CAPTURED = np.radians(
     30
 )  # a captured view teaches what the thing looks like from no farther than this
@@ -214,7 +214,9 @@ def _around(clean: Parts, sensed: Parts) -> Float32:
 def _clean(pool: ThreadPoolExecutor, mesh: Mesh) -> Parts:
     """Embeddings of the views of the grid without errors."""
     camera = SimulatedCamera(mesh)
-    return pool.map(partial(_seen, camera), np.split(MEMORY_GRID.poses, len(MEMORY_GRID) // BATCH))
+    return pool.map(
+        partial(_seen, camera), np.split(MEMORY_GRID.poses, len(MEMORY_GRID) // VIEWS_PER_BATCH)
+    )
 
 
 def _sensed(
@@ -298,5 +300,8 @@ def embeddings(observations: list[Observation]) -> Float32:
     """
     network = _features()
     inputs = from_observations(network.card.input, observations)
-    parts = [network(inputs[start : start + BATCH]) for start in range(0, len(inputs), BATCH)]
+    parts = [
+        network(inputs[start : start + VIEWS_PER_BATCH])
+        for start in range(0, len(inputs), VIEWS_PER_BATCH)
+    ]
     return np.concatenate(parts) * np.array([view.seen for view in observations])[:, None]

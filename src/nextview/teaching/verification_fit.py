@@ -17,13 +17,13 @@ from nextview.simulation.sensed_camera import SensedCamera
 from nextview.things.memory import RINGS, TaughtRecogniser
 from nextview.things.taught import TaughtThings, residuals_of
 from nextview.things.unknown import KnownResiduals
-from nextview.things.weighing import LEAST_BELIEF, EvidenceWeights, JudgedEpisode, fit_weights
+from nextview.things.weighing import LEAST_TRUE_BELIEF, EvidenceWeights, JudgedEpisode, fit_weights
 from nextview.types import Float, Index
 
-VIEWS = (1, 2, 3)  # after so many views things are judged
-TRIES = 6  # views that are taken at most, until so many show the thing
-MOST_THINGS = 150  # that are shown: a drawn part of more
-EPISODES = 2  # for each of many things
+VIEWS_VERIFIED = (1, 2, 3)  # after so many views things are judged
+SHOWING_VIEWS_TRIED = 6  # views that are taken at most, until so many show the thing
+MOST_THINGS_VERIFIED = 150  # that are shown: a drawn part of more
+EPISODES_PER_THING = 2  # for each of many things
 ENOUGH_EPISODES = 16  # for each of few things as if all of them had so many together
 GROWTH = 2  # weights are fitted anew when there are so many times as many things
 # things that the default weights count for, beside those that others are fitted to
@@ -84,8 +84,8 @@ def to_be_shown(things: Sequence[int], known: int, rng: Generator) -> list[tuple
         known: how many there are in all.
         rng: draws a part of very many.
     """
-    some = np.sort(rng.permutation(things)[:MOST_THINGS])
-    episodes = max(EPISODES, ENOUGH_EPISODES // known)
+    some = np.sort(rng.permutation(things)[:MOST_THINGS_VERIFIED])
+    episodes = max(EPISODES_PER_THING, ENOUGH_EPISODES // known)
     return [(int(thing), draw) for thing in some for draw in range(episodes)]
 
 
@@ -119,7 +119,7 @@ def show(card: Path, sensor: str, seed: int, item: tuple[int, int]) -> list[Show
     evidence = known.log_evidence(observations)
 
     found = []
-    for count in VIEWS[: len(observations)]:
+    for count in VIEWS_VERIFIED[: len(observations)]:
         try:
             verified = known.verify(observations[:count], evidence[:count])
         except ObservationError:  # what was seen is too little to be compared with surfaces
@@ -165,13 +165,13 @@ def _views(known: TaughtThings, thing: int, sensor: str, rng: Generator) -> list
     mesh = make_mesh(surface.vertices.astype(np.float64) @ turn.T, surface.faces, surface.name, "m")
     camera = SensedCamera(mesh, sensor, rng.spawn(1)[0])
 
-    elevations = np.arcsin(rng.uniform(0, np.sin(np.radians(RINGS[-1])), TRIES))
+    elevations = np.arcsin(rng.uniform(0, np.sin(np.radians(RINGS[-1])), SHOWING_VIEWS_TRIED))
     observations = []
-    for pose in look_at_origin(elevations, rng.uniform(0, 2 * np.pi, TRIES)):
+    for pose in look_at_origin(elevations, rng.uniform(0, 2 * np.pi, SHOWING_VIEWS_TRIED)):
         observation = camera.observe(pose)
         if observation.seen:
             observations.append(observation)
-        if len(observations) == max(VIEWS):
+        if len(observations) == max(VIEWS_VERIFIED):
             break
     return observations
 
@@ -249,7 +249,7 @@ def _weights(shown: Sequence[Shown]) -> EvidenceWeights:
 def _log_likelihood(weights: EvidenceWeights, episodes: Sequence[JudgedEpisode]) -> float:
     """Sum of the logarithms of the belief in the truth."""
     believed = [episode.belief(weights)[episode.truth] for episode in episodes]
-    return float(np.log(np.maximum(believed, LEAST_BELIEF)).sum())
+    return float(np.log(np.maximum(believed, LEAST_TRUE_BELIEF)).sum())
 
 
 def _residuals(shown: Sequence[Shown], labels: Index) -> KnownResiduals | None:
@@ -355,7 +355,9 @@ def _accuracy(shown: Sequence[Shown], answers: Sequence[int]) -> tuple[float, ..
         return ()
     right = np.array([one.judged.truth for one in shown]) == answers
     views = np.array([one.views for one in shown])
-    return tuple(float(right[views == count].mean()) for count in VIEWS if (views == count).any())
+    return tuple(
+        float(right[views == count].mean()) for count in VIEWS_VERIFIED if (views == count).any()
+    )
 
 
 def _confused(shown: Sequence[Shown], answers: Sequence[int]) -> tuple[tuple[int, int, float], ...]:

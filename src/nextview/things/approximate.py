@@ -8,11 +8,11 @@ import numpy as np
 from nextview.checks import extras
 from nextview.types import Float32, Floats, Index
 
-LARGE = 20_000  # views of a ring from which looking at all of them takes more than 10 ms
+LARGE_RING = 20_000  # views of a ring from which looking at all of them takes more than 10 ms
 INDEX = "PCA64,IVF256,SQ8"  # 64 numbers of a byte for each view, in 256 cells
 PROBED = 16  # cells that are searched
-SAMPLE = 10_240  # views from which an index learns its cells
-NEAREST = 1000  # views of a ring that are compared exactly
+VIEWS_SAMPLED = 10_240  # views from which an index learns its cells
+VIEWS_COMPARED = 1000  # views of a ring that are compared exactly
 
 
 def is_large(views: Float32) -> bool:
@@ -20,14 +20,14 @@ def is_large(views: Float32) -> bool:
 
     They are if there are many, and faiss is installed.
     """
-    return views.shape[1] >= LARGE and find_spec("faiss") is not None
+    return views.shape[1] >= LARGE_RING and find_spec("faiss") is not None
 
 
 class NearestViews:
     """An index for each ring of remembered views, (rings, N, F) float32, unit vectors."""
 
     def __init__(self, views: Float32) -> None:
-        sample = np.random.default_rng(0).permutation(views.shape[1])[:SAMPLE]
+        sample = np.random.default_rng(0).permutation(views.shape[1])[:VIEWS_SAMPLED]
         self._views = views
         self._indices = [_index(ring, sample) for ring in views]
 
@@ -48,7 +48,10 @@ class NearestViews:
         for row, (embedding, share) in enumerate(pairs):
             rings = np.flatnonzero(share > 0)
             near = np.concatenate(
-                [self._indices[ring].search(embedding[None], NEAREST)[1][0] for ring in rings]
+                [
+                    self._indices[ring].search(embedding[None], VIEWS_COMPARED)[1][0]
+                    for ring in rings
+                ]
             )
             near = np.unique(near[near >= 0])
             alike = sum(share[ring] * (self._views[ring, near] @ embedding) for ring in rings)

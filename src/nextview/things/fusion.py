@@ -19,8 +19,8 @@ from nextview.types import Float
 FINEST_CELL = 0.0015  # metres: what depth cameras tell apart
 CELLS = 45.0  # in a radius, of a large thing
 SQUARE = 0.75  # half the side of a square, cells: neighbours overlap
-MOST_POINTS = 20_000  # of a frame; an even choice of more is taken
-STEEPEST = 0.25  # cosine of the angle of incidence below which a pixel does not count
+MOST_FUSED_POINTS = 20_000  # of a frame; an even choice of more is taken
+STEEPEST_COSINE = 0.25  # cosine of the angle of incidence below which a pixel does not count
 FEW_SHARE = 0.1  # of what a usual cell was seen, below which it is an error
 FEWEST_SQUARES = 50
 
@@ -62,14 +62,14 @@ def fuse(sightings: Sequence[Sighting], radius: float, name: str) -> Surface | N
 def _measured(sighting: Sighting) -> tuple[Float, Float, Float]:
     """Points of the thing, (N, 3), their normals towards the camera, and how much they count."""
     facets = sighting.facets
-    step = 1 + len(facets.rows) // MOST_POINTS
+    step = 1 + len(facets.rows) // MOST_FUSED_POINTS
     facets = facets.some(slice(None, None, step))
     points = facets.points
     normals = -facets.planes / np.linalg.norm(facets.planes, axis=1, keepdims=True)
     cosine = -np.einsum("ni,ni->n", normals, points) / np.linalg.norm(points, axis=1)
 
     pose = sighting.frame.camera_to_world
-    good = np.isfinite(points).all(1) & np.isfinite(normals).all(1) & (cosine > STEEPEST)
+    good = np.isfinite(points).all(1) & np.isfinite(normals).all(1) & (cosine > STEEPEST_COSINE)
     in_world = points[good] @ pose[:3, :3].T + pose[:3, 3]
     return in_world, normals[good] @ pose[:3, :3].T, step * cosine[good]
 

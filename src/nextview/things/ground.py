@@ -7,11 +7,15 @@ import numpy as np
 
 from nextview.types import Float, Floats
 
-FEWEST_POINTS = 50  # on the plane
-LEAST_SHARE = 0.25  # of what is measured beside the thing
-LAYER = 0.15  # thickness of the layer that the plane is looked for in, half sizes of the thing
+FEWEST_PLANE_POINTS = 50  # on the plane
+LEAST_PLANE_SHARE = 0.25  # of what is measured beside the thing
+PLANE_LAYER = (
+    0.15  # thickness of the layer that the plane is looked for in, half sizes of the thing
+)
 THINNEST_LAYER = 0.006  # metres
-STEEPEST = np.cos(np.radians(15.0))  # vertical part of the normal: the vertical is known up to this
+LEAST_VERTICAL = np.cos(
+    np.radians(15.0)
+)  # vertical part of the normal: the vertical is known up to this
 FITS = 4
 NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal number
 
@@ -52,12 +56,12 @@ def find_ground(beside: Float, thing: Float, origin: Float, axis: Float) -> Grou
     Returns:
         The plane; None where too few of the points lie on one.
     """
-    enough = max(FEWEST_POINTS, LEAST_SHARE * len(beside))
+    enough = max(FEWEST_PLANE_POINTS, LEAST_PLANE_SHARE * len(beside))
     if len(beside) < enough or not len(thing):
         return None
 
     half_size = float(np.linalg.norm(np.ptp(thing, axis=0))) / 2
-    layer = max(LAYER * half_size, THINNEST_LAYER)
+    layer = max(PLANE_LAYER * half_size, THINNEST_LAYER)
     heights = np.sort(beside[:, 2])
     inside = np.searchsorted(heights, heights + layer) - np.arange(len(heights))
     lowest = heights[inside.argmax()]
@@ -81,7 +85,7 @@ def find_ground(beside: Float, thing: Float, origin: Float, axis: Float) -> Grou
         normal, float(offset), _noise(off[near] * normal[2], beside[near], normal, origin, axis)
     )
     bottom = np.quantile(ground.heights(thing), 0.1)
-    if normal[2] < STEEPEST or bottom < -layer:
+    if normal[2] < LEAST_VERTICAL or bottom < -layer:
         return None
     return ground
 

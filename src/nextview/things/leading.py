@@ -9,7 +9,7 @@ from nextview.types import Float, Index
 
 MOST_LEADING = 10  # hypotheses that are rendered
 FEW_THINGS = 5  # likeliest things whose best hypothesis is always among them
-LEAST_SHARE = 1e-4  # of the likeliest hypothesis' belief, below which one does not count
+LEAST_LEADING_SHARE = 1e-4  # of the likeliest hypothesis' belief, below which one does not count
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +48,6 @@ class Hypotheses:
         ahead = np.zeros(len(belief))
         ahead[first[:FEW_THINGS]] = 1
         rows = np.argsort(-(ahead + belief), kind="stable")[:most]
-        rows = rows[belief[rows] >= LEAST_SHARE * belief.max()]
+        rows = rows[belief[rows] >= LEAST_LEADING_SHARE * belief.max()]
         some = belief[rows]
         return cls(verified.things[rows], verified.poses[rows], some / some.sum())

@@ -15,7 +15,7 @@ from nextview.errors import ModelError
 from nextview.files import arrays_in, checked_bytes, new_file
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import Features, NetworkRecogniser
-from nextview.recognition.model_card import FEATURES, ModelCard, find_card
+from nextview.recognition.model_card import FEATURE_NETWORK, ModelCard, find_card
 from nextview.recognition.novelty import ROUNDED, Quantiles, unit
 from nextview.things.approximate import NearestViews, is_large
 from nextview.things.stored_surfaces import StoredSurfaces
@@ -23,8 +23,8 @@ from nextview.types import Float32, Floats, Index
 
 RINGS = (0.0, 18.0, 36.0, 54.0, 72.0)  # elevations of the remembered views, degrees
 AZIMUTHS = 16  # remembered views on a ring: the azimuth bins of a memory
-PICTURE = 64  # side of the picture of a thing, pixels
-LARGEST_RADIUS = 1e4  # of a thing, metres; nothing as large is looked at from around
+THING_PICTURE = 64  # side of the picture of a thing, pixels
+LARGEST_THING_RADIUS = 1e4  # of a thing, metres; nothing as large is looked at from around
 LARGEST_LOGIT = 700.0  # that a head can say: the exponential of more is no number
 
 
@@ -77,7 +77,7 @@ class Memory:
         check_array("its held_out", self.held_out, np.floating, (things, None, size))
         held_out = self.held_out.shape[1]
         check_array("its held_out_views", self.held_out_views, np.floating, (things, held_out, 2))
-        check_array("its pictures", self.pictures, np.uint8, (things, PICTURE, PICTURE))
+        check_array("its pictures", self.pictures, np.uint8, (things, THING_PICTURE, THING_PICTURE))
 
         check_array("its head_bias", self.head_bias, np.floating, (None,))
         check_array("its head", self.head, np.floating, (size, len(self.head_bias)))
@@ -92,8 +92,8 @@ class Memory:
             raise ModelError("its thing does not ascend")
 
         known = self.radii[~np.isnan(self.radii)]
-        if not ((known > 0) & (known <= LARGEST_RADIUS)).all():
-            raise ModelError(f"its radii are not above zero and at most {LARGEST_RADIUS:g} m")
+        if not ((known > 0) & (known <= LARGEST_THING_RADIUS)).all():
+            raise ModelError(f"its radii are not above zero and at most {LARGEST_THING_RADIUS:g} m")
 
         nameless = np.isnan(self.radii) & (self.surfaces.counts[:, 0] > 0)
         if nameless.any():
@@ -191,7 +191,7 @@ def open_memory(model: str | Path) -> tuple[ModelCard, Memory]:
     if card.memory is None:
         raise ModelError(f"{card.card_path}: is no memory of things")
 
-    features = find_card(FEATURES)
+    features = find_card(FEATURE_NETWORK)
     if card.memory.features_sha256 != features.sha256:
         raise ModelError(
             f"{card.card_path}: was taught with other features; teach it again with nextview learn"

@@ -14,7 +14,7 @@ from nextview.things.taught import TaughtThings
 from nextview.things.verifier import FINE_SIDE, Verified, Verifier
 from nextview.types import Index
 
-AXES = 3  # along each of which a camera's place errs
+CAMERA_DIRECTIONS = 3  # along each of which a camera's place errs
 LEAST_PROBABILITY = 0.01  # of a pose that is named beside the likeliest one
 
 
@@ -79,7 +79,7 @@ def _camera_error(
     """By how much errors of the cameras' places displace a pose, millimetres; 0 for exact ones."""
     if all(observation.exact for observation in observations):
         return 0.0
-    variances = AXES * verifier.prior.displaced(views) ** 2
+    variances = CAMERA_DIRECTIONS * verifier.prior.displaced(views) ** 2
     return float(1000 * np.sqrt(variances.sum()) / len(views))
 
 

@@ -25,12 +25,12 @@ PLACE = slice(3, 6)
 POSE = 6
 """Unknowns of a step: turn and place of a hypothesis; the errors of the cameras follow."""
 
-FIXED = 1e9  # weight of an unknown that does not change
-FREE = 1e-3  # weight of one that nothing is known of
+FIXED_WEIGHT = 1e9  # weight of an unknown that does not change
+FREE_WEIGHT = 1e-3  # weight of one that nothing is known of
 SHIFT_LIMIT = 0.25  # radii that a step moves a hypothesis at most
 TURN_LIMIT = 0.3  # radians that a step turns it at most
-SAME_TURN = np.radians(3.0)
-SAME_PLACE = 0.03  # radii
+TURN_TOLERANCE = np.radians(3.0)
+PLACE_TOLERANCE = 0.03  # radii
 """Hypotheses of one thing that are not farther apart are one."""
 
 
@@ -88,7 +88,7 @@ class Level:
 
 
 FIRST = (Level(2, 0.25, 2.0, False),)
-COARSE = (Level(2, 0.1, 1.0, False), Level(1, 0.05, 0.5, True))
+COARSE_LEVELS = (Level(2, 0.1, 1.0, False), Level(1, 0.05, 0.5, True))
 FINE = (Level(2, 0.035, 0.25, True), Level(1, 0.02, 0.1, True))
 
 
@@ -315,7 +315,7 @@ def _overlap(view: DepthView, shows: Mask) -> Float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Pulls:
+class _PoseEquations:
     """By how much, and in which direction, each pixel of one view draws each hypothesis.
 
     Attributes:
@@ -334,7 +334,7 @@ class _Pulls:
 OUTLINE_PIXELS = 1.5  # deviation of an outline, pixels
 
 
-def _pulls(view: DepthView, rendered: Rendered, centres: Float, reach: Float32) -> _Pulls:
+def _pulls(view: DepthView, rendered: Rendered, centres: Float, reach: Float32) -> _PoseEquations:
     """What draws the hypotheses whose centres are these, (H, 3), as this view sees them.
 
     ``reach`` is the deviation of each that is to be expected beside the noise, (H,), metres.
@@ -374,7 +374,7 @@ def _pulls(view: DepthView, rendered: Rendered, centres: Float, reach: Float32) 
     variance = error**2 + np.where(thing, view.noise, outline) ** 2
     expected = reach[:, None] ** 2 + (NOISE_REACH * view.noise) ** 2
     weights = (thing | beyond | missing) / variance / (1 + distances**2 / expected)
-    return _Pulls(arms, directions, distances, weights.astype(np.float32))
+    return _PoseEquations(arms, directions, distances, weights.astype(np.float32))
 
 
 def _nearest_shown(view: DepthView, shows: Mask) -> tuple[Index, Float32, Float32]:
@@ -511,8 +511,8 @@ def different_poses(caster: SurfaceCaster, alignment: Alignment) -> Index:
     """
     rotations = alignment.rotations.reshape(len(alignment), 9)
     apart = np.linalg.norm(alignment.centres[:, None] - alignment.centres, axis=-1)
-    near = apart < SAME_PLACE * caster.radii[alignment.things][:, None]
-    alike = (rotations @ rotations.T - 1) / 2 > np.cos(SAME_TURN)
+    near = apart < PLACE_TOLERANCE * caster.radii[alignment.things][:, None]
+    alike = (rotations @ rotations.T - 1) / 2 > np.cos(TURN_TOLERANCE)
     same = near & alike & (alignment.things[:, None] == alignment.things)
 
     kept: list[int] = []
@@ -559,7 +559,7 @@ def inverses(information: Float) -> Float:
     In single precision a direction that is hardly determined may get a zero or negative
     eigenvalue: it counts as determined as little as that precision tells.
     """
-    scale = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), FREE))
+    scale = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), FREE_WEIGHT))
     scaled = information / (scale[:, :, None] * scale[:, None])  # turns and places have other units
     values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
     values = np.maximum(values, np.finfo(np.float32).eps)
@@ -567,7 +567,7 @@ def inverses(information: Float) -> Float:
     return np.asarray(inverse / (scale[:, :, None] * scale[:, None]), np.float64)
 
 
-def _outline(view: DepthView, rendered: Rendered, centres: Float) -> _Pulls:
+def _outline(view: DepthView, rendered: Rendered, centres: Float) -> _PoseEquations:
     """What holds hypotheses that lie right, with these centres, (H, 3), at the thing's outline.
 
     These are the pixels of the thing next to others where something farther, or nothing, shows:
@@ -594,10 +594,10 @@ def _outline(view: DepthView, rendered: Rendered, centres: Float) -> _Pulls:
     deviation = OUTLINE_PIXELS * view.pitch * shown
     weights = rim / (rendered.errors[:, None] ** 2 + deviation**2)
     directions = np.broadcast_to(aside, arms.shape)
-    return _Pulls(arms, directions, np.zeros_like(shown), weights.astype(np.float32))
+    return _PoseEquations(arms, directions, np.zeros_like(shown), weights.astype(np.float32))
 
 
-def _normal_equations(pulls: _Pulls, prior: RegistrationPrior) -> tuple[Float, Float]:
+def _normal_equations(pulls: _PoseEquations, prior: RegistrationPrior) -> tuple[Float, Float]:
     """What one view says of turn and place: matrices, (H, 6, 6), and right-hand sides, (H, 6)."""
     jacobian = np.concatenate([np.cross(pulls.arms, pulls.directions), pulls.directions], -1)
     # Neighbouring pixels err together.
@@ -622,8 +622,8 @@ def _priors(
     weights = np.zeros((len(alignment), POSE + cameras))
     so_far = np.zeros((len(alignment), POSE + cameras))
 
-    weights[:, :2] = 1 / prior.tilt**2 if level.turned else FIXED
-    weights[:, 2] = FREE
+    weights[:, :2] = 1 / prior.tilt**2 if level.turned else FIXED_WEIGHT
+    weights[:, 2] = FREE_WEIGHT
     if level.turned:
         so_far[:, :2] = alignment.tilts
 

@@ -24,7 +24,7 @@ from nextview.types import Floats
 
 EXPLAINED = 0.02  # p-value from which on a scan explains what is seen
 OTHERS = 1e-3  # share of the belief that is left to all but the collection that answers
-LEAST_BELIEF = 1e-12  # where the logarithm of a belief is taken
+LEAST_MODEL_BELIEF = 1e-12  # where the logarithm of a belief is taken
 
 
 class SeveralRecognisers:
@@ -114,7 +114,7 @@ class SeveralRecognisers:
             found = member(observations)
             logs = log_evidence_of(found.logits, found.azimuth_bins, azimuths)
             belief = member.calibration.belief(logs, 1, len(member.classes))
-            logits.append(np.log(np.maximum(belief, LEAST_BELIEF)))
+            logits.append(np.log(np.maximum(belief, LEAST_MODEL_BELIEF)))
             for of_view, row in zip(said, logs, strict=True):
                 of_view.append(row)
 

@@ -11,7 +11,7 @@ from nextview.errors import ModelError
 from nextview.things.surface import Surface
 from nextview.types import Float, Index
 
-STEPS = 65535  # of a box along each axis: 5 micrometres for a thing of 30 cm
+BOX_STEPS = 65535  # of a box along each axis: 5 micrometres for a thing of 30 cm
 SHORT = 65536  # vertices of a thing whose indices need no more than 16 bits
 LARGEST_EXTENT = 1e4  # metres, of a box and of its distance from the origin
 
@@ -80,7 +80,7 @@ class StoredSurfaces:
             low = vertices.min(0)
             extents = vertices.max(0) - low
             steps = np.divide(vertices - low, extents, np.zeros_like(vertices), where=extents > 0)
-            places.append(np.rint(steps * STEPS).astype(np.uint16))
+            places.append(np.rint(steps * BOX_STEPS).astype(np.uint16))
             faces.append(surface.faces.astype(np.uint32))
             counts[number] = len(vertices), len(surface.faces)
             boxes[number] = low, extents
@@ -111,7 +111,7 @@ class StoredSurfaces:
 
         vertex, face = self.counts[:thing].sum(0).tolist()
         low, extents = self.boxes[thing]
-        shares = self.places[vertex : vertex + vertices] / STEPS
+        shares = self.places[vertex : vertex + vertices] / BOX_STEPS
         return Surface(
             name,
             (low + shares * extents).astype(np.float32),

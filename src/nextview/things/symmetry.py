@@ -19,14 +19,14 @@ from nextview.types import Float
 
 # metres: three deviations of edges that a stereo camera sees at arm's length
 LEAST_TOLERANCE = 0.005
-TOLERANCE = 0.02  # of the diameter: a camera stands farther from a large thing
-COMPARED = 0.95  # share of the surface that has to be that near: scans have spurs
+SYMMETRY_TOLERANCE = 0.02  # of the diameter: a camera stands farther from a large thing
+COMPARED_SHARE = 0.95  # share of the surface that has to be that near: scans have spurs
 HIGHEST_ORDER = 8
 ANY_TURNS = np.arange(1, 24, 2) / 48  # of a full turn, that are tried for a symmetry of any angle
-SURFACE_POINTS = 20_000  # of the surface that is compared with
+SYMMETRY_POINTS = 20_000  # of the surface that is compared with
 TURNED_POINTS = 500  # of its turned copy
 STEP_ACROSS = np.radians(5)  # between axes that are tried across one of a symmetry
-SAME_AXIS = np.radians(20)  # axes within this angle are one
+AXIS_TOLERANCE = np.radians(20)  # axes within this angle are one
 
 
 def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
@@ -43,12 +43,12 @@ def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
         Its symmetries, those of any angle first, then by their order.
     """
     rng = np.random.default_rng(0)
-    whole = surface.sample(SURFACE_POINTS, rng)
+    whole = surface.sample(SYMMETRY_POINTS, rng)
     centroid = whole.mean(0)
     whole -= centroid
     tree = cKDTree(whole)
     points = surface.sample(TURNED_POINTS, rng) - centroid
-    tolerance = max(LEAST_TOLERANCE, TOLERANCE * surface.diameter)
+    tolerance = max(LEAST_TOLERANCE, SYMMETRY_TOLERANCE * surface.diameter)
 
     found = []
     for axis in _axes(surface, whole):
@@ -81,7 +81,7 @@ def _half_turn_across(
 
 def _is_ball(axes: Sequence[Float]) -> bool:
     """Whether some axes of symmetries of any angle are not all one."""
-    return any(abs(axis @ axes[0]) < np.cos(SAME_AXIS) for axis in axes)
+    return any(abs(axis @ axes[0]) < np.cos(AXIS_TOLERANCE) for axis in axes)
 
 
 def _axes(surface: Surface, points: Float) -> Float:
@@ -130,7 +130,7 @@ def _deviation(tree: cKDTree, points: Float, axis: Float, turn: float) -> float:
     from scipy.spatial.transform import Rotation
 
     rotation = Rotation.from_rotvec(2 * np.pi * turn * axis).as_matrix()
-    return float(np.quantile(tree.query(points @ rotation.T)[0], COMPARED))
+    return float(np.quantile(tree.query(points @ rotation.T)[0], COMPARED_SHARE))
 
 
 def _distinct(found: Iterable[tuple[Float, int]]) -> list[Symmetry]:
@@ -139,7 +139,7 @@ def _distinct(found: Iterable[tuple[Float, int]]) -> list[Symmetry]:
     across = False  # whether an axis across one of any angle is there already
     for axis, order in found:
         alike = np.abs([axis @ np.array(other.axis) for other in kept])
-        if (alike > np.cos(SAME_AXIS)).any():
+        if (alike > np.cos(AXIS_TOLERANCE)).any():
             continue
         if order and any(other.order == 0 for other in kept):
             if across:

@@ -21,7 +21,7 @@ from nextview.types import Float, Floats
 
 # The radius of what is seen, of that of the whole thing: much may be hidden, or little taken in.
 SMALLEST_SHARE = 0.25
-LARGEST_SHARE = 2.0
+LARGEST_SEEN_SHARE = 2.0
 
 
 class TaughtThings:
@@ -192,7 +192,7 @@ class TaughtThings:
         views = found.mean.shape[1]
         seen = max(observation.radius or 0.0 for observation in observations)
         share = seen / float(self.verifier.caster.radii[likeliest])
-        if not SMALLEST_SHARE <= share <= LARGEST_SHARE:
+        if not SMALLEST_SHARE <= share <= LARGEST_SEEN_SHARE:
             return self.residuals.p_value(np.inf, likeliest, views)
 
         explained = float(found.explained[0].mean())

@@ -13,7 +13,7 @@ import numpy as np
 from nextview.geometry.observation import Observation
 from nextview.types import Float, Float32, Mask
 
-STEPS = 10  # places on each line of sight that are looked up
+SIGHT_STEPS = 10  # places on each line of sight that are looked up
 BEFORE = 0.01  # metres before a measured surface, from which on space is known to be free
 
 
@@ -91,7 +91,7 @@ def chance_of_sight(
     Returns:
         Chances, (V, P) float32: 1 where all is known to be free.
     """
-    steps = (np.arange(STEPS, dtype=np.float32) + 0.5) / STEPS
+    steps = (np.arange(SIGHT_STEPS, dtype=np.float32) + 0.5) / SIGHT_STEPS
     back = (reach * steps)[:, None] * rays[:, :, None]
     places = (ends[:, :, None] - back).astype(np.float32)
     low = places[..., 2] < top
@@ -99,7 +99,7 @@ def chance_of_sight(
     for image in seen:
         free |= image.shows_free(places)
 
-    step = reach / STEPS
+    step = reach / SIGHT_STEPS
     unknown = step * (low & ~free).sum(2)
     known = step * float((low & free)[~hidden].sum())
     blocked = np.count_nonzero(hidden)

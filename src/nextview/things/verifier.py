@@ -13,7 +13,7 @@ from nextview.things.depth_view import DepthView, MetricImage
 from nextview.things.ground import levelling
 from nextview.things.proposals import propose
 from nextview.things.registration import (
-    COARSE,
+    COARSE_LEVELS,
     FINE,
     FIRST,
     Alignment,
@@ -38,7 +38,7 @@ TILTED_PROPOSALS = 120  # of things in any orientation, of all views together
 AGAINST_FEATURES = 0.1  # misfit for each unit of log-belief that features hold against a thing
 TINY = 1e-300  # belief that has a logarithm
 LEAST_BY_FEATURES = 0.01  # belief by features below which it does not matter
-AROUND = (Level(1, 0.05, 0.5, False),)  # steps of the alignment at azimuths all around
+AROUND_LEVELS = (Level(1, 0.05, 0.5, False),)  # steps of the alignment at azimuths all around
 AROUND_THINGS = 2  # likeliest things that are also judged at azimuths all around
 AROUND_STEPS = 24  # azimuths: a small part of a round body shows at one of them
 AROUND_PEAKS = 2  # of these azimuths that are aligned, for each thing
@@ -65,9 +65,9 @@ class Stage:
 
 
 FINE_SIDE = 40  # rows and columns of pixels that survivors are judged by
-STAGES = (
+VERIFICATION_STAGES = (
     Stage(16, FIRST, 24, 50.0, around=True),
-    Stage(24, COARSE, 12, 25.0),
+    Stage(24, COARSE_LEVELS, 12, 25.0),
     Stage(FINE_SIDE, FINE, 12, np.inf),
 )
 TILTED_STAGES = tuple(
@@ -77,7 +77,7 @@ TILTED_STAGES = tuple(
         most=most,
         around=False,
     )
-    for stage, most in zip(STAGES, (32, 12, 12), strict=True)
+    for stage, most in zip(VERIFICATION_STAGES, (32, 12, 12), strict=True)
 )
 """The same for things in any orientation, which are turned about all axes from the beginning."""
 
@@ -263,7 +263,7 @@ class Verifier:
         images = _images(observations)
         level = levelling([image.ground for image in images if image.ground is not None])
         images = [image.turned(level) for image in images]
-        return self._settled(proposed, images, STAGES, self.prior, level)
+        return self._settled(proposed, images, VERIFICATION_STAGES, self.prior, level)
 
     def in_any_orientation(
         self, observations: Sequence[Observation], templates: ViewTemplates
@@ -369,7 +369,7 @@ class Verifier:
         rotations = turns @ some.rotations
         centres = axes - np.einsum("hij,hj->hi", rotations, arms)
         some = replace(some, rotations=rotations, centres=centres)
-        some = align(self.caster, some, views, AROUND, prior)
+        some = align(self.caster, some, views, AROUND_LEVELS, prior)
 
         mean = np.stack([view.mean for view in self._judge(some, views)], 1)
         costs = camera_cost(some, views, prior)

@@ -20,14 +20,14 @@ from nextview.things.depth_view import THING, MetricImage
 from nextview.things.surface import SurfaceCaster
 from nextview.types import Float, Float32, Index, Mask
 
-DIRECTIONS = 162  # from which each thing is rendered: some 15 degrees apart
+TEMPLATE_DIRECTIONS = 162  # from which each thing is rendered: some 15 degrees apart
 TURNS = 24  # in the image plane, in which what is seen is compared: 15 degrees apart
-GRID = 16  # rows and columns of a picture
-REACH = 2.2  # from its centre to its borders, root mean squares of the outline
-RENDERED = 48  # rows and columns of pixels of a rendering
-DISTANCE = 5.0  # of the camera from the centre, radii
+TEMPLATE_SIDE = 16  # rows and columns of a picture
+TEMPLATE_REACH = 2.2  # from its centre to its borders, root mean squares of the outline
+RENDERING_PIXELS = 48  # rows and columns of pixels of a rendering
+TEMPLATE_DISTANCE = 5.0  # of the camera from the centre, radii
 MOST_ORIENTATIONS = 16  # of one thing that are proposed
-FEWEST_PIXELS = 12  # of an outline that can be compared
+FEWEST_OUTLINE_PIXELS = 12  # of an outline that can be compared
 
 OUTLINE_WEIGHT = 8.0
 DEPTH_WEIGHT = 4.0
@@ -84,7 +84,7 @@ class ViewTemplates:
         Args:
             caster: of the things.
         """
-        looks = looking_from(spread_directions(DIRECTIONS))
+        looks = looking_from(spread_directions(TEMPLATE_DIRECTIONS))
         things = []
         rotations = []
         found = []
@@ -165,15 +165,19 @@ def _rendered(
 ) -> Iterator[tuple[Float, tuple[Float32, Float32, float]]]:
     """The pictures of one thing from cameras with these axes, (N, 3, 3)."""
     radius = float(caster.radii[thing])
-    focal = RENDERED / 2 * np.sqrt(DISTANCE**2 - 1)
-    lines = (np.arange(RENDERED) + 0.5 - RENDERED / 2) / focal
-    rays = np.stack([*np.meshgrid(lines, lines), np.ones((RENDERED, RENDERED))], -1).reshape(-1, 3)
+    focal = RENDERING_PIXELS / 2 * np.sqrt(TEMPLATE_DISTANCE**2 - 1)
+    lines = (np.arange(RENDERING_PIXELS) + 0.5 - RENDERING_PIXELS / 2) / focal
+    rays = np.stack(
+        [*np.meshgrid(lines, lines), np.ones((RENDERING_PIXELS, RENDERING_PIXELS))], -1
+    ).reshape(-1, 3)
 
-    origins = caster.centres[thing] - DISTANCE * radius * looks[:, 2]
+    origins = caster.centres[thing] - TEMPLATE_DISTANCE * radius * looks[:, 2]
     depth, _ = caster.cast(
         np.full(len(looks), thing), origins.astype(np.float32), (rays @ looks).astype(np.float32)
     )
-    for look, image in zip(looks, depth.reshape(-1, RENDERED, RENDERED), strict=True):
+    for look, image in zip(
+        looks, depth.reshape(-1, RENDERING_PIXELS, RENDERING_PIXELS), strict=True
+    ):
         picture = _picture(image, np.isfinite(image), focal, np.zeros(1))
         if picture is not None:
             yield look, (picture[0][0], picture[1][0], picture[2])
@@ -216,15 +220,15 @@ def _picture(
     None where too few pixels show the thing.
     """
     rows, columns = np.nonzero(shown)
-    if len(rows) < FEWEST_PIXELS:
+    if len(rows) < FEWEST_OUTLINE_PIXELS:
         return None
     centre = np.array([columns.mean(), rows.mean()])
     spread = float(np.sqrt(columns.var() + rows.var() + 1 / 6))  # a pixel is a square
     middle = float(np.median(depth[rows, columns]))
     size = spread * middle / focal
 
-    lines = (np.arange(GRID) + 0.5) / GRID * 2 - 1
-    cells = REACH * spread * np.stack(np.meshgrid(lines, lines), -1).reshape(-1, 2)
+    lines = (np.arange(TEMPLATE_SIDE) + 0.5) / TEMPLATE_SIDE * 2 - 1
+    cells = TEMPLATE_REACH * spread * np.stack(np.meshgrid(lines, lines), -1).reshape(-1, 2)
     turned = np.einsum("aij,cj->aci", rotation_z(turns)[:, :2, :2], cells) + centre
     column, row = np.rint(turned).astype(np.int64).transpose(2, 0, 1)
     inside = (row >= 0) & (row < shown.shape[0]) & (column >= 0) & (column < shown.shape[1])

@@ -11,7 +11,7 @@ with extras():
     from torch.nn import functional as F
 
 # expansion, width, kernel, stride and blocks (Tan and Le, EfficientNet, ICML 2019, table 1)
-STAGES = (
+NETWORK_STAGES = (
     (1, 16, 3, 1, 1),
     (6, 24, 3, 2, 2),
     (6, 40, 5, 2, 2),
@@ -20,8 +20,8 @@ STAGES = (
     (6, 192, 5, 2, 4),
     (6, 320, 3, 1, 1),
 )
-BLOCKS = sum(length for *_, length in STAGES)
-FEATURES = 1280
+BLOCKS = sum(length for *_, length in NETWORK_STAGES)
+FEATURE_CHANNELS = 1280
 
 
 class Depthwise(nn.Conv2d):
@@ -119,7 +119,7 @@ class LiteNet(RecogniserNetwork):
         self.norm0 = _norm(inputs)
 
         stages: list[nn.Module] = []
-        for expansion, width, kernel, stride, length in STAGES:
+        for expansion, width, kernel, stride, length in NETWORK_STAGES:
             for index in range(length):
                 step = 1 if index else stride
                 skip = dropout * len(stages) / BLOCKS
@@ -127,10 +127,10 @@ class LiteNet(RecogniserNetwork):
                 inputs = width
         self.stages = nn.Sequential(*stages)
 
-        self.head = nn.Conv2d(inputs, FEATURES, 1, bias=False)
-        self.norm1 = _norm(FEATURES)
+        self.head = nn.Conv2d(inputs, FEATURE_CHANNELS, 1, bias=False)
+        self.norm1 = _norm(FEATURE_CHANNELS)
         self.relu = nn.ReLU6(inplace=True)
-        self.finish(FEATURES, classes, azimuths)
+        self.finish(FEATURE_CHANNELS, classes, azimuths)
 
     def features(self, x: Tensor) -> Tensor:
         """Of images, (B, F)."""

@@ -31,7 +31,7 @@ from nextview.training.fitting_set import blind_walks, card_to_fit, for_fitting,
 from nextview.types import Float, Floats, Index, Mask
 
 # of promised error rates
-THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())
+PROMISED_THRESHOLDS = tuple(np.round(1 - np.geomspace(0.5, 0.002, 32), 4).tolist())
 
 
 @dataclass(frozen=True)
@@ -268,7 +268,7 @@ def fit_risk(
     for n in walked.numbers:
         each = [_promise(sure[half, :n], wrong[half, :n], data.weights, delta) for half in halves]
         promised.append(tuple(np.max(each, axis=0).round(5).tolist()))
-    return RiskBounds(THRESHOLDS, tuple(promised), delta)
+    return RiskBounds(PROMISED_THRESHOLDS, tuple(promised), delta)
 
 
 def _promise(sure: Float, wrong: Mask, weights: Float, delta: float) -> Float:
@@ -276,10 +276,10 @@ def _promise(sure: Float, wrong: Mask, weights: Float, delta: float) -> Float:
 
     Confidences and mistakes are (walks * N, views).
     """
-    promised = np.ones(len(THRESHOLDS))
+    promised = np.ones(len(PROMISED_THRESHOLDS))
     worst = 0.0
-    for t in reversed(range(len(THRESHOLDS))):
-        reached = sure >= THRESHOLDS[t]
+    for t in reversed(range(len(PROMISED_THRESHOLDS))):
+        reached = sure >= PROMISED_THRESHOLDS[t]
         failed = wrong[np.arange(len(wrong)), reached.argmax(1)] & reached.any(1)
         failed, stopped = (x.reshape(-1, len(weights)).mean(0) for x in (failed, reached.any(1)))
         if worst > 0 or weights @ stopped >= weights.sum() / 2:

@@ -40,7 +40,7 @@ CONDITIONS = 2 * len(DEFORMATIONS)
 """Through the sensor and without one, each deformation: of views of a held-out object, in this
 order.
 """
-LEVELS = 201  # of the quantiles
+QUANTILES_FITTED = 201  # of the quantiles
 
 _log = logging.getLogger("nextview")
 
@@ -218,7 +218,7 @@ def quantiles(scores: Float, labels: Index, n_views: int) -> Float32:
         n_views: largest number of views.
 
     Returns:
-        Quantiles, (views, LEVELS) float32, ascending.
+        Quantiles, (views, QUANTILES_FITTED) float32, ascending.
     """
     count = np.bincount(labels)
     share_of = 1 / count[labels]
@@ -229,5 +229,5 @@ def quantiles(scores: Float, labels: Index, n_views: int) -> Float32:
         order = np.argsort(means, axis=None)
         weight = np.repeat(share_of, draws)[order]
         share = (np.cumsum(weight) - weight / 2) / weight.sum()
-        levels.append(np.interp(np.linspace(0, 1, LEVELS), share, means.ravel()[order]))
+        levels.append(np.interp(np.linspace(0, 1, QUANTILES_FITTED), share, means.ravel()[order]))
     return np.array(levels, np.float32)

@@ -18,9 +18,9 @@ from nextview.things.expected_views import RivalPictures
 from nextview.types import Float, Mask
 from nextview.viewers.exploration import Walk
 
-CELL = 11  # side of a cell of a map, pixels
+MAP_CELL = 11  # side of a cell of a map, pixels
 SHOWN_CLASSES = 5  # classes of which the belief is shown
-STYLE = f"""<style>
+CARD_STYLE = f"""<style>
 .nv {{ font: 13px sans-serif; color: {INK}; padding: 0.4em 0.8em 0.8em }}
 .nv h3 {{ margin: 0 0 0.1em; font-size: 20px }}
 .nv h3 small {{ color: {ACCENT}; font-size: 17px }}
@@ -40,7 +40,7 @@ def walk_card(walk: Walk) -> str:
     """The walk so far: image, maps and values, belief before and after, and every view."""
     if not walk.views:
         return (
-            f'{STYLE}<div class="nv"><p>No view was taken yet. The policy begins at view'
+            f'{CARD_STYLE}<div class="nv"><p>No view was taken yet. The policy begins at view'
             f" {walk.start}.</p></div>"
         )
 
@@ -63,7 +63,7 @@ def walk_card(walk: Walk) -> str:
         why = geometry_card(walk, walk.sphere.directions[at], f"view {at}")
     parts.append(why or rivals_card(walk))
     parts += [_maps(view), _steps(walk)]
-    return f'{STYLE}<div class="nv">{"".join(parts)}</div>'
+    return f'{CARD_STYLE}<div class="nv">{"".join(parts)}</div>'
 
 
 def _pose(walk: Walk) -> str:
@@ -96,12 +96,14 @@ def preview_card(observation: Observation, walk: Walk) -> str:
     nearest, _ = walk.sphere.nearest(direction)
     rivals = geometry_card(walk, direction, "this camera") or rivals_card(walk, nearest)
     parts = f"<h3>From here</h3>{_image(observation.picture, 200)}{rivals}"
-    return f'{STYLE}<div class="nv">{parts}</div>'
+    return f'{CARD_STYLE}<div class="nv">{parts}</div>'
 
 
 def class_card(label: str) -> str:
     """What the object is."""
-    return f'{STYLE}<div class="nv">Its class is <b>{escape(label)}</b>; no policy knows.</div>'
+    return (
+        f'{CARD_STYLE}<div class="nv">Its class is <b>{escape(label)}</b>; no policy knows.</div>'
+    )
 
 
 def warm(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -126,13 +128,13 @@ def _figures(walk: Walk, view: View) -> str:
     if view.values is not None and isinstance(walk.sphere, ViewSphere):
         grid = view.values.reshape(walk.sphere.rings, walk.sphere.azimuths)
         order = np.argsort(walk.sphere.elevations)[::-1]
-        found.append(("value of each view", _image(heat(grid[order]), CELL * grid.shape[1])))
+        found.append(("value of each view", _image(heat(grid[order]), MAP_CELL * grid.shape[1])))
     return _captioned(found)
 
 
 def _maps(view: View) -> str:
     found = [
-        (name, _image(heat(values[::-1]), CELL * values.shape[1]))
+        (name, _image(heat(values[::-1]), MAP_CELL * values.shape[1]))
         for name, values in view.maps.items()
     ]
     return f"<p>Maps of the views around this one:</p>{_captioned(found)}" if found else ""
@@ -208,7 +210,7 @@ def rivals_card(walk: Walk, view: int | None = None) -> str:
             np.argsort(walk.sphere.elevations)[::-1]
         ]
         both.append(
-            ("how much they differ from each view", _image(heat(grid), CELL * grid.shape[1]))
+            ("how much they differ from each view", _image(heat(grid), MAP_CELL * grid.shape[1]))
         )
 
     known = not np.isnan(differ[at])

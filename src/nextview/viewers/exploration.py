@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nextview.checks import whole
 from nextview.data.folders import list_dataset
-from nextview.data.samples import SAMPLES, sample_mesh
+from nextview.data.samples import SAMPLE_MESHES, sample_mesh
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.geometry.mesh import Mesh, load_mesh, make_mesh
@@ -80,7 +80,7 @@ def shown_objects(
         DatasetError: there is no object.
     """
     if path is None:
-        return tuple(ShownObject(name, partial(sample_mesh, name), name) for name in SAMPLES)
+        return tuple(ShownObject(name, partial(sample_mesh, name), name) for name in SAMPLE_MESHES)
     if not path.is_dir():
         return (ShownObject(path.stem, partial(load_mesh, path, up, unit)),)
     if (path / "zarr.json").exists():

@@ -30,10 +30,10 @@ with extras():
     from websockets.asyncio import server as websocket
 
 SAND = "#e9dfd0"  # at the foot of the background
-NOTHING = "nothing"
+NO_ANSWER = "nothing"
 CLEAN = "clean renders"
 APART = 8.5  # between two objects side by side, object radii
-LAMP = (-4.0, -5.0, 8.0)  # where it hangs
+LAMP_PLACE = (-4.0, -5.0, 8.0)  # where it hangs
 PAUSE = 0.5  # between the views of a policy that walks, seconds: long enough to see each
 HELP = """Click a **ball** to look from there, or drag the **arrows**. The large **red** ball is where the policy would
 look next. Yellow views promise most, violet ones least; small dark ones are done."""
@@ -68,7 +68,7 @@ class Page:
             "/sky", sky_color=rgb(PAPER), ground_color=rgb(GROUND), intensity=3.0
         )
         scene.add_light_directional(
-            "/lamp", color=rgb(GROUND), intensity=2.0, cast_shadow=True, position=LAMP
+            "/lamp", color=rgb(GROUND), intensity=2.0, cast_shadow=True, position=LAMP_PLACE
         )
         self._controls(gui)
         self._rebuild()
@@ -88,9 +88,9 @@ class Page:
         policies = list(
             dict.fromkeys([*exploration.policies, *bundled_policies(), *policy_names(), *by_map])
         )
-        self._policies = [NOTHING, *policies]
+        self._policies = [NO_ANSWER, *policies]
         self._sensors = [CLEAN, *SENSORS, "mix"]
-        second = exploration.policies[1] if len(exploration.policies) > 1 else NOTHING
+        second = exploration.policies[1] if len(exploration.policies) > 1 else NO_ANSWER
         gui.main_panel.dock_left()
         gui.add_markdown(HELP)
         self._object = gui.add_dropdown(
@@ -159,7 +159,7 @@ class Page:
         self._sensor.value = name
         self._strength.value = float(strength or self._strength.value)
         self._policy.value, *second = exploration.policies
-        self._second.value = second[0] if second else NOTHING
+        self._second.value = second[0] if second else NO_ANSWER
 
     def _show_object(self) -> None:
         name = _listed(self._object.value, self.exploration.objects)
@@ -169,7 +169,7 @@ class Page:
         first = _listed(self._policy.value, self._policies[1:])
         second = _listed(self._second.value, self._policies)
         self._changed(
-            lambda: self.exploration.compare([first] if second == NOTHING else [first, second])
+            lambda: self.exploration.compare([first] if second == NO_ANSWER else [first, second])
         )
 
     def _use_sensor(self) -> None:
