@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 
 import nextview
 from nextview.cli.exit_status import orderly_end
-from nextview.geometry.ray_caster import RayCaster, pixel_rays
+from nextview.geometry.pinhole import PinholeCamera
+from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.sensing import Frame
 
@@ -70,7 +71,7 @@ class Robot:
 
     def look(self, pose: np.ndarray) -> Frame:
         """What the camera sees from a pose in the world, (4, 4), OpenCV axes, metres."""
-        rays = pixel_rays(INTRINSICS, SHAPE).reshape(-1, 3) @ pose[:3, :3].T
+        rays = PinholeCamera.of(INTRINSICS, SHAPE).rays.reshape(-1, 3) @ pose[:3, :3].T
         depth, _ = self.caster.cast(pose[:3, 3], rays.astype(np.float32))
         depth = np.where(np.isfinite(depth), depth, 0).reshape(SHAPE)
         depth += NOISE * depth**2 * self.rng.normal(size=SHAPE)

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from nextview.errors import ObservationError
 from nextview.geometry.mesh import Mesh
-from nextview.geometry.ray_caster import RayCaster, Triangles, pixel_rays
+from nextview.geometry.pinhole import PinholeCamera
+from nextview.geometry.ray_caster import RayCaster, Triangles
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS, Sensor
@@ -318,7 +319,7 @@ class Arm:
     def look(self) -> Frame:
         """What the camera on the wrist gives."""
         pose, (height, width), k = self.pose, self.sensor.shape, self.sensor.intrinsics
-        rays = pixel_rays(k, (height, width)).reshape(-1, 3) @ pose[:3, :3].T
+        rays = PinholeCamera.of(k, (height, width)).rays.reshape(-1, 3) @ pose[:3, :3].T
         depth, _ = RayCaster([triangles for triangles, _ in self.things()]).cast(pose[:3, 3], rays)
         depth = np.where(depth < self.sensor.farthest, depth, 0).astype(np.float32)
         measured, _ = self.sensor.measure(depth.reshape(height, width), self._rng)

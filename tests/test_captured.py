@@ -22,7 +22,8 @@ from nextview.captured.writing import write_capture
 from nextview.cli.main import main
 from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError
-from nextview.geometry.ray_caster import RayCaster, pixel_rays
+from nextview.geometry.pinhole import PinholeCamera
+from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.simulation.scene import square
 from nextview.teaching.learn import learn
@@ -225,7 +226,7 @@ def seen(count=9, moved=0.0, turned=0.0, evenly=False, thing=None):
         mesh = sample_mesh("chair")
         thing = 0.3 * (mesh.vertices - [0, 0, mesh.vertices[:, 2].min()]), mesh.faces
     caster = RayCaster([thing, square(0.6, 0.0)])
-    rays = pixel_rays(SMALL_K, (120, 160)).reshape(-1, 3)
+    rays = PinholeCamera.of(SMALL_K, (120, 160)).rays.reshape(-1, 3)
     if evenly:
         elevation = np.full(count, np.radians(35))
         azimuth = 2 * np.pi * np.arange(count) / count

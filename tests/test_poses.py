@@ -20,7 +20,8 @@ import nextview
 from nextview.cli.main import main
 from nextview.errors import ModelError, SessionError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh
-from nextview.geometry.ray_caster import RayCaster, pixel_rays
+from nextview.geometry.pinhole import PinholeCamera
+from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.resting import rotated
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.recognition.belief import FixedLength
@@ -375,7 +376,10 @@ def test_the_outline_of_the_scan_is_that_of_what_was_seen(system, meshes, tmp_pa
     result = system.recognise(meshes["mug"], start=12)
     vertices, faces = result.posed_surface
     seen = result.views[0].observation
-    rays = pixel_rays(seen.intrinsics, seen.depth.shape).reshape(-1, 3) @ seen.pose[:3, :3].T
+    rays = (
+        PinholeCamera.of(seen.intrinsics, seen.depth.shape).rays.reshape(-1, 3)
+        @ seen.pose[:3, :3].T
+    )
     depth, _ = RayCaster([(vertices, faces)]).cast(seen.pose[:3, 3], rays)
     shown = np.isfinite(depth).reshape(seen.depth.shape)
     assert (shown & (seen.depth > 0)).sum() > 0.95 * (shown | (seen.depth > 0)).sum()

@@ -12,7 +12,8 @@ import nextview
 from nextview.captured.turntable import read_turntable
 from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError
-from nextview.geometry.ray_caster import RayCaster, pixel_rays
+from nextview.geometry.pinhole import PinholeCamera
+from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.scene import square
 from nextview.teaching.learn import learn
@@ -32,7 +33,9 @@ def write_frames(folder, angles):
     mesh = sample_mesh("chair")
     vertices = RADIUS * (mesh.vertices + np.array([0.2, -0.1, -mesh.vertices[:, 2].min()]))
     rays = (
-        pixel_rays(K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), SHAPE).reshape(-1, 3)
+        PinholeCamera.of(K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), SHAPE).rays.reshape(
+            -1, 3
+        )
         @ POSE[:3, :3].T
     )
     for i, angle in enumerate(angles):

@@ -12,9 +12,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from nextview.captured.frames import MILLIMETRES, pinhole_of
+from nextview.captured.frames import MILLIMETRES
 from nextview.errors import DatasetError
 from nextview.files import regular_file
+from nextview.geometry.pinhole import pinhole_matrix
 from nextview.types import Float
 
 LARGEST_FILE = 2**20  # bytes
@@ -116,7 +117,7 @@ def _intrinsics(camera: Mapping[str, Any]) -> Float:
         by_columns = not matrix[:2, 2].any() and matrix[2, :2].any()
         return matrix.T if by_columns else matrix
     cx, cy = next(names for names in PRINCIPAL_POINTS if names[0] in camera)
-    return pinhole_of(*(float(camera[name]) for name in ("fx", "fy", cx, cy)))
+    return pinhole_matrix(*(float(camera[name]) for name in ("fx", "fy", cx, cy)))
 
 
 def _numbers(values: Any) -> Any:

@@ -26,7 +26,6 @@ from nextview.captured.frames import (
     LayoutViews,
     lines_of,
     numbers_of,
-    pinhole_of,
     read_table,
     rigid,
 )
@@ -34,6 +33,7 @@ from nextview.checks import number
 from nextview.errors import DatasetError, UsageError
 from nextview.files import read_record
 from nextview.geometry.mesh import FORMATS
+from nextview.geometry.pinhole import pinhole_matrix
 from nextview.sensing.object_frame import Box
 from nextview.types import Float
 
@@ -206,7 +206,7 @@ def _check_links(folder: Path) -> None:
 def _given_intrinsics(path: Path, given: Intrinsics) -> tuple[Float | None, list[str]]:
     """The pinhole matrix that was given or lies in the folder, if any, and a note of it."""
     if isinstance(given, tuple):
-        return pinhole_of(*given), ["intrinsics as given"]
+        return pinhole_matrix(*given), ["intrinsics as given"]
     file = path / INTRINSICS if given is None else Path(given)
     if given is None and not (path.is_dir() and file.exists()):
         return None, []
@@ -398,7 +398,7 @@ def _read_seven_scenes(folder: Path, intrinsics: Float | None, _: Reading) -> La
     """
     notes = []
     if intrinsics is None:
-        intrinsics = pinhole_of(*KINECT)
+        intrinsics = pinhole_matrix(*KINECT)
         notes.append(
             "there is no camera-intrinsics.txt: the Kinect's fx = fy = 585, cx = 320, cy = 240 are"
             " assumed"

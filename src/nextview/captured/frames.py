@@ -177,21 +177,6 @@ class Capture:
         return "; ".join([f"{self.folder}: {self.layout} layout, {count}", *self.notes])
 
 
-def pinhole_of(fx: float, fy: float, cx: float, cy: float) -> Float:
-    """Return the pinhole matrix of focal lengths and a principal point.
-
-    Args:
-        fx: focal length along the rows, pixels.
-        fy: focal length along the columns, pixels.
-        cx: column of the principal point, pixels.
-        cy: row of the principal point, pixels.
-
-    Returns:
-        Matrix, (3, 3) float64.
-    """
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-
-
 def rigid(pose: ArrayLike, where: str) -> Float:
     """Check and copy a rigid pose.
 

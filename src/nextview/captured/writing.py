@@ -8,18 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from nextview.captured.frames import NO_DEPTH, pinhole_of
+from nextview.captured.frames import NO_DEPTH
 from nextview.checks import number
 from nextview.errors import ResultsError, UsageError
 from nextview.files import new_folder
 from nextview.geometry.mesh import Mesh
-from nextview.geometry.ray_caster import RayCaster, pixel_rays
+from nextview.geometry.pinhole import PinholeCamera, pinhole_matrix
+from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.viewsphere import CAMERA_DISTANCE, ViewSphere, look_at_origin
 from nextview.simulation.scene import square
 from nextview.types import Float32
 
 # a Kinect's as ROS has it by default; first pixel's centre at 0
-PINHOLE = pinhole_of(525.0, 525.0, 319.5, 239.5)
+PINHOLE = pinhole_matrix(525.0, 525.0, 319.5, 239.5)
 SHAPE = 480, 640
 TABLE_HALF_SIDE = 2.0  # half the side of the table, object radii
 DEPTH_STEP = 0.0001  # metres that one step of the depth images stands for
@@ -64,7 +65,7 @@ def write_capture(
     vertices = radius * mesh.vertices + np.array([0, 0, height])
     things = [(vertices, mesh.faces)] + [square(TABLE_HALF_SIDE * radius, 0.0)] * table
     caster = RayCaster(things)
-    rays = pixel_rays(pinhole_of(525.0, 525.0, 320.0, 240.0), SHAPE).reshape(-1, 3)
+    rays = PinholeCamera.of(pinhole_matrix(525.0, 525.0, 320.0, 240.0), SHAPE).rays.reshape(-1, 3)
     # The box has an inside, even that of a flat mesh.
     low = vertices.min(0) - 1e-6 * radius
     high = vertices.max(0) + 1e-6 * radius

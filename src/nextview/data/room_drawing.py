@@ -22,7 +22,8 @@ from nextview.data.store import writing
 from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.files import check_new
 from nextview.geometry.mesh import MAX_FACES, Mesh, load_mesh
-from nextview.geometry.ray_caster import RayCaster, pixel_rays
+from nextview.geometry.pinhole import PinholeCamera
+from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.resting import resting_poses
 from nextview.geometry.viewsphere import level_pose, rotation_z
 from nextview.simulation.room import Room, at_rest, build_room
@@ -615,8 +616,8 @@ def _first_view(room: Room, rng: np.random.Generator) -> Float | None:
 def _shown(room: Room, pose: Float) -> float:
     """Share of the target's picture from a pose that lies in it and that nothing hides."""
     focal = PREVIEW_SIDE / 2 / FIELD
-    intrinsics = np.array([[focal, 0, PREVIEW_SIDE / 2], [0, focal, PREVIEW_SIDE / 2], [0, 0, 1.0]])
-    rays = pixel_rays(intrinsics, (PREVIEW_SIDE, PREVIEW_SIDE)).reshape(-1, 3) @ pose[:3, :3].T
+    camera = PinholeCamera.centred(focal, (PREVIEW_SIDE, PREVIEW_SIDE))
+    rays = camera.rays.reshape(-1, 3) @ pose[:3, :3].T
     alone, _ = RayCaster(room.things[:1]).cast(pose[:3, 3], rays.astype(np.float32))
     _, which = room.caster.cast(pose[:3, 3], rays.astype(np.float32))
     whole_picture = np.isfinite(alone).sum()

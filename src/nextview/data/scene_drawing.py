@@ -18,6 +18,7 @@ from nextview.data.store import writing
 from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.files import check_new
 from nextview.geometry.mesh import Mesh
+from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.simulation.scene import (
@@ -297,10 +298,7 @@ class _Hiding:
         for view, pose in enumerate(SCENE_VIEWS.poses):
             seen = camera.observe(pose)
             rows, columns = np.nonzero(seen.depth)
-            (fx, _, cx), (_, fy, cy) = seen.intrinsics[:2]
-            ahead = np.stack(
-                [(columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy, np.ones(len(rows))], 1
-            )
+            ahead = PinholeCamera.of(seen.intrinsics, seen.depth.shape).rays_through(rows, columns)
             rays.append(seen.depth[rows, columns, None] * ahead @ pose[:3, :3].T)
             eyes.append(np.broadcast_to(pose[:3, 3], rays[-1].shape))
             views.append(np.full(len(rows), view))

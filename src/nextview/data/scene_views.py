@@ -12,6 +12,7 @@ from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.geometry.observation import SceneView
+from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.sensing.expected_visibility import (
     VISIBILITY_GRID,
@@ -44,7 +45,7 @@ def scene_intrinsics(distance: float, side: int = SCENE_SIDE) -> Float:
         Matrix, (3, 3) float64, pixels; the centre of the first pixel is at 0.5.
     """
     focal = side / 2 * distance / HALF
-    return np.array([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1.0]])
+    return PinholeCamera.centred(focal, (side, side)).matrix
 
 
 def render_scene(scene: Scene, sphere: ViewSphere) -> dict[str, NDArray]:

@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.geometry.pinhole import PinholeCamera
 from nextview.types import Float, Float32, Floats
 
 # object radii; what is farther is no object: depth cameras have large numbers for "nothing"
@@ -56,13 +57,12 @@ def headlight(depth: Float32, intrinsics: Float) -> NDArray[np.uint8]:
     Returns:
         Brightness, (H, W) uint8: the cosine between the ray and the surface normal.
     """
-    height, width = depth.shape
+    camera = PinholeCamera.of(intrinsics, depth.shape)
     padded = np.pad(depth, 1)
-    (fx, _, cx), (_, fy, cy) = intrinsics[:2]
-    across = fx * slope(padded[1:-1, :-2], depth, padded[1:-1, 2:])
-    down = fy * slope(padded[:-2, 1:-1], depth, padded[2:, 1:-1])
-    x = (np.arange(width) + 0.5 - cx) / fx
-    y = ((np.arange(height) + 0.5 - cy) / fy)[:, None]
+    across = camera.fx * slope(padded[1:-1, :-2], depth, padded[1:-1, 2:])
+    down = camera.fy * slope(padded[:-2, 1:-1], depth, padded[2:, 1:-1])
+    x, y = camera.image_slopes
+    y = y[:, None]
     # The surface is P = (x z, y z, z); the cross product of its derivatives, scaled:
     length = np.sqrt(across**2 + down**2 + (depth + x * across + y * down) ** 2)
     cosine = depth / (length * np.sqrt(x**2 + y**2 + 1) + 1e-30)
@@ -115,6 +115,5 @@ def visible_points(
         return np.zeros((CLOUD_POINTS, 3), np.float32)
     chosen = np.resize(chosen, CLOUD_POINTS)
     rows, columns = np.divmod(chosen, depth.shape[1])
-    (fx, _, cx), (_, fy, cy) = intrinsics[:2]
-    rays = np.stack([(columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy, np.ones(CLOUD_POINTS)], -1)
+    rays = PinholeCamera.of(intrinsics, depth.shape).rays_through(rows, columns)
     return ((rays * flat[chosen, None]) @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from nextview.checks import number, one_line
 from nextview.errors import ObservationError
 from nextview.geometry.depth import FARTHEST_SURFACE, headlight, object_depth, visible_points
+from nextview.geometry.pinhole import PinholeCamera
 from nextview.types import Float, Float32, Mask
 
 LEAST_VISIBLE_SHARE = 0.006
@@ -349,4 +350,4 @@ def pinhole(size: int, distance: float) -> Float:
         )
     # size/2 over the tangent of the half angle asin(1/distance)
     focal = size / 2 * np.sqrt(distance**2 - 1)
-    return np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
+    return PinholeCamera.centred(focal, (size, size)).matrix

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.types import Float, Float32, Floats, Index
+from nextview.types import Float32, Floats, Index
 
 Triangles = tuple[Floats, NDArray[np.int32]]  # vertices, (N, 3), and faces, (F, 3)
 
@@ -45,20 +45,3 @@ class RayCaster:
         return np.where(hit, hits["tfar"], np.float32(np.inf)), np.where(
             hit, hits["geomID"].astype(np.int64), -1
         )
-
-
-def pixel_rays(intrinsics: Float, shape: tuple[int, int]) -> Float32:
-    """Return the rays through the pixels of a pinhole camera.
-
-    Args:
-        intrinsics: pinhole matrix, (3, 3), pixels.
-        shape: rows and columns of the image.
-
-    Returns:
-        Rays, (H, W, 3) float32, camera frame, with z = 1, so that multiples of a ray are depths.
-    """
-    height, width = shape
-    fx, _, cx = intrinsics[0]
-    _, fy, cy = intrinsics[1]
-    x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
-    return np.stack([x, y, np.ones_like(x)], -1).astype(np.float32)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.facets import ROWS_MEASURED, Noise, estimate_noise
 from nextview.sensing.frame import Frame
 from nextview.sensing.segmentation import find_plane, sample
@@ -220,11 +221,11 @@ def compare(
 def _looked_up(picture: Picture, points: Float, tolerance: Float) -> tuple[Index, Mask, Mask]:
     """Return which points, (P, 3), lie in a picture, and are confirmed or contradicted."""
     height, width = picture.nearest.shape
-    k = picture.intrinsics
     ahead = points[:, 2] > LEAST_DEPTH
     z = np.where(ahead, points[:, 2], 1.0)
-    column = np.floor(np.clip(points[:, 0] / z * k[0, 0] + k[0, 2], -1, width)).astype(np.int64)
-    row = np.floor(np.clip(points[:, 1] / z * k[1, 1] + k[1, 2], -1, height)).astype(np.int64)
+    camera = PinholeCamera.of(picture.intrinsics, (height, width))
+    at = camera.project(np.column_stack([points[:, :2], z]))
+    column, row = np.floor(np.clip(at, -1, (width, height))).astype(np.int64).T
 
     # At the border a small error of the pose leads out of the picture.
     inside = ahead & (row >= 1) & (row < height - 1) & (column >= 1) & (column < width - 1)

@@ -229,9 +229,8 @@ class _Surface:
     def _looks_past(self, rays: Float, z: Float) -> Mask:
         """Where the frame measured something behind points with these rays, (N, 2), and depths."""
         frame = self.sighting.frame
-        k = frame.intrinsics
-        column = np.floor(rays[:, 0] * k[0, 0] + k[0, 2]).astype(int)
-        row = np.floor(rays[:, 1] * k[1, 1] + k[1, 2]).astype(int)
+        at = frame.camera.project(np.column_stack([rays, np.ones(len(rays))]))
+        column, row = np.floor(at).astype(int).T
         height, width = frame.shape
         inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
         depth = frame.depth[np.where(inside, row, 0), np.where(inside, column, 0)]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.geometry.observation import pinhole
+from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.types import Float, Float32, Floats, Index, Mask
 
@@ -197,7 +198,8 @@ def fit_facets(
     Returns:
         The facets.
     """
-    focal = intrinsics[[0, 1], [0, 1]]
+    camera = PinholeCamera.of(intrinsics, depth.shape)
+    focal = np.array([camera.fx, camera.fy])
     h, w = depth.shape
     usable = mask & (depth > 0)
     noise = 0.0
@@ -213,8 +215,7 @@ def fit_facets(
     if not usable.any():
         none = np.zeros(0, np.int64)
         return Facets(np.zeros((0, 3)), np.zeros((0, 3)), none, none, coarse / focal)
-    x = (corner[1] + np.arange(w) + 0.5 - intrinsics[0, 2]) / focal[0]
-    y = (corner[0] + np.arange(h) + 0.5 - intrinsics[1, 2]) / focal[1]
+    x, y = camera.slopes(corner[0] + np.arange(h), corner[1] + np.arange(w))
     inverse = np.where(usable, 1 / np.where(usable, depth, 1), 0).astype(np.float64)
     weight = usable.astype(np.float64)
     middle = np.array([x.mean(), y.mean(), inverse.sum() / weight.sum()])

@@ -10,6 +10,7 @@ from scipy import ndimage
 from nextview.checks import one_line
 from nextview.errors import ObservationError
 from nextview.geometry.observation import LARGEST_ENTRY, array_of, numbers
+from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.holes import fill_regular_gaps, filled_mask
 from nextview.types import Float, Float32, Floats, Index, Mask
 
@@ -129,6 +130,11 @@ class Frame:
         return other
 
     @property
+    def camera(self) -> PinholeCamera:
+        """The pinhole camera that took the frame."""
+        return PinholeCamera.of(self.intrinsics, self.shape)
+
+    @property
     def camera_to_world(self) -> Float:
         """The pose, or the identity if there is none."""
         return np.eye(4) if self.pose is None else self.pose
@@ -136,10 +142,7 @@ class Frame:
     @property
     def rays(self) -> tuple[Float32, Float32]:
         """x and y of the rays (x, y, 1) through the columns (W,) and the rows (H,), float32."""
-        k = self.intrinsics
-        height, width = self.shape
-        x = (np.arange(width) + 0.5 - k[0, 2]) / k[0, 0]
-        y = (np.arange(height) + 0.5 - k[1, 2]) / k[1, 1]
+        x, y = self.camera.image_slopes
         return x.astype(np.float32), y.astype(np.float32)
 
     def positions(self, rows: Index, columns: Index) -> Float:

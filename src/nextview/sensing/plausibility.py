@@ -6,6 +6,7 @@ import numpy as np
 
 from nextview.errors import ObservationError
 from nextview.geometry.observation import Observation
+from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.displacement import Displacement
 from nextview.sensing.frame import CAMERA_AXES, Frame
 from nextview.sensing.lean import Lean
@@ -192,14 +193,13 @@ def refuse_depth_scale(
 def _times_behind(frame: Frame, target: Float, radius: float) -> float:
     """How many times too large the depth is if all that is seen lies behind a target; else 0."""
     pose = frame.camera_to_world
-    x, y, z = pose[:3, :3].T @ (target - pose[:3, 3])
+    in_camera = pose[:3, :3].T @ (target - pose[:3, 3])
+    z = in_camera[2]
     if z <= 0:
         return 0.0
 
-    k = frame.intrinsics
     height, width = frame.shape
-    column = int(k[0, 0] * x / z + k[0, 2])
-    row = int(k[1, 1] * y / z + k[1, 2])
+    column, row = frame.camera.project(in_camera[None])[0].astype(int).tolist()
     if not (0 <= column < width and 0 <= row < height):
         return 0.0
 
@@ -408,11 +408,9 @@ def _surface(observation: Observation, seen: Index) -> Float:
     rows, columns = np.divmod(
         seen[:: max(1, len(seen) // PIXELS_SAMPLED)], observation.depth.shape[1]
     )
-    k = observation.intrinsics
+    camera = PinholeCamera.of(observation.intrinsics, observation.depth.shape)
     z = observation.depth[rows, columns].astype(np.float64)
-    return np.stack(
-        [(columns + 0.5 - k[0, 2]) / k[0, 0] * z, (rows + 0.5 - k[1, 2]) / k[1, 1] * z, z], 1
-    )
+    return camera.rays_through(rows, columns) * z[:, None]
 
 
 def _reach(points: Float, pose: Float) -> float:
@@ -522,7 +520,7 @@ def _seen_through(first: Observation, second: Observation) -> float:
         return 1.0
 
     height, width = depth.shape
-    at = points[:, :2] / points[:, 2:] * k[[0, 1], [0, 1]] + k[:2, 2]
+    at = PinholeCamera.of(k, depth.shape).project(points)
     column, row = np.floor(at).astype(np.int64).T
     margin = max(2, width // 50) if scene is None else 2  # what the object frame may be off
     inside = (

@@ -17,7 +17,8 @@ from scipy.ndimage import label
 
 from nextview.errors import UsageError
 from nextview.files import new_file
-from nextview.geometry.ray_caster import RayCaster, Triangles, pixel_rays
+from nextview.geometry.pinhole import PinholeCamera
+from nextview.geometry.ray_caster import RayCaster, Triangles
 from nextview.geometry.viewsphere import Viewpoints, ViewSphere, great_circle, look_at_origin
 from nextview.recognition.belief import Stopping
 from nextview.session.soft_light import SoftLight
@@ -208,7 +209,7 @@ def _draw_outline(axis: Axes, view: View, caster: RayCaster, displacement: Float
     height, width = axis.get_images()[0].get_size()
     shape = (int(height), int(width))
     times = shape[0] / seen.depth.shape[0]
-    rays = pixel_rays(seen.intrinsics * [[times], [times], [1]], shape).reshape(-1, 3)
+    rays = PinholeCamera.of(seen.intrinsics * [[times], [times], [1]], shape).rays.reshape(-1, 3)
 
     along = rays @ seen.pose[:3, :3].T.astype(np.float32)
     # Seen from a camera that is displaced the other way, the surface itself is where it should be.
@@ -368,8 +369,10 @@ def _draw_path(
     shape = round(130 * high), round(130 * wide)
     pose = look_at_origin(np.radians(25), seen_from, FIGURE_DISTANCE)
     focal = 0.5 * FIGURE_DISTANCE / 1.5 * min(shape)
-    intrinsics = np.array([[focal, 0, shape[1] / 2], [0, focal, 0.56 * shape[0]], [0, 0, 1.0]])
-    pixels, far = light.picture(light.surfaces, pose, intrinsics, shape)
+    camera = PinholeCamera(
+        focal, focal, shape[1] / 2, 0.56 * shape[0], width=shape[1], height=shape[0]
+    )
+    pixels, far = light.picture(light.surfaces, pose, camera.matrix, shape)
     axis.imshow(pixels, interpolation="antialiased", aspect="auto")
 
     def place(points: Float) -> tuple[Float, Float]:
@@ -378,7 +381,7 @@ def _draw_path(
         It is lower behind the object and at the back.
         """
         inside = (DOME * points - pose[:3, 3]) @ pose[:3, :3]
-        flat = inside[:, :2] / inside[:, 2:] * focal + intrinsics[:2, 2]
+        flat = camera.project(inside)
         row, column = np.clip(flat[:, ::-1].astype(int), 0, np.array(shape) - 1).T
         return flat, np.where(
             far[row, column] < inside[:, 2], 0.15, np.where(points @ pose[:3, 3] < 0, 0.45, 1.0)

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates, median_filter
 
 from nextview.geometry.observation import Observation
-from nextview.geometry.ray_caster import RayCaster, Triangles, embree_scene, pixel_rays
+from nextview.geometry.pinhole import PinholeCamera
+from nextview.geometry.ray_caster import RayCaster, Triangles, embree_scene
 from nextview.session.style import GROUND, WOOD, rgb
 from nextview.types import Floats
 
@@ -24,7 +25,7 @@ LAMP_DIRECTION = np.array([-0.45, -0.75, -0.8])
 def surface(seen: Observation) -> Triangles:
     """A depth image as triangles, object frame."""
     depth = seen.depth if seen.exact else np.where(seen.depth > 0, median_filter(seen.depth, 5), 0)
-    points = (pixel_rays(seen.intrinsics, depth.shape) * depth[..., None]).reshape(-1, 3)
+    points = (PinholeCamera.of(seen.intrinsics, depth.shape).rays * depth[..., None]).reshape(-1, 3)
     k = np.arange(depth.size).reshape(depth.shape)
     a, b, c, d = (part.ravel() for part in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]))
     faces = np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)])
@@ -94,7 +95,10 @@ class SoftLight:
         Returns:
             The picture, (H, W, 3) uint8, and the distance along each pixel's ray, (H, W).
         """
-        rays = pixel_rays(np.asarray(intrinsics, np.float64), shape).reshape(-1, 3) @ pose[:3, :3].T
+        rays = (
+            PinholeCamera.of(np.asarray(intrinsics, np.float64), shape).rays.reshape(-1, 3)
+            @ pose[:3, :3].T
+        )
         origins = np.tile(pose[:3, 3], (len(rays), 1)).astype(np.float32)
         hits = embree_scene(surfaces).run(origins, rays.astype(np.float32), output=1)
         hit = hits["primID"] >= 0

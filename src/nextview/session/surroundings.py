@@ -128,11 +128,10 @@ class Surroundings:
         NaN where nothing is measured.
         """
         height, width = self.frame.shape
-        k = self.frame.intrinsics
         ahead = seen_at[:, 2] > 1e-6
         z = np.where(ahead, seen_at[:, 2], 1)
-        column = np.floor(seen_at[:, 0] / z * k[0, 0] + k[0, 2])
-        row = np.floor(seen_at[:, 1] / z * k[1, 1] + k[1, 2])
+        at = self.frame.camera.project(np.column_stack([seen_at[:, :2], z]))
+        column, row = np.floor(at).T
         inside = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
 
         around = np.arange(-SIGHT_WINDOW, SIGHT_WINDOW + 1)

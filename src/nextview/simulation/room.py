@@ -9,7 +9,8 @@ import numpy as np
 
 from nextview.errors import DatasetError, MeshError
 from nextview.geometry.mesh import MAX_FACES
-from nextview.geometry.ray_caster import RayCaster, Triangles, pixel_rays
+from nextview.geometry.pinhole import PinholeCamera
+from nextview.geometry.ray_caster import RayCaster, Triangles
 from nextview.geometry.viewsphere import rotation_z
 from nextview.sensing import Frame
 from nextview.simulation.room_layout import RoomLayout, Slab, Standing
@@ -218,7 +219,7 @@ class RoomCamera:
         self.room = room
         self.sensor = sensor
         self.seed = seed
-        self._rays = pixel_rays(sensor.intrinsics, sensor.shape).reshape(-1, 3)
+        self._rays = PinholeCamera.of(sensor.intrinsics, sensor.shape).rays.reshape(-1, 3)
 
     def look(self, pose: Float) -> tuple[Frame, Mask]:
         """Look from a camera-to-world pose, (4, 4), OpenCV's axes.

@@ -14,6 +14,7 @@ from scipy.special import ndtr
 from nextview.checks import number, whole
 from nextview.errors import UsageError
 from nextview.geometry.observation import pinhole
+from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.sensing.frame import Part, within
 from nextview.types import Float, Float32, Floats, Index, Mask
@@ -145,9 +146,7 @@ class Sensor:
     @property
     def intrinsics(self) -> Float:
         """Pinhole matrix, (3, 3) float64, pixels; the first pixel's centre is at 0.5."""
-        return np.array(
-            [[self.focal, 0, self.width / 2], [0, self.focal, self.height / 2], [0, 0, 1.0]]
-        )
+        return PinholeCamera.centred(self.focal, self.shape).matrix
 
     def to_dict(self) -> dict[str, Any]:
         """Its name and all its numbers, for JSON."""
@@ -442,12 +441,12 @@ def incidence(q: Float, slope: tuple[Float, Float], intrinsics: Float) -> Float:
     Returns:
         Angles, (H, W), radians; 0 where there is nothing.
     """
-    (fx, _, cx), (_, fy, cy) = intrinsics[:2]
-    x = (np.arange(q.shape[1]) + 0.5 - cx) / fx
-    y = ((np.arange(q.shape[0]) + 0.5 - cy) / fy)[:, None]
+    camera = PinholeCamera.of(intrinsics, q.shape)
+    x, y = camera.image_slopes
+    y = y[:, None]
     # n = (a, b, c) with n . (x, y, 1) = q
-    a = slope[0] * fx
-    b = slope[1] * fy
+    a = slope[0] * camera.fx
+    b = slope[1] * camera.fy
     c = q - a * x - b * y
     length = np.sqrt((a * a + b * b + c * c) * (x * x + y * y + 1))
     return np.where(q > 0, np.arccos(np.clip(q / np.where(length > 0, length, 1), 0, 1)), 0.0)

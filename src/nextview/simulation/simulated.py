@@ -10,7 +10,8 @@ from nextview.checks import whole
 from nextview.geometry.depth import AMBIENT
 from nextview.geometry.mesh import Mesh
 from nextview.geometry.observation import Observation, checked_intrinsics, checked_pose, pinhole
-from nextview.geometry.ray_caster import RayCaster, embree_scene, pixel_rays
+from nextview.geometry.pinhole import PinholeCamera
+from nextview.geometry.ray_caster import RayCaster, embree_scene
 from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.types import Float, Float32, Mask
 
@@ -145,7 +146,7 @@ class OccludedCamera:
         self._others = RayCaster(
             [(mesh.vertices, mesh.faces) for mesh in (scene.table, scene.around) if mesh]
         )
-        self._rays = pixel_rays(pinhole(size, distance), (size, size))
+        self._rays = PinholeCamera.of(pinhole(size, distance), (size, size)).rays
 
     def observe(self, pose: Float) -> Observation:
         """Look from a camera-to-world pose, (4, 4), OpenCV axes, object frame, object radii."""
@@ -179,7 +180,7 @@ class SceneCamera:
     def __init__(self, scene: "Scene", intrinsics: Float, shape: tuple[int, int]) -> None:
         meshes = (scene.target, scene.table, scene.around)
         self._caster = RayCaster([(mesh.vertices, mesh.faces) for mesh in meshes if mesh])
-        self._rays = pixel_rays(checked_intrinsics(intrinsics, shape), shape)
+        self._rays = PinholeCamera.of(checked_intrinsics(intrinsics, shape), shape).rays
         self._owners = np.array([SHOWS_TARGET, SHOWS_TABLE, SHOWS_OTHER, SHOWS_NOTHING])
 
     def look(self, pose: Float) -> tuple[Float32, NDArray[np.uint8]]:

@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from nextview.errors import ObservationError, UsageError
 from nextview.geometry.mesh import UNITS, Mesh
-from nextview.geometry.ray_caster import RayCaster, Triangles, pixel_rays
+from nextview.geometry.pinhole import PinholeCamera
+from nextview.geometry.ray_caster import RayCaster, Triangles
 from nextview.geometry.resting import resting_poses
 from nextview.geometry.viewsphere import look_at_origin, rotation_z
 from nextview.sensing.frame import Frame
@@ -161,7 +162,7 @@ class TableCamera:
         self.lean[:3, :3] = Rotation.from_rotvec(angles, degrees=True).as_matrix()
         self._count = 0
         self.change(table)
-        self._rays = pixel_rays(sensor.intrinsics, sensor.shape).reshape(-1, 3)
+        self._rays = PinholeCamera.of(sensor.intrinsics, sensor.shape).rays.reshape(-1, 3)
 
     def change(self, table: SimulatedTable) -> None:
         """Put another table in the place of the one so far: somebody moved a thing."""

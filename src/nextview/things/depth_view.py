@@ -8,6 +8,7 @@ from scipy.ndimage import distance_transform_edt
 
 from nextview.errors import ObservationError
 from nextview.geometry.observation import Observation
+from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.facets import Noise, estimate_noise
 from nextview.things.ground import Ground, find_ground
 from nextview.types import Float, Float32, Index, Mask
@@ -175,9 +176,7 @@ class MetricImage:
 
     def _rays(self, rows: Index, columns: Index) -> Float:
         """Rays through some rows and columns of pixels, (rows * columns, 3), object frame."""
-        focal = self.intrinsics[[0, 1], [0, 1]]
-        x = (columns + 0.5 - self.intrinsics[0, 2]) / focal[0]
-        y = (rows + 0.5 - self.intrinsics[1, 2]) / focal[1]
+        x, y = PinholeCamera.of(self.intrinsics, self.depth.shape).slopes(rows, columns)
         ahead = np.ones((len(rows), len(columns)))
         return np.stack([*np.meshgrid(x, y), ahead], -1).reshape(-1, 3) @ self.pose[:3, :3].T
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.viewsphere import rotation_z
 from nextview.things.depth_view import THING, MetricImage
 from nextview.things.surface import SurfaceCaster
@@ -198,8 +199,8 @@ def seen(image: MetricImage) -> tuple[Pictures | None, Float]:
     outline, depth, size = found
 
     rows, columns = np.nonzero(shown)
-    x = (columns.mean() + 0.5 - image.intrinsics[0, 2]) / image.intrinsics[0, 0]
-    y = (rows.mean() + 0.5 - image.intrinsics[1, 2]) / image.intrinsics[1, 1]
+    camera = PinholeCamera.of(image.intrinsics, image.depth.shape)
+    x, y = camera.slopes(rows.mean(), columns.mean())
     ahead = np.array([x, y, 1.0]) / np.sqrt(x**2 + y**2 + 1)
     look = image.pose[:3, :3] @ _from_z_to(ahead)
     return Pictures(outline, depth, np.full(TURNS, size)), look
