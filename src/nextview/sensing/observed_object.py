@@ -22,6 +22,7 @@ from nextview.sensing.convex_pieces import STANDS, cut
 from nextview.sensing.displacement import Displacement, displacement
 from nextview.sensing.facets import (
     ROWS,
+    Facets,
     Index,
     Noise,
     estimate_noise,
@@ -759,15 +760,31 @@ class ObservedObject:
     def _observe(self, sighting: Sighting, latest: ObjectFrame) -> Observation:
         pose = latest.pose_in_object(sighting.frame.camera_to_world)
         depth, facet = look_again(sighting.facets, pose, latest.radius, SIZE)
-        image = sighting.frame.image
-        facets = sighting.facets
-        if image is not None and not len(facets.rows):
-            image = np.zeros((SIZE, SIZE, 3), image.dtype)
-        elif image is not None:
-            image = np.where(facet >= 0, image[facets.rows[facet], facets.columns[facet]], 0)
+        image = _resampled(sighting.frame.image, sighting.facets, facet)
+        colour = _resampled(sighting.frame.colour, sighting.facets, facet)
         radius = latest.radius if self.life_size else None
         scene = _scene(sighting, pose, latest.radius)
-        return Observation(depth, virtual_pose(pose), pinhole(SIZE, DISTANCE), radius, image, scene)
+        return Observation(
+            depth,
+            virtual_pose(pose),
+            pinhole(SIZE, DISTANCE),
+            radius,
+            image,
+            scene,
+            colour=colour,
+        )
+
+
+def _resampled(
+    picture: NDArray[np.uint8] | None, facets: Facets, facet: NDArray[np.int64]
+) -> NDArray[np.uint8] | None:
+    """The picture of a frame, (H, W) or (H, W, 3), at the facets that a camera sees, (S, S)."""
+    if picture is None:
+        return None
+    shown = np.zeros((*facet.shape, *picture.shape[2:]), np.uint8)
+    hit = facet >= 0
+    shown[hit] = picture[facets.rows[facet[hit]], facets.columns[facet[hit]]]
+    return shown
 
 
 def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
