@@ -9,9 +9,9 @@ same ten things as Monty.
 
 Prints for both the share that is named right, by Monty's own count (its best hypothesis where it
 ran out of steps), the steps or frames, the seconds of an episode, and the error of the rotation of
-what is named right: Monty's as it tells it, modulo the symmetries that it found; nextview's modulo
-those that are on its card. Monty's seconds are those of its learning module and of the rendering
-between its steps; nextview's are of CPU, from the frames to the decision.
+what is named right, modulo the symmetries that are on nextview's card. Monty's seconds are those of
+its learning module and of the rendering between its steps; nextview's are of CPU, from the frames
+to the decision.
 """
 
 from __future__ import annotations
@@ -28,7 +28,15 @@ from numpy.typing import NDArray
 from rich.progress import track
 from scipy.spatial.transform import Rotation
 
-from benchmarks.verified_things import Outcome, Setting, Taught, judged, median_and_most, shown
+from benchmarks.verified_things import (
+    Outcome,
+    Setting,
+    Taught,
+    judged,
+    median_and_most,
+    rotation_error,
+    shown,
+)
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import UsageError
 
@@ -49,7 +57,7 @@ class Episode:
         right: whether Monty named it right.
         steps: that it took.
         seconds: that it took.
-        rotation: error of its pose, degrees; None where it was not named right.
+        found: the rotation that it found, of the thing that it named, (3, 3) float64.
     """
 
     name: str
@@ -57,7 +65,7 @@ class Episode:
     right: bool
     steps: int
     seconds: float
-    rotation: float | None
+    found: NDArray[np.float64]
 
 
 def episodes_of(work: Path, things: str) -> list[Episode]:
@@ -73,23 +81,26 @@ def episodes_of(work: Path, things: str) -> list[Episode]:
     files = sorted((work / TESTED / things).rglob(EPISODES))
     if not files:
         raise UsageError(f"{work}: Monty was not tested with the {things} things")
-    with files[-1].open(newline="") as lines:
-        return [episode_of(row) for row in csv.DictReader(lines)]
+    episodes = []
+    for file in files:
+        with file.open(newline="") as lines:
+            episodes += [episode_of(row) for row in csv.DictReader(lines)]
+    return episodes
 
 
 def episode_of(row: dict[str, str]) -> Episode:
     """An episode as Monty writes it."""
-    right = row["primary_performance"] in RIGHT
     scalar_first = np.array(row["primary_target_rotation_quat"].strip("[]").split(), float)
     turn = Rotation.from_quat(scalar_first, scalar_first=True).as_matrix()
-    error = row["rotation_error"]
+    angles = np.array(row["most_likely_rotation"].strip("[]").split(), float)
+    found = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
     return Episode(
         row["primary_target_object"],
         Z_UP @ turn @ Z_UP.T,
-        right,
+        row["primary_performance"] in RIGHT,
         int(row["num_steps"]),
         float(row["time"]),
-        float(error) if right and error else None,
+        Z_UP @ found @ Z_UP.T,
     )
 
 
@@ -116,14 +127,16 @@ def beside(taught: Taught, episodes: Sequence[Episode], draw: int) -> list[Outco
     return outcomes
 
 
-def table(episodes: Sequence[Episode], outcomes: Sequence[Outcome]) -> Iterator[str]:
+def table(
+    episodes: Sequence[Episode], outcomes: Sequence[Outcome], taught: Taught
+) -> Iterator[str]:
     """Monty's row, and one for each number of frames."""
     yield "| | right | steps or frames | seconds: median, worst | rotation, degrees: median, 95 % |"
     yield "|---|---|---|---|---|"
     steps = np.array([episode.steps for episode in episodes])
     seconds = np.array([episode.seconds for episode in episodes])
     share = np.mean([episode.right for episode in episodes])
-    errors = median_and_most([episode.rotation for episode in episodes])
+    errors = median_and_most([error_of(episode, taught) for episode in episodes if episode.right])
     yield (
         f"| Monty | {share:.3f} | {steps.mean():.0f} | "
         f"{np.median(seconds):.1f}, {seconds.max():.1f} | {errors} |"
@@ -139,6 +152,13 @@ def table(episodes: Sequence[Episode], outcomes: Sequence[Outcome]) -> Iterator[
             f"| nextview, {frames} | {share:.3f} | {k} | "
             f"{np.median(seconds):.2f}, {seconds.max():.2f} | {errors} |"
         )
+
+
+def error_of(episode: Episode, taught: Taught) -> float | None:
+    """The error of Monty's rotation, degrees; None for a ball."""
+    thing = np.array([taught.names.index(episode.name)])
+    symmetries = taught.things(thing).symmetries[0]
+    return rotation_error(episode.found, episode.turn, symmetries)
 
 
 def main(
@@ -162,7 +182,7 @@ def main(
         episodes = episodes_of(work, things)
         outcomes = beside(taught, episodes, draw)
         print(f"\nten {things} things, {len(episodes)} episodes", "", sep="\n")
-        print(*table(episodes, outcomes), sep="\n")
+        print(*table(episodes, outcomes, taught), sep="\n")
 
 
 if __name__ == "__main__":

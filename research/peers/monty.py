@@ -21,7 +21,8 @@ and noise (``randrot_noise_10distinctobj_dist_agent_mujoco``, ``..._10simobj_...
 many rotations are taught (some of its fourteen: the faces of a cube, opposite ones first) and
 tested, and shadows and smoothed edges, which the renderer draws slowly and no depth shows.
 
-Each rotation of the ten things is a lesson; ``teach`` goes on after the last complete one.
+Each rotation of the ten things is a lesson, and one of the test: ``teach`` and ``recognise`` go on
+after the last complete one.
 """
 
 from __future__ import annotations
@@ -79,6 +80,7 @@ Things = Literal["distinct", "similar"]
 TAUGHT = "taught"  # folders below WORK
 TESTED = "tested"
 MODEL = "model.pt"
+SEED = 42  # Monty's own
 EPISODES = "eval_stats.csv"  # what Monty writes of its episodes
 OBJECTS = "mujoco/objects/ycb"  # where Monty's simulator looks for things
 
@@ -135,28 +137,30 @@ def teach(
 def recognise(
     work: tyro.conf.Positional[Path], things: tyro.conf.Positional[Things], rotations: int = 3
 ) -> None:
-    """Show Monty each of ten things in random rotations, and print how it did.
+    """Show Monty ten things in random rotations; goes on where it was stopped.
 
     Args:
         work: folder that ``scans`` wrote.
         things: which ten.
-        rotations: how many of each thing; Monty's seed draws them.
+        rotations: how many of each thing; Monty's seed draws them, another one for each episode.
     """
     taught = sorted((work / TAUGHT / things).rglob(MODEL))
     if not taught:
         raise SystemExit(f"{work}: nothing was taught; run the stage teach first")
-    print(f"each thing was taught in {len(taught)} rotations")
-    place = work / TESTED / things
-    if not list(place.rglob(EPISODES)):
-        _run(
-            work,
-            TESTS[things],
-            "logging=basic_warning_monty_runs",
-            f"experiment.config.n_eval_epochs={rotations}",
-            f"experiment.config.model_name_or_path={taught[-1].parent.absolute()}",
-            f"experiment.config.logging.output_dir={place.absolute()}",
-            "experiment.config.python_log_level=WARNING",
-        )
+    print(f"each thing was taught in {len(taught)} of Monty's fourteen rotations")
+    for number in range(rotations):
+        place = work / TESTED / things / f"{number}"
+        if not list(place.rglob(EPISODES)):
+            _run(
+                work,
+                TESTS[things],
+                "logging=basic_warning_monty_runs",
+                f"experiment.config.seed={SEED + number}",
+                "experiment.config.n_eval_epochs=1",
+                f"experiment.config.model_name_or_path={taught[-1].parent.absolute()}",
+                f"experiment.config.logging.output_dir={place.absolute()}",
+                "experiment.config.python_log_level=WARNING",
+            )
 
 
 def _run(work: Path, experiment: str, *changes: str) -> None:
