@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,9 +82,7 @@ class Bench:
         return self.share([track]) >= GOOD_FIT
 
 
-def part(
-    tracks: Sequence[Track], bench: Bench, before: Mapping[int, Track] = MappingProxyType({})
-) -> list[Track]:
+def part(tracks: Sequence[Track], bench: Bench, before: Mapping[int, Track]) -> list[Track]:
     """Join and cut the objects of one frame where scans explain more of it then.
 
     Args:
