@@ -9,7 +9,8 @@ with an azimuth, views and errors of the sensor of its own. The camera stands fi
 away, between 25 cm from the surface and 45 cm from the centre. Things stand as they were scanned,
 or with ``--resting`` in any pose that they can rest in; with ``--clutter`` so many boxes stand
 around each, which hide parts of it. With ``--any-orientation`` they hang in the middle of a round
-room, turned at random about all axes, and are recognised as such.
+room, turned at random about all axes, and are recognised as such; the error of the rotation, modulo
+the symmetries of the thing, stands in the place of those of azimuth and resting pose.
 
 Prints after 1, 2, 3 and 5 random views: the share that is named right by features and size, and
 with the geometry; the expected calibration error (ten bins) and the share that is wrong with a
@@ -49,6 +50,7 @@ from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.observation import Observation
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import ViewSphere, rotation_z
+from nextview.recognition.model_card import Symmetry
 from nextview.simulation.scene import boxes_around
 from nextview.simulation.sensed_camera import BARE_TABLE_RADIUS, SensedCamera
 from nextview.things.memory import TaughtRecogniser
@@ -73,12 +75,16 @@ COLUMNS = (
     "calibration error",
     "sure and wrong",
     "azimuth, degrees: median, 95 %",
+    "rotation, degrees: median, 95 %",
     "place, mm, camera's frame: median, 95 %",
     "in the world: median",
     "ADD-S < 0.1 d",
     "resting pose",
     "ms of CPU: median, worst",
 )
+OF_HELD_THINGS = ("rotation, degrees: median, 95 %",)  # columns
+OF_STANDING_THINGS = ("azimuth, degrees: median, 95 %", "resting pose")
+POSE_ERRORS = ("azimuth", "rotation", "place", "place_in_world", "add_s", "resting")
 ROOM = 1.5  # metres from a thing that hangs in the air to the wall
 FARTHEST = 25.0  # object radii from a small one
 ORDERS = (1, 2, 3, 4, 5, 6, 7, 8)  # of symmetries about the vertical
@@ -141,6 +147,7 @@ class Outcome:
         p_value: share of known things that are explained as badly; None if the memory does not say.
         azimuth: error, degrees; None for a thing with every symmetry, and in another resting pose
             that looks the same, too.
+        rotation: error about any axis, degrees, modulo the thing's symmetries; None for a ball.
         place: error of the centre in the last camera's frame, metres.
         place_in_world: the same in the robot's world, in which the cameras' places have errors.
         add_s: mean distance of the surface's points, diameters.
@@ -157,6 +164,7 @@ class Outcome:
     explained: float
     p_value: float | None
     azimuth: float | None
+    rotation: float | None
     place: float | None
     place_in_world: float | None
     add_s: float | None
@@ -271,8 +279,24 @@ def symmetry_order(surface: Surface, points: Float) -> int:
     return 0 if highest >= ROUND else highest
 
 
-def shown(taught: Taught, things: TaughtThings, thing: int, draw: int, setting: Setting) -> Episode:
-    """Look at a thing from random viewpoints through a sensor, at its true size."""
+def shown(
+    taught: Taught,
+    things: TaughtThings,
+    thing: int,
+    draw: int,
+    setting: Setting,
+    held: Float | None = None,
+) -> Episode:
+    """Look at a thing from random viewpoints through a sensor, at its true size.
+
+    Args:
+        taught: the things.
+        things: recognises them; its features are part of the episode.
+        thing: number of the one that is shown.
+        draw: number of the draw.
+        setting: how it is shown.
+        held: rotation of a thing that hangs in a room, (3, 3); drawn if not given.
+    """
     rng = np.random.default_rng([thing, draw])
     turn = rotation_z(rng.uniform(0, 2 * np.pi))
     mesh = taught.meshes[thing]
@@ -280,7 +304,8 @@ def shown(taught: Taught, things: TaughtThings, thing: int, draw: int, setting: 
         poses = np.random.default_rng([thing, draw, 1])
         turn = turn @ poses.choice(taught.resting_poses(thing))
     if setting.any_orientation:
-        turn = Rotation.random(rng=np.random.default_rng([thing, draw, 3])).as_matrix()
+        drawn = Rotation.random(rng=np.random.default_rng([thing, draw, 3])).as_matrix()
+        turn = drawn if held is None else held
     standing = rotated(mesh, turn)
     around = None
     if setting.clutter:
@@ -337,9 +362,10 @@ def judged(
 
     answer = int(some[found.belief.argmax()])
     truth = int(np.searchsorted(some, episode.thing)) if episode.thing in some else -1
-    errors: dict = dict.fromkeys(("azimuth", "place", "place_in_world", "add_s", "resting"))
+    errors: dict = dict.fromkeys(POSE_ERRORS)
     if answer == episode.thing:
-        errors = pose_errors(taught, found, truth, episode, views)
+        symmetries = things.symmetries[truth]
+        errors = pose_errors(taught, found, truth, episode, views, symmetries)
     return Outcome(
         thing=episode.thing,
         views=views,
@@ -355,9 +381,23 @@ def judged(
 
 
 def pose_errors(
-    taught: Taught, found: Verified, truth: int, episode: Episode, views: int
+    taught: Taught,
+    found: Verified,
+    truth: int,
+    episode: Episode,
+    views: int,
+    symmetries: Sequence[Symmetry],
 ) -> dict[str, float | bool | None]:
-    """Errors of the pose of the thing that was named right."""
+    """Errors of the pose of the thing that was named right, by the names of an outcome's fields.
+
+    Args:
+        taught: the things.
+        found: what was found.
+        truth: number of the thing among those that were asked for.
+        episode: what was seen.
+        views: how many of the views were taken.
+        symmetries: of the thing.
+    """
     best = int(np.flatnonzero(found.things == truth)[0])
     pose = found.poses[best]
     surface = taught.surfaces[episode.thing]
@@ -386,11 +426,39 @@ def pose_errors(
     same_pose = up > np.cos(np.radians(UPRIGHT))
     return {
         "azimuth": abs((azimuth + step / 2) % step - step / 2) if order and same_pose else None,
+        "rotation": rotation_error(pose[:3, :3], episode.true_pose[:3, :3], symmetries),
         "place": float(np.linalg.norm((in_camera - true_in_camera) @ centre)),
         "place_in_world": float(np.linalg.norm((pose - episode.true_pose) @ centre)),
         "add_s": float(add_s),
         "resting": bool(same_pose or add_s < 0.1),
     }
+
+
+def rotation_error(found: Float, true: Float, symmetries: Sequence[Symmetry]) -> float | None:
+    """The angle between two rotations of a thing that its symmetries leave.
+
+    Args:
+        found: rotation from the axes of its scan, (3, 3).
+        true: the same, (3, 3).
+        symmetries: of the thing.
+
+    Returns:
+        Degrees; None for a ball, which looks the same in all rotations.
+    """
+    apart = Rotation.from_matrix(true.T @ found)  # about the axes of the scan
+    free = [np.array(symmetry.axis) for symmetry in symmetries if symmetry.order == 0]
+    if len(free) > 1:
+        return None
+
+    same = [apart]
+    for symmetry in symmetries:
+        angles = 2 * np.pi * np.arange(symmetry.order) / max(symmetry.order, 1)
+        turns = [Rotation.from_rotvec(angle * np.array(symmetry.axis)) for angle in angles]
+        same = [each * turn for each in same for turn in turns] or same
+    if free:
+        cosines = [free[0] @ each.apply(free[0]) for each in same]
+        return float(np.degrees(np.arccos(min(max(cosines), 1.0))))
+    return float(np.degrees(min(each.magnitude() for each in same)))
 
 
 def moved(points: Float, pose: Float) -> Float:
@@ -407,34 +475,50 @@ def calibration_error(outcomes: Sequence[Outcome]) -> float:
     return float(sum(gaps) / len(right))
 
 
-def table(outcomes: Sequence[Outcome], views: Sequence[int]) -> Iterator[str]:
-    """The results as lines of a table."""
-    yield f"| {' | '.join(COLUMNS)} |"
-    yield "|---" * len(COLUMNS) + "|"
+def table(outcomes: Sequence[Outcome], views: Sequence[int], held: bool) -> Iterator[str]:
+    """The results as lines of a table.
+
+    Args:
+        outcomes: of all draws.
+        views: after how many views things were judged.
+        held: whether things hang in a room in any orientation.
+    """
+    left_out = OF_STANDING_THINGS if held else OF_HELD_THINGS
+    kept = [number for number, name in enumerate(COLUMNS) if name not in left_out]
+    yield f"| {' | '.join(COLUMNS[number] for number in kept)} |"
+    yield "|---" * len(kept) + "|"
     for k in views:
-        some = [outcome for outcome in outcomes if outcome.views == k]
-        right = [outcome for outcome in some if outcome.right]
-        azimuths = np.array([o.azimuth for o in right if o.azimuth is not None])
-        places = 1000 * np.array([o.place for o in right], float)
-        in_world = 1000 * np.array([o.place_in_world for o in right], float)
-        milliseconds = 1000 * np.array([o.seconds for o in some])
-        wrong = np.mean([not o.right and o.confidence >= CONFIDENT for o in some])
-        cells = (
-            f"{k}",
-            f"{np.mean([o.by_features for o in some]):.3f}",
-            f"{len(right) / len(some):.3f}",
-            f"{calibration_error(some):.3f}",
-            f"{wrong:.3f}",
-            f"{np.median(azimuths):.1f}, {np.quantile(azimuths, 0.95):.1f}"
-            if len(azimuths)
-            else "-",
-            f"{np.median(places):.1f}, {np.quantile(places, 0.95):.1f}",
-            f"{np.median(in_world):.1f}",
-            f"{np.mean([o.add_s is not None and o.add_s < 0.1 for o in right]):.3f}",
-            f"{np.mean([bool(o.resting) for o in right]):.3f}",
-            f"{np.median(milliseconds):.0f}, {milliseconds.max():.0f}",
-        )
-        yield f"| {' | '.join(cells)} |"
+        cells = row([outcome for outcome in outcomes if outcome.views == k], k)
+        yield f"| {' | '.join(cells[number] for number in kept)} |"
+
+
+def row(some: Sequence[Outcome], views: int) -> tuple[str, ...]:
+    """The results after so many views, by ``COLUMNS``."""
+    right = [outcome for outcome in some if outcome.right]
+    places = 1000 * np.array([o.place for o in right], float)
+    in_world = 1000 * np.array([o.place_in_world for o in right], float)
+    milliseconds = 1000 * np.array([o.seconds for o in some])
+    wrong = np.mean([not o.right and o.confidence >= CONFIDENT for o in some])
+    return (
+        f"{views}",
+        f"{np.mean([o.by_features for o in some]):.3f}",
+        f"{len(right) / len(some):.3f}",
+        f"{calibration_error(some):.3f}",
+        f"{wrong:.3f}",
+        median_and_most([o.azimuth for o in right]),
+        median_and_most([o.rotation for o in right]),
+        f"{np.median(places):.1f}, {np.quantile(places, 0.95):.1f}",
+        f"{np.median(in_world):.1f}",
+        f"{np.mean([o.add_s is not None and o.add_s < 0.1 for o in right]):.3f}",
+        f"{np.mean([bool(o.resting) for o in right]):.3f}",
+        f"{np.median(milliseconds):.0f}, {milliseconds.max():.0f}",
+    )
+
+
+def median_and_most(errors: Sequence[float | None]) -> str:
+    """Median and 95 % quantile of the errors that are known."""
+    known = np.array([error for error in errors if error is not None])
+    return f"{np.median(known):.1f}, {np.quantile(known, 0.95):.1f}" if len(known) else "-"
 
 
 def mistakes(taught: Taught, outcomes: Sequence[Outcome], views: Sequence[int]) -> Iterator[str]:
@@ -532,7 +616,12 @@ def main(
 
     together = [outcome for draw in outcomes for outcome in draw]
     if known == "all":
-        print(*table(together, views), "", *mistakes(taught, together, views), sep="\n")
+        print(
+            *table(together, views, any_orientation),
+            "",
+            *mistakes(taught, together, views),
+            sep="\n",
+        )
     else:
         print(*unknown_table(together, some, views), sep="\n")
     print(f"memory: at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GB")

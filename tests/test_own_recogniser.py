@@ -8,9 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial import cKDTree
 
 import nextview
+from nextview.captured.camera import CapturedCamera
+from nextview.captured.folders import read_capture
+from nextview.captured.writing import write_capture
 from nextview.data.samples import sample_mesh
 from nextview.errors import ModelError, SessionError, UsageError
 from nextview.policies.base import Evidence
@@ -267,3 +271,40 @@ def test_it_is_named_as_module_and_name_too(tmp_path, monkeypatch):
 def test_the_packages_own_kinds_are_taken_as_they_are():
     recogniser = nextview.load(threads=1).models.recogniser
     assert own_recogniser(recogniser) is recogniser
+
+
+class Painted:
+    """Tells a red object from a blue one of the same shape, by the mean colour of its pixels."""
+
+    classes = ("blue", "red")
+
+    def __call__(self, observations):
+        logits = []
+        for observation in observations:
+            colours = observation.colour[observation.depth > 0].astype(float)
+            logits.append([colours[:, 2].mean() / 16, colours[:, 0].mean() / 16])
+        return np.array(logits)
+
+
+@pytest.mark.parametrize(("answer", "rgb"), [("red", (200, 30, 20)), ("blue", (10, 40, 180))])
+@pytest.mark.parametrize("table", [False, True])
+def test_a_recogniser_of_ones_own_sees_the_colours_of_captured_images(tmp_path, table, answer, rgb):
+    """The background is of the other colour, which must not reach the recogniser."""
+    folder = tmp_path / "captured"
+    sphere = nextview.ViewSphere.named("12")
+    list(write_capture(sample_mesh("chair"), folder, sphere, 0.5, table=table))
+    other = (10, 40, 180) if answer == "red" else (200, 30, 20)
+    (folder / "rgb").mkdir(exist_ok=True)
+    for mask in folder.glob("mask_visib/*.png"):
+        shown = np.asarray(Image.open(mask)) > 0
+        colours = np.where(shown[..., None], rgb, other).astype(np.uint8)
+        Image.fromarray(colours).save(folder / "rgb" / f"{mask.stem.split('_')[0]}.png")
+    camera = CapturedCamera(read_capture(folder))
+    result = nextview.load(recogniser=Painted(), threshold=0.9).recognise(camera)
+    assert result.answer == answer
+    for view in result.views:
+        shown = view.observation.depth > 0
+        pure = (view.observation.colour[shown] == rgb).all(1)
+        assert pure.mean() > 0.95  # but for edges, where a facet lies over several pixels
+        assert not view.observation.colour[~shown].any()
+        assert not view.observation.colour.flags.writeable

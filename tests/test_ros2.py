@@ -189,6 +189,101 @@ def test_an_episode_from_a_bag_is_that_of_the_frames(tmp_path):
     np.testing.assert_allclose(ends[1].views[-1].belief, ends[0].views[-1].belief, atol=1e-5)
 
 
+# What the node tells of an object, with stand-ins for the messages
+
+
+def pose_message(**fields):
+    """An object with the fields of a ``geometry_msgs/Pose``."""
+    place = SimpleNamespace(x=0.0, y=0.0, z=0.0)
+    turn = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
+    return SimpleNamespace(position=place, orientation=turn, **fields)
+
+
+def matrix_of(told):
+    turn = told.orientation
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+    pose[:3, 3] = told.position.x, told.position.y, told.position.z
+    return pose
+
+
+@pytest.fixture
+def outputs(monkeypatch):
+    """The module that makes the messages, with objects that have their fields."""
+
+    def detection(header, id):
+        sizes = SimpleNamespace(x=0.0, y=0.0, z=0.0)
+        bbox = SimpleNamespace(center=pose_message(), size=sizes)
+        return SimpleNamespace(header=header, id=id, results=[], bbox=bbox)
+
+    def hypothesis():
+        told = SimpleNamespace(pose=pose_message(), covariance=np.zeros(36))
+        return SimpleNamespace(hypothesis=SimpleNamespace(class_id="", score=0.0), pose=told)
+
+    vision = SimpleNamespace(
+        Detection3D=detection,
+        Detection3DArray=SimpleNamespace,
+        ObjectHypothesisWithPose=hypothesis,
+    )
+    geometry = SimpleNamespace(Pose=pose_message, PoseArray=SimpleNamespace)
+    for name, module in (("geometry_msgs.msg", geometry), ("vision_msgs.msg", vision)):
+        monkeypatch.setitem(sys.modules, name.split(".")[0], SimpleNamespace())
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.delitem(sys.modules, "nextview_ros.outputs", raising=False)
+    yield importlib.import_module("nextview_ros.outputs")
+    sys.modules.pop("nextview_ros.outputs", None)
+
+
+def seen_at(centre, **fields):
+    """What is known of an object of 5 cm around a place."""
+    from_object = np.eye(4)
+    from_object[:3, 3] = centre
+    return SimpleNamespace(
+        poses_in=SimpleNamespace(from_object=from_object), radius=0.05, beliefs={}, **fields
+    )
+
+
+def test_a_detection_holds_the_poses_of_scans_with_their_variances(outputs):
+    poses = [np.eye(4), np.eye(4)]
+    poses[0][:3, :3] = Rotation.from_euler("xyz", [20, -35, 110], degrees=True).as_matrix()
+    poses[0][:3, 3] = 0.4, -0.1, 0.02  # the scan's origin, not its middle
+    candidates = [
+        SimpleNamespace(thing=name, probability=share, pose=pose, degrees=3.0, millimetres=6.0)
+        for name, share, pose in zip(("mug", "bowl"), (0.9, 0.1), poses, strict=True)
+    ]
+    unlikely = replace_in(candidates[1], thing="banana", probability=0.001)
+    seen = seen_at((0.41, -0.08, 0.07), answer="mug", pose_candidates=[*candidates, unlikely])
+    (told,) = outputs.detections(seen, "world").detections
+    assert told.id == "mug"
+    assert [one.hypothesis.class_id for one in told.results] == ["mug", "bowl"]
+    assert [one.hypothesis.score for one in told.results] == [0.9, 0.1]
+    for one, pose in zip(told.results, poses, strict=True):
+        np.testing.assert_allclose(matrix_of(one.pose.pose), pose, atol=1e-9)
+        variances = np.diag(one.pose.covariance.reshape(6, 6))
+        assert np.sqrt(variances[:3].sum()) == pytest.approx(0.006)
+        assert np.degrees(np.sqrt(variances[3:].sum())) == pytest.approx(3.0)
+    np.testing.assert_allclose(matrix_of(told.bbox.center)[:3, 3], (0.41, -0.08, 0.07))
+    assert told.bbox.size.x == told.bbox.size.z == pytest.approx(0.1)
+
+
+def replace_in(what, **fields):
+    return SimpleNamespace(**(vars(what) | fields))
+
+
+def test_a_detection_of_a_class_has_any_turn_and_an_unknown_one_no_hypothesis(outputs):
+    seen = seen_at((0.3, 0.2, 0.1), answer="chair", pose_candidates=[])
+    seen.beliefs = {"table": 0.2, "chair": 0.795, "bed": 0.005}
+    (told,) = outputs.detections(seen, "world").detections
+    assert [one.hypothesis.class_id for one in told.results] == ["chair", "table"]
+    variances = np.diag(told.results[0].pose.covariance.reshape(6, 6))
+    assert np.sqrt(variances[:3].sum()) == pytest.approx(0.05)
+    assert variances[3:] == pytest.approx([np.pi**2 / 3] * 3)  # of an even angle, +- 180 degrees
+    np.testing.assert_allclose(matrix_of(told.results[0].pose.pose)[:3, 3], (0.3, 0.2, 0.1))
+
+    (told,) = outputs.detections(seen_at((0, 0, 0), answer=None), "world").detections
+    assert (told.id, told.results) == ("unknown", [])
+
+
 # The node, with stand-ins for ROS
 
 

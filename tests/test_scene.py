@@ -285,6 +285,7 @@ def test_the_command_says_what_is_on_the_table(meshes, tmp_path, capsys):
     said = json.loads(capsys.readouterr().out)
     assert {thing["name"] for thing in said["objects"]} == {"cracker_box", "mug"}
     assert [frame["taken"] for frame in said["frames"]] == [True, True]
+    assert [frame["joined"] for frame in said["frames"]] == [[], []]
     for thing in said["objects"]:
         true = camera.truth[thing["name"]]
         assert np.linalg.norm(np.array(thing["pose"])[:3, 3] - true[:3, 3]) < 0.01

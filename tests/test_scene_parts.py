@@ -9,7 +9,7 @@ import nextview
 from nextview.geometry.mesh import make_mesh
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import Ground
-from nextview.scene.parting import Bench, merged, new_track
+from nextview.scene.parting import Bench, merged, new_track, taken_over
 from nextview.scene.tracks import Track
 from nextview.sensing.tabletop import TableTop
 from nextview.simulation.sensor import SENSORS
@@ -101,6 +101,15 @@ def test_two_sides_of_one_thing_are_one_object_and_two_things_stay_two(system, m
     assert all(track.frames == (0, 1) for track in one_each)
     assert sorted(number for track in one_each for number in track.absorbed) == [10, 11]
     assert merged(found[0], benches[:1]) == found[0]
+
+
+def test_an_object_that_ended_takes_no_pixels(system, meshes):
+    found, benches = two_sides(system, camera_over([meshes["tomato_soup_can"]]), (20,))
+    ((can,),) = found
+    ended = replace(can, frames=())
+    unjudged = replace(can, number=5, result=None)
+    assert taken_over([ended, unjudged], benches) == [ended, unjudged]
+    assert taken_over([can, unjudged], benches)[0].absorbed == (5,)
 
 
 def test_a_look_tells_which_numbers_end_in_another_object(system, meshes):

@@ -85,7 +85,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs the YCB scans, and minutes"
     ),
     r"benchmark-things SCANS OUT": "needs the YCB scans, and minutes",
-    r"peers/monty\.py": "needs an environment of its own, and an hour",
+    r"peers/monty\.py|peers\.beside_monty": "needs an environment of its own, and an hour",
     r"research\.(train_grid|thing_features)": "trains for hours",
     r"research\.simulated_arm": "takes an hour; research/tests/test_arm.py has episodes of it",
     r"benchmarks/(render|replay|latency|session_latency)\.py": "measures time, on a quiet machine",

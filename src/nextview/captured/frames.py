@@ -16,6 +16,7 @@ from nextview.types import Float, Float32
 
 NO_DEPTH = np.iinfo(np.uint16).max  # what some sensors give for "nothing" besides 0
 DEEP = ("I;16", "I;16B", "I")  # Pillow's names of grey images of 16 bits
+GREY = ("1", "L", "LA", "La")  # its names of grey images of 8 bits or fewer
 LARGEST_TEXT = 2**28  # bytes of a list of images or poses
 MILLIMETRES = 0.001
 
@@ -115,7 +116,7 @@ class CapturedFrame:
         mask = None
         if masked and self.mask is not None:
             mask = _as_grey(self.mask, raw.shape) > 0
-        image = None if self.image is None else _as_grey(self.image, raw.shape)
+        image = None if self.image is None else _picture(self.image, raw.shape)
         return Frame(depth, self.intrinsics, self.pose, mask, image)
 
     def _check_scale(self, depth: Float32) -> None:
@@ -271,7 +272,18 @@ def read_table(path: Path, what: str, side: int) -> Float:
 
 
 def _as_grey(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """A mask or a picture, (H, W) uint8 (ITU-R BT.601)."""
+    """A mask, (H, W) uint8 (ITU-R BT.601)."""
+    return np.asarray(_opened_as(path, shape).convert("L"))
+
+
+def _picture(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """A picture, (H, W) uint8 if it is grey, else (H, W, 3) uint8, RGB."""
+    image = _opened_as(path, shape)
+    return np.asarray(image.convert("L" if image.mode in GREY else "RGB"))
+
+
+def _opened_as(path: Path, shape: tuple[int, ...]) -> Image.Image:
+    """An image of 8 bits and of the depth image's shape; else a DatasetError."""
     image = _open(path, ("PNG", "JPEG"))
     if (image.height, image.width) != shape:
         raise DatasetError(
@@ -280,7 +292,7 @@ def _as_grey(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
         )
     if image.mode in DEEP:
         raise DatasetError(f"{path}: has 16 bits where 8 are expected; is it a depth image?")
-    return np.asarray(image.convert("L"))
+    return image
 
 
 def _open(path: Path, formats: tuple[str, ...], load: bool = True) -> Image.Image:

@@ -72,6 +72,8 @@ class Observation:
         scene: all that the camera saw. None where only the object is known: then nothing is taken
             to hide it.
         exact: whether the depth is without a sensor's errors, as of a render.
+        colour: RGB picture, (H, W, 3) uint8, 0 where there is no object, for recognisers of your
+            own. None if the camera has none, as in simulations.
 
     Raises:
         ObservationError: a shape is not as above, or no camera can have the numbers; the message
@@ -90,6 +92,7 @@ class Observation:
     image: NDArray[np.uint8] | None = None
     scene: SceneView | None = None
     exact: bool = False
+    colour: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
         with np.errstate(over="ignore"):  # what is too large becomes infinity, and so 0
@@ -102,6 +105,9 @@ class Observation:
             "pose": checked_pose(self.pose),
             "intrinsics": checked_intrinsics(self.intrinsics, depth.shape),
             "image": None if self.image is None else _image(self.image, depth.shape),
+            "colour": None
+            if self.colour is None
+            else _image(self.colour, (*depth.shape, 3), "the colour image is RGB"),
         }
         for name, value in checked.items():
             object.__setattr__(self, name, None if value is None else _own(value))
@@ -315,12 +321,12 @@ def _check_unit(given: Float32, near: int) -> None:
         )
 
 
-def _image(image: Any, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+def _image(
+    image: Any, shape: tuple[int, ...], what: str = "the image is grey"
+) -> NDArray[np.uint8]:
     image = numbers(image, "the image")
     if image.shape != shape:
-        raise ObservationError(
-            f"the image is grey and of the depth's shape {shape}, not {image.shape}"
-        )
+        raise ObservationError(f"{what} and of the depth's shape {shape}, not {image.shape}")
     if image.dtype != np.uint8 and (
         image.dtype.kind == "f" or image.min() < 0 or image.max() > 255
     ):

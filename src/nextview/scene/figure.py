@@ -99,7 +99,7 @@ def _heading(
 ) -> None:
     """Say how many objects were found, and in how many frames."""
     named = sum(thing.name != UNKNOWN for thing in objects)
-    said = f"{named} known things"
+    said = f"{named} known thing{'s' * (named != 1)}"
     if named < len(objects):
         said += f", {len(objects) - named} unknown"
     if not objects:

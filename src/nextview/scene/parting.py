@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,9 +82,7 @@ class Bench:
         return self.share([track]) >= GOOD_FIT
 
 
-def part(
-    tracks: Sequence[Track], bench: Bench, before: Mapping[int, Track] = MappingProxyType({})
-) -> list[Track]:
+def part(tracks: Sequence[Track], bench: Bench, before: Mapping[int, Track]) -> list[Track]:
     """Join and cut the objects of one frame where scans explain more of it then.
 
     Args:
@@ -127,7 +124,7 @@ def taken_over(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]
         ]
         for row in doubtful:
             for other, taker in enumerate(found):
-                if other == row or taker.posed is None:
+                if other == row or not taker.frames or taker.posed is None:
                     continue
                 pair = _taken(found[row], taker, bench)
                 if pair is not None:
@@ -238,7 +235,7 @@ def _taken(loser: Track, taker: Track, bench: Bench) -> tuple[Track, Track] | No
         return replace(left, result=loser.result), grown
     ended = (*taker.absorbed, *loser.absorbed, loser.number)
     absorbed = tuple(number for number in ended if number >= 0)
-    return replace(loser, frames=()), replace(grown, absorbed=absorbed)
+    return replace(loser, frames=(), again=()), replace(grown, absorbed=absorbed)
 
 
 def _trimmed(tracks: Sequence[Track], bench: Bench, before: Mapping[int, Track]) -> list[Track]:

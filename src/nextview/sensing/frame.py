@@ -50,6 +50,7 @@ class Frame:
             camera itself is the world; good for a single frame only.
         mask: where the object is, (H, W) bool; None if that is to be found.
         image: grey (H, W) or colour (H, W, 3) uint8, registered to the depth; becomes grey.
+        colour: the image as it was handed in, (H, W, 3) uint8, RGB; None if it is grey.
         counted: whether the depth was handed in as uint16, in steps that may be other than
             millimetres.
         axes: of the pose handed in: "opencv", "opengl" or "ros", see CAMERA_AXES.
@@ -63,6 +64,7 @@ class Frame:
     mask: Mask | None = None
     image: NDArray[np.uint8] | None = None
     counted: bool = field(init=False, default=False)
+    colour: NDArray[np.uint8] | None = field(init=False, default=None)
     axes: InitVar[str] = "opencv"
     pixel_centre: InitVar[float] = 0.0
 
@@ -106,9 +108,10 @@ class Frame:
             if image.dtype != np.uint8 or image.shape not in (depth.shape, (*depth.shape, 3)):
                 wanted = f"(H, W) or (H, W, 3) uint8 registered to the depth, {depth.shape}"
                 raise ObservationError(f"an image is {wanted}, not {image.shape} {image.dtype}")
-            object.__setattr__(
-                self, "image", image if image.ndim == 2 else np.rint(image @ LUMA).astype(np.uint8)
-            )
+            if image.ndim == 3:
+                object.__setattr__(self, "colour", image.copy())
+                image = np.rint(image @ LUMA).astype(np.uint8)
+            object.__setattr__(self, "image", image)
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from nextview.checks import one_line
@@ -22,6 +22,7 @@ from nextview.sensing.convex_pieces import STANDS, cut
 from nextview.sensing.displacement import Displacement, displacement
 from nextview.sensing.facets import (
     ROWS_MEASURED,
+    Facets,
     Noise,
     estimate_noise,
     fit_facets,
@@ -763,17 +764,31 @@ class ObservedObject:
     def _observe(self, sighting: Sighting, latest: ObjectFrame) -> Observation:
         pose = latest.pose_in_object(sighting.frame.camera_to_world)
         depth, facet = look_again(sighting.facets, pose, latest.radius, SIZE)
-        image = sighting.frame.image
-        facets = sighting.facets
-        if image is not None and not len(facets.rows):
-            image = np.zeros((SIZE, SIZE, 3), image.dtype)
-        elif image is not None:
-            image = np.where(facet >= 0, image[facets.rows[facet], facets.columns[facet]], 0)
+        image = _resampled(sighting.frame.image, sighting.facets, facet)
+        colour = _resampled(sighting.frame.colour, sighting.facets, facet)
         radius = latest.radius if self.life_size else None
         scene = _scene(sighting, pose, latest.radius)
         return Observation(
-            depth, virtual_pose(pose), pinhole(SIZE, CAMERA_DISTANCE), radius, image, scene
+            depth,
+            virtual_pose(pose),
+            pinhole(SIZE, CAMERA_DISTANCE),
+            radius,
+            image,
+            scene,
+            colour=colour,
         )
+
+
+def _resampled(
+    picture: NDArray[np.uint8] | None, facets: Facets, facet: Index
+) -> NDArray[np.uint8] | None:
+    """The picture of a frame, (H, W) or (H, W, 3), at the facets that a camera sees, (S, S)."""
+    if picture is None:
+        return None
+    shown = np.zeros((*facet.shape, *picture.shape[2:]), np.uint8)
+    hit = facet >= 0
+    shown[hit] = picture[facets.rows[facet[hit]], facets.columns[facet[hit]]]
+    return shown
 
 
 def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
