@@ -33,7 +33,7 @@ from nextview.session.result import Recognition
 from nextview.session.session import Session
 from nextview.session.style import BLUE, FIGURE_STYLE, GREY, PAPER
 from nextview.simulation.robot_camera import RobotCamera
-from nextview.simulation.scene import Scene, build_scene, footprint
+from nextview.simulation.scene import TargetScene, build_scene, footprint
 from nextview.simulation.simulated import SHOWS_OTHER, SHOWS_TARGET
 
 SHOWS = 0.15
@@ -42,7 +42,7 @@ SPHERE = ViewSphere.named("40")
 
 
 def session(
-    scene: Scene, policy: str, models: str, start: int, views: int, seed: int
+    scene: TargetScene, policy: str, models: str, start: int, views: int, seed: int
 ) -> Recognition:
     """What a policy makes of a scene."""
     system = nextview.load(models, policy=policy)
@@ -54,7 +54,7 @@ def session(
     return made.run(camera)
 
 
-def from_above(axis: Axes, scene: Scene, directions: list[np.ndarray]) -> None:
+def from_above(axis: Axes, scene: TargetScene, directions: list[np.ndarray]) -> None:
     """The table, and the way of the camera above it."""
     for outline, colour in [
         (footprint(scene.target.vertices), SHOWS_TARGET),

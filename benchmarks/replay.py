@@ -22,7 +22,7 @@ import numpy as np
 import tyro
 
 from nextview.benchmark.entries import default_entries
-from nextview.benchmark.replay import THRESHOLDS, Grid, make_specs, run_grid
+from nextview.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
 from nextview.benchmark.summary import summarise
 from nextview.cli.exit_status import orderly_end
 from nextview.data.predictions import Predictions
@@ -63,7 +63,7 @@ def run(
     predictions = Predictions.load(source) if isinstance(source, Path) else made_up(*source)
     began = time.perf_counter()
     specs = make_specs(predictions, 10, 0)
-    grid = Grid(specs, 10, THRESHOLDS, max_views, 0)
+    grid = Grid(specs, 10, THESIS_THRESHOLDS, max_views, 0)
     list(run_grid(grid, names or default_entries(specs)))
     replayed = time.perf_counter()
     summarise(grid, "random", 2000, np.random.default_rng(0))
@@ -124,7 +124,7 @@ def main(predictions: Path | None = None, meshes: list[Path] | None = None) -> N
     if meshes:
         observation = with_networks(meshes)
         table = Predictions.load(full) if isinstance(full, Path) else made_up(*full)
-        grid = Grid(make_specs(table, 10, 0), 10, THRESHOLDS, 5, 0)
+        grid = Grid(make_specs(table, 10, 0), 10, THESIS_THRESHOLDS, 5, 0)
         list(run_grid(grid, TEN))
         n_views = sum(int(ends.n_views.sum()) for _, _, ends in grid.cells())
         print(

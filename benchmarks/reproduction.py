@@ -22,7 +22,7 @@ import tyro
 from nextview.benchmark.entries import default_entries
 from nextview.benchmark.leaderboard import SIGNIFICANT, nothing_differs
 from nextview.benchmark.published import published, published_threshold
-from nextview.benchmark.replay import THRESHOLDS, Grid, make_specs, run_grid
+from nextview.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
 from nextview.benchmark.summary import Tables, summarise
 from nextview.cli.exit_status import orderly_end
 from nextview.data.predictions import Predictions
@@ -85,7 +85,7 @@ def tests_of(tables: Tables, measure: str) -> dict[tuple[str, float], Compared]:
 def page(predictions: Path, samples: int = 2000) -> str:
     table = replace(Predictions.load(predictions), calibration=PLAIN_SUM)  # as published
     specs = make_specs(table, 10, 0)
-    grid = Grid(specs, 10, THRESHOLDS, 5, 0)
+    grid = Grid(specs, 10, THESIS_THRESHOLDS, 5, 0)
     list(run_grid(grid, default_entries(specs)))
     ran = {name for name, paths in grid.paths.items() if not paths.fixed}
     references = [name for name in (*BASELINES, "lem", "true-lem", "lcm") if name in ran]
@@ -235,14 +235,16 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "",
         "Accuracy against random, points; `tests.csv`.",
         "",
-        "| policy | " + " | ".join(map(str, THRESHOLDS)) + " |",
-        "|---" * (1 + len(THRESHOLDS)) + "|",
+        "| policy | " + " | ".join(map(str, THESIS_THRESHOLDS)) + " |",
+        "|---" * (1 + len(THESIS_THRESHOLDS)) + "|",
     ]
     for name in (
         name for name in ("oracle-valley", "lem", "lcm", "gain", "oracle-gain") if name in lems
     ):
         out.append(
-            f"| {name} | " + " | ".join(str(test["random"][name, t]) for t in THRESHOLDS) + " |"
+            f"| {name} | "
+            + " | ".join(str(test["random"][name, t]) for t in THESIS_THRESHOLDS)
+            + " |"
         )
     out += [
         "",

@@ -24,7 +24,7 @@ from nextview.geometry.depth import headlight
 from nextview.geometry.observation import pinhole
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.session.style import FIGURE_STYLE, PAPER
-from nextview.simulation.scene import Scene, build_scene
+from nextview.simulation.scene import TargetScene, build_scene
 from nextview.simulation.scene_layout import CLUTTER_LEVELS
 from nextview.simulation.simulated import SHOWS_OTHER, SHOWS_TABLE, SHOWS_TARGET, SceneCamera
 
@@ -39,7 +39,7 @@ COLOURS = {
 VIEWS = (10, 12, 14, 16, 18, 27)
 
 
-def picture(scene: Scene, pose: np.ndarray) -> np.ndarray:
+def picture(scene: TargetScene, pose: np.ndarray) -> np.ndarray:
     """What a camera sees, (SIZE, SIZE, 3), in the colours of the owners."""
     intrinsics = pinhole(SIZE, 3.0) * [[WIDE, 1, 1], [1, WIDE, 1], [1, 1, 1]]
     depth, owner = SceneCamera(scene, intrinsics, (SIZE, SIZE)).look(pose)

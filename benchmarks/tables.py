@@ -45,7 +45,7 @@ import nextview
 from nextview.errors import ObservationError, UsageError
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.resting import resting_poses
-from nextview.scene.objects import UNKNOWN, SceneObject
+from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Scene
 from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS
@@ -169,9 +169,9 @@ class Looking:
             number = self.truth(found)
             name = things[number].name if number >= 0 else ""
             if name == STRANGER:
-                unknown_stranger |= found.name == UNKNOWN
-                named_stranger |= found.name != UNKNOWN
-            if found.name == UNKNOWN:
+                unknown_stranger |= found.name == UNKNOWN_NAME
+                named_stranger |= found.name != UNKNOWN_NAME
+            if found.name == UNKNOWN_NAME:
                 continue
             counts.named += 1
             counts.sure += found.confident

@@ -32,7 +32,7 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from matplotlib.transforms import Bbox
 
 from nextview.benchmark.entries import EpisodeSpecs, entry_policy, knows_truth
-from nextview.benchmark.figures import COLOURS, OWN
+from nextview.benchmark.figures import OWN, POLICY_COLOURS
 from nextview.benchmark.replay import Grid, make_specs, run_grid
 from nextview.benchmark.views import CEILING, as_rows, by_key, markdown, measured
 from nextview.cli.exit_status import orderly_end
@@ -92,7 +92,7 @@ def front(table: pd.DataFrame, travel_weights: dict[str, list[tuple[float, str]]
     names = [
         name for name in drawn if name in at_prices or name.partition("@")[0] not in travel_weights
     ]
-    colour = {name: COLOURS.get(name, "#4a5560") for name in names}
+    colour = {name: POLICY_COLOURS.get(name, "#4a5560") for name in names}
     text_of = {name: Path(name).name for name in names}
     for own, (family, members) in zip(
         OWN * len(travel_weights), travel_weights.items(), strict=False

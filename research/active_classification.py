@@ -19,7 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.benchmark.environments import RecogniseEnv, RecogniseVectorEnv, Split, info_of
+from nextview.benchmark.environments import (
+    EnvironmentSplit,
+    RecogniseEnv,
+    RecogniseVectorEnv,
+    info_of,
+)
 from nextview.data.predictions import Predictions
 from research.extras import extras
 
@@ -43,7 +48,7 @@ class ActiveRecogniseEnv(ap_gym.ActiveClassificationEnv):
     def __init__(
         self,
         predictions: str | Path | Predictions,
-        split: Split | None = "train",
+        split: EnvironmentSplit | None = "train",
         balanced: bool = False,
         **rules: Any,
     ) -> None:
@@ -78,7 +83,7 @@ class ActiveRecogniseVectorEnv(ap_gym.ActiveClassificationVectorEnv):
         self,
         num_envs: int,
         predictions: str | Path | Predictions,
-        split: Split | None = "train",
+        split: EnvironmentSplit | None = "train",
         balanced: bool = False,
         **rules: Any,
     ) -> None:

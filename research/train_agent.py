@@ -29,7 +29,7 @@ from nextview.benchmark.environments import Rules, TaskVectorEnv, replayed
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import console, track
 from nextview.data.predictions import Predictions
-from nextview.data.progress import Track, silently
+from nextview.data.progress import TrackProgress, silently
 from nextview.errors import UsageError
 from nextview.files import check_new, command, sha256_of
 from nextview.policies.gain import Gain, features
@@ -60,7 +60,11 @@ class TrainedAgent:
 
 
 def train_agent(
-    predictions: Path, card: Path, recipe: AgentRecipe = AgentRecipe(), *, track: Track = silently
+    predictions: Path,
+    card: Path,
+    recipe: AgentRecipe = AgentRecipe(),
+    *,
+    track: TrackProgress = silently,
 ) -> TrainedAgent:
     """Train an agent on predictions of objects that the recogniser was not trained on.
 
@@ -119,7 +123,7 @@ def train_agent(
 
 
 def _best(
-    env: TaskVectorEnv, judges: ReplayTable, recipe: AgentRecipe, track: Track
+    env: TaskVectorEnv, judges: ReplayTable, recipe: AgentRecipe, track: TrackProgress
 ) -> tuple[int, Gain, Value]:
     """The agent that was best on the objects held out, after how many steps, and what it
     reaches.

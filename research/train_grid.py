@@ -28,7 +28,7 @@ from torch import nn
 from nextview.benchmark.published import published_recognisers, read_rows
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track as progress
-from nextview.data.progress import Track, silently
+from nextview.data.progress import TrackProgress, silently
 from nextview.data.store import ViewStore
 from nextview.errors import ResultsError, UsageError
 from nextview.files import new_file
@@ -52,7 +52,7 @@ def train_grid(
     depths: Sequence[int] = (),
     batches: Sequence[int] = (),
     hardware: Hardware = Hardware(),
-    track: Track = silently,
+    track: TrackProgress = silently,
 ) -> Path:
     """Train the networks of table 6, each in a folder of its own. A second call resumes what was
     cut off.
@@ -170,7 +170,7 @@ def count_right(
 
 
 def _scores(
-    run: Path, store: Path, views: ViewStore, recipe: RecogniserRecipe, track: Track
+    run: Path, store: Path, views: ViewStore, recipe: RecogniserRecipe, track: TrackProgress
 ) -> dict[str, float]:
     """Accuracy from one view of the test split, over objects and over classes, kept in the run's
     folder.

@@ -18,13 +18,13 @@ from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.depth_view import depth_view
-from nextview.things.expected_images import ExpectedSensor, Surroundings
+from nextview.things.expected_images import ExpectedSensor, SeenSurroundings
 from nextview.things.expected_pose import surface_errors
 from nextview.things.expected_views import ExpectedViews, Outlook, expected_views
 from nextview.things.leading import Hypotheses
 from nextview.things.registration import RegistrationPrior, render, start
 from nextview.things.surface import Surface, SurfaceCaster
-from nextview.things.unseen_space import DepthImage, chance_of_sight
+from nextview.things.unseen_space import MeasuredDepth, chance_of_sight
 from nextview.things.verification import PixelModel, likelihood
 from nextview.things.verifier import Verifier
 from nextview.things.weighing import EvidenceWeights
@@ -103,11 +103,11 @@ def wall(distance: float) -> np.ndarray:
 
 def test_views_from_behind_an_obstacle_are_worth_nothing():
     open_view = knob_or_not().information()
-    hidden = knob_or_not(surroundings=Surroundings(wall(0.12))).information()
+    hidden = knob_or_not(surroundings=SeenSurroundings(wall(0.12))).information()
     ahead = (SPHERE.elevation < 0.4) & (SPHERE.directions[:, 0] > 0.6)
     assert open_view[ahead].min() > 0.3
     np.testing.assert_allclose(hidden[ahead], 0, atol=1e-9)
-    behind = knob_or_not(surroundings=Surroundings(wall(-0.2))).information()
+    behind = knob_or_not(surroundings=SeenSurroundings(wall(-0.2))).information()
     np.testing.assert_allclose(behind[ahead], open_view[ahead], atol=0.2)
     assert behind[ahead].min() > 0.3
 
@@ -185,7 +185,7 @@ def test_what_is_expected_is_what_the_verifier_says(shown, side):
     pose = found.pose.copy()
     pose[:3, 3] *= found.radius
     sensor = ExpectedSensor(view.pitch, SENSOR.noise)
-    floor = Surroundings(np.zeros((0, 3)), -0.05, 10.0)
+    floor = SeenSurroundings(np.zeros((0, 3)), -0.05, 10.0)
     plain = EvidenceWeights(geometry=1.0, correlation=0.0)
     expected_ratio = expected_views(caster, hypotheses, pose[None], sensor, floor, 1, plain)
     divergence = expected_ratio.divergence[0, 0, 1]
@@ -203,7 +203,7 @@ def outlook_of(belief, taken=1) -> Outlook:
         caster=surfaces_of(box_mesh(BODY), box_mesh(BODY, KNOB)),
         hypotheses=hypotheses_of((0, 1), belief),
         sensor=SENSOR,
-        surroundings=Surroundings.nothing(),
+        surroundings=SeenSurroundings.nothing(),
         place=np.array([-AWAY, 0.0, 0.0]),
         taken=taken,
         weights=EvidenceWeights(),
@@ -367,14 +367,14 @@ def test_words_name_the_rivals_and_how_much_is_settled():
     assert found.told_apart(best) == (0, 1)
 
 
-def half_a_wall() -> DepthImage:
+def half_a_wall() -> MeasuredDepth:
     """What a camera on -x sees: a wall 35 cm before it where y > 0, and far away the rest."""
     pose = look_at_origin(np.zeros(1), np.full(1, np.pi))[0]
     pose[:3, 3] *= AWAY / np.linalg.norm(pose[:3, 3])
     x, y = np.meshgrid(np.arange(64) + 0.5, np.arange(64) + 0.5)
     rays = np.stack([(x - 32) / 60, (y - 32) / 60, np.ones_like(x)], -1) @ pose[:3, :3].T
     depth = np.where(rays[..., 1] > 0, 0.35, 5.0).astype(np.float32)
-    return DepthImage(depth, pose, np.array([[60.0, 0, 32], [0, 60, 32], [0, 0, 1]]))
+    return MeasuredDepth(depth, pose, np.array([[60.0, 0, 32], [0, 60, 32], [0, 0, 1]]))
 
 
 def lines_from(*sides: float) -> tuple[np.ndarray, np.ndarray]:
@@ -435,7 +435,7 @@ def test_the_pose_becomes_sharper_from_where_more_is_told():
     loose = np.diag([1e-4, 1e-4, 1e-2, 1e-6, 1e-6, 1e-6])  # the azimuth is hardly known
     surfaces = surfaces_of(box_mesh(BODY, HANDLE))
     hypotheses = hypotheses_of((0,), (1.0,))
-    wall_around = Surroundings(wall(0.14))
+    wall_around = SeenSurroundings(wall(0.14))
     found = expected_views(surfaces, hypotheses, cameras(), SENSOR, wall_around, covariance=loose)
     hidden = found.found < 1e-6
     towards = SPHERE.directions[:, 0]

@@ -81,3 +81,25 @@ def test_no_two_modules_import_each_other_in_a_circle() -> None:
         free = {name for name in arrows if name not in done and arrows[name] <= done}
         assert free, f"a circle among {sorted(set(arrows) - done)}"
         done |= free
+
+
+def names_bound_at_the_top(path: Path) -> set[str]:
+    """Constants, types and classes of a module; those with an underscore are its own."""
+    found = set()
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ClassDef):
+            found.add(node.name)
+        if isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = [name for target in targets for name in ast.walk(target)]
+            found |= {name.id for name in names if isinstance(name, ast.Name)}
+    return {name for name in found if not name.startswith("_") and name != "log"}
+
+
+def test_a_constant_or_class_has_one_meaning_in_the_whole_package() -> None:
+    modules: dict[str, list[str]] = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for name in names_bound_at_the_top(path):
+            modules.setdefault(name, []).append(str(path.relative_to(PACKAGE)))
+
+    assert {name: where for name, where in modules.items() if len(where) > 1} == {}

@@ -8,7 +8,7 @@ import pytest
 import nextview
 from nextview.geometry.mesh import make_mesh
 from nextview.scene.judging import Judge
-from nextview.scene.next_view import Ground
+from nextview.scene.next_view import TableGround
 from nextview.scene.parting import Bench, merged, new_track, taken_over
 from nextview.scene.tracks import Track
 from nextview.sensing.tabletop import TableTop
@@ -155,7 +155,7 @@ def test_what_stands_behind_another_thing_is_not_seen(system, meshes):
     box, can = (
         tracks[name].thing.object_frame.centre for name in ("cracker_box", "tomato_soup_can")
     )
-    ground = Ground.of(scene.tops, scene._tracks)
+    ground = TableGround.of(scene.tops, scene._tracks)
     away = (box - can)[:2] / np.linalg.norm((box - can)[:2])
     behind_the_box = np.append(box[:2] + 0.5 * away, 0.08)
     before_the_can = np.append(can[:2] - 0.5 * away, 0.08)

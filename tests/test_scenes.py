@@ -19,7 +19,7 @@ from nextview.geometry.viewsphere import ViewSphere, look_at_origin
 from nextview.simulation.robot_camera import RobotCamera
 from nextview.simulation.scene import (
     SCENE_TABLE,
-    Scene,
+    TargetScene,
     block_item,
     build_scene,
     footprint,
@@ -41,9 +41,9 @@ FRONT = GRID.poses[0]
 """From +x, level."""
 
 
-def scene_of(*blocks: Block, target=BALL) -> Scene:
+def scene_of(*blocks: Block, target=BALL) -> TargetScene:
     floor = float(target.vertices[:, 2].min())
-    return Scene(target, tuple(block_item(block, floor) for block in blocks))
+    return TargetScene(target, tuple(block_item(block, floor) for block in blocks))
 
 
 # What hides what

@@ -11,7 +11,7 @@ from nextview.benchmark import thing_benchmark as stage
 from nextview.benchmark.confusable import Alikeness, how_alike
 from nextview.benchmark.thing_benchmark import ThingSettings, benchmark_things
 from nextview.benchmark.thing_episodes import (
-    SPHERE,
+    EPISODE_SPHERE,
     VISIBLE_SHARES,
     KeptArrays,
     Setting,
@@ -115,7 +115,7 @@ def test_a_view_is_sensed_once_and_another_policy_uses_what_is_there(
     assert joint.sum() == pytest.approx(1)
     assert hypotheses.belief.sum() == pytest.approx(1)
     assert hypotheses.poses.shape == (len(hypotheses.things), 4, 4)
-    away = SPHERE.arc.max(1)
+    away = EPISODE_SPHERE.arc.max(1)
     travel = tables.measures.query("policy == @own and measure == 'travel, rad' and views == 2")
     assert travel["value"].iloc[0] == pytest.approx(away.mean(), abs=away.std() + 1e-9)
 
@@ -123,7 +123,7 @@ def test_a_view_is_sensed_once_and_another_policy_uses_what_is_there(
 def test_what_is_kept_is_what_the_recogniser_says_of_the_same_views(knobs_memory, knobs, tmp_path):
     file = tmp_path / "episode"
     fresh = episode_of(knobs_memory, knobs, 0, file)
-    views = [fresh.start, (fresh.start + 3) % len(SPHERE)]
+    views = [fresh.start, (fresh.start + 3) % len(EPISODE_SPHERE)]
     found, _ = fresh.verified(views)
     direct = fresh.things([fresh.observation(view) for view in sorted(views)])
     np.testing.assert_allclose(found.belief, direct.belief, rtol=1e-4, atol=1e-12)
@@ -193,7 +193,7 @@ def test_boxes_leave_the_share_visible_that_was_asked_for(knobs_memory, knobs):
         camera = SensedCamera(
             standing, episode.stage.sensor, np.random.default_rng(0), around=boxes
         )
-        shares = [camera.visible_share(pose) for pose in SPHERE.poses]
+        shares = [camera.visible_share(pose) for pose in EPISODE_SPHERE.poses]
         assert low - 0.08 < np.mean(shares) < high + 0.08
 
 
@@ -210,7 +210,7 @@ def test_the_thing_that_is_most_alike_is_the_one_with_a_knob(knobs_memory):
 
 
 def state_at(view, visited=()):
-    mask = np.zeros((1, len(SPHERE)), bool)
+    mask = np.zeros((1, len(EPISODE_SPHERE)), bool)
     mask[0, [view, *visited]] = True
     nothing = Evidence(np.zeros((1, 1)))
     return EpisodeState(np.array([view]), mask, np.ones((1, 1)), nothing, len(visited) + 1)
@@ -220,10 +220,12 @@ def test_the_fixed_sequence_comes_to_all_views_of_its_ring():
     taken = [8]
     for _ in range(7):
         state = state_at(taken[-1], taken)
-        taken.append(int(RingSteps(SPHERE).next_views(state, np.random.default_rng(0))[0]))
+        taken.append(int(RingSteps(EPISODE_SPHERE).next_views(state, np.random.default_rng(0))[0]))
     assert sorted(taken) == list(range(8, 16))
     assert taken[1] == 11  # three steps of 45 degrees ahead
-    after = RingSteps(SPHERE).next_views(state_at(taken[-1], taken), np.random.default_rng(0))
+    after = RingSteps(EPISODE_SPHERE).next_views(
+        state_at(taken[-1], taken), np.random.default_rng(0)
+    )
     assert int(after[0]) not in taken
 
 
@@ -268,8 +270,10 @@ def test_measures_are_those_of_a_hand_count():
     assert random["sure", 0] == 1
     assert random["wrong, of the sure", 0] == pytest.approx(2 / 3)
     assert random["pose error, 95 %", 3] == 1
-    steps = np.pi / 4 * np.cos(SPHERE.elevation[0])
-    assert random["travel, rad", 2] == pytest.approx(np.pi * np.cos(SPHERE.elevation[0]), abs=0.2)
+    steps = np.pi / 4 * np.cos(EPISODE_SPHERE.elevation[0])
+    assert random["travel, rad", 2] == pytest.approx(
+        np.pi * np.cos(EPISODE_SPHERE.elevation[0]), abs=0.2
+    )
     assert steps > 0
     difference = tables.tests.query("things == 'all' and measure == 'accuracy' and views == 2")
     assert difference["difference"].iloc[0] == pytest.approx(2 / 3)

@@ -11,7 +11,7 @@ gymnasium = pytest.importorskip("gymnasium")
 from gymnasium.utils.env_checker import check_env
 
 import nextview.benchmark.environments  # noqa: F401
-from nextview.benchmark.thing_episodes import SPHERE
+from nextview.benchmark.thing_episodes import EPISODE_SPHERE
 from nextview.errors import DatasetError, SessionError, UsageError
 from nextview.policies.learned_tables import cells_from
 
@@ -50,7 +50,7 @@ def test_the_observation_is_the_joint_belief_of_thing_and_pose(env):
     np.testing.assert_allclose(
         turned @ turned.swapaxes(1, 2), np.tile(np.eye(3), (len(poses), 1, 1)), atol=1e-5
     )
-    down = -np.sin(SPHERE.elevation[info["view"]])
+    down = -np.sin(EPISODE_SPHERE.elevation[info["view"]])
     assert poses[0, 2, 2] == pytest.approx(down, abs=0.1)  # the thing's up, along the view
 
 
@@ -60,15 +60,15 @@ def test_rewards_add_up_and_an_action_is_counted_from_the_camera(env):
     start = info["view"]
     assert observation["visited"].sum() == 1
     action = 11
-    expected = cells_from(SPHERE)[start, action]
-    assert info["travel_to"][action] == SPHERE.travel[start, expected]
+    expected = cells_from(EPISODE_SPHERE)[start, action]
+    assert info["travel_to"][action] == EPISODE_SPHERE.travel[start, expected]
     observation, reward, over, cut, info = env.step(action)
     assert info["view"] == expected or expected == start
     assert not over
     assert not cut
     total = reward
     # Where it stands already: the nearest free view is taken.
-    stay = int(SPHERE.ring[info["view"]] * SPHERE.azimuths)
+    stay = int(EPISODE_SPHERE.ring[info["view"]] * EPISODE_SPHERE.azimuths)
     before = info["view"]
     observation, reward, over, cut, info = env.step(stay)
     assert info["view"] not in (start, before)

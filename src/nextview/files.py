@@ -29,7 +29,7 @@ from nextview.errors import DatasetError, ModelError, NextviewError, ResultsErro
 
 T = TypeVar("T")
 # a field of a record: a hash in hexadecimal digits
-Sha256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+HashText = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # errors of a full disk
 MARKER = "nextview-unfinished.json"  # in each temporary folder: an ``Unfinished`` record
 LONGEST_OUTPUT_NAME = 40  # letters of an output's name that the name of its temporary folder holds

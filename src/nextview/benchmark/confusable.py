@@ -4,15 +4,13 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from nextview.geometry.viewsphere import rotation_z
 from nextview.things.taught import TaughtThings
+from nextview.types import Float, Mask
 
-Float = NDArray[np.float64]
-
-SURFACE_POINTS = 300  # by which two things are compared
+COMPARED_SURFACE_POINTS = 300  # by which two things are compared
 AZIMUTHS_TRIED = 16  # at which one is laid over the other
 RADII_APART = 1.25  # times as large as another, from which a thing is not like it
 
@@ -33,7 +31,7 @@ class Alikeness:
     distance: Float
 
     @property
-    def confusable(self) -> NDArray[np.bool_]:
+    def confusable(self) -> Mask:
         """The half of the things to which another one is most like, (T,) bool."""
         rank = np.argsort(np.argsort(self.distance, kind="stable"), kind="stable")
         return rank < len(self.names) // 2
@@ -62,7 +60,7 @@ def distances_between(things: TaughtThings) -> Float:
     """
     surfaces = things.verifier.caster.surfaces
     rng = np.random.default_rng(0)
-    points = [surface.sample(SURFACE_POINTS, rng) for surface in surfaces]
+    points = [surface.sample(COMPARED_SURFACE_POINTS, rng) for surface in surfaces]
     points = [cloud - (cloud.max(0) + cloud.min(0)) / 2 for cloud in points]
     trees = [cKDTree(cloud) for cloud in points]
     radii = np.array([surface.radius for surface in surfaces])

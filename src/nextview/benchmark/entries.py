@@ -4,7 +4,6 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_softmax
 
 from nextview.benchmark.true_maps import TRUE, known_maps, stored_rows, true_measure
@@ -18,7 +17,7 @@ from nextview.policies.maps import MapPeak
 from nextview.policies.oracle import OracleGain, OracleMeasure, OracleValley
 from nextview.policies.policy_card import bundled_policies
 from nextview.policies.registry import (
-    DEFAULT,
+    DEFAULT_POLICY,
     VISIBLE,
     make_policy,
     map_policy,
@@ -27,6 +26,7 @@ from nextview.policies.registry import (
 )
 from nextview.recognition.map_names import LCM, LEM, SPHERE_SUFFIX, in_order, map_name
 from nextview.recognition.model_card import DISCRIMINATE
+from nextview.types import Index
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class EpisodeSpecs:
     """The E episodes of every entry: the same objects from the same first views."""
 
     predictions: Predictions
-    objects: NDArray[np.int64]
-    starts: NDArray[np.int64]
+    objects: Index
+    starts: Index
     scenes: SceneSight | None = None
 
     @property
-    def labels(self) -> NDArray[np.int64]:
+    def labels(self) -> Index:
         """True class of each episode's object, (E,) int64."""
         return self.predictions.labels[self.objects]
 
@@ -67,7 +67,7 @@ MAP_ORACLE = re.compile(r"(true-)?(.+?)(-peak|-oracle-valley)?")
 classes, by the belief; "true-MAP-peak" always to its peaks. With "-oracle-valley" the true class
 decides, also on the predicted map."""
 MORE = f"{LEM}{SPHERE_SUFFIX}-peak"  # by Parisotto et al., see ``maps.SpherePeak``; always compared
-FIXED = ("best", "worst", "high-entropy", "low-entropy", "random-fixed", "orbit")
+FIXED_ENTRIES = ("best", "worst", "high-entropy", "low-entropy", "random-fixed", "orbit")
 """Fixed views by name, followed by their number: "best-5", "orbit-8". They go on to the end
 whatever is believed.
 
@@ -91,7 +91,7 @@ def knows_truth(entry: str) -> bool:
 
 
 # where things hide an object
-IN_SCENES = ("visibility", f"{VISIBLE}{DEFAULT}", "true-visible_share-all")
+IN_SCENES = ("visibility", f"{VISIBLE}{DEFAULT_POLICY}", "true-visible_share-all")
 
 
 def default_entries(specs: EpisodeSpecs) -> list[str]:
@@ -108,7 +108,7 @@ def default_entries(specs: EpisodeSpecs) -> list[str]:
     if specs.scenes is not None:
         return [name for name in (*names, *IN_SCENES) if _ready(name, specs)]
     names = [name for name in names if _ready(name, specs)]
-    names += [f"{kind}-{min(5, v)}" for kind in FIXED if kind != "orbit"]
+    names += [f"{kind}-{min(5, v)}" for kind in FIXED_ENTRIES if kind != "orbit"]
     return names + [f"orbit-{k}" for k in sorted({n, v})]
 
 
@@ -190,7 +190,7 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
         )
 
     names = [*policy_names(), *map_policy_names(p.maps), *bundled_policies(), *ORACLES]
-    names += ["true-MEASURE-all", *(f"{kind}-K" for kind in FIXED)]
+    names += ["true-MEASURE-all", *(f"{kind}-K" for kind in FIXED_ENTRIES)]
     raise EntryError(
         "no policy is called"
         f" {name!r}{did_you_mean(name, names) or '; there are ' + ', '.join(names)}"
@@ -215,9 +215,7 @@ def _ready(name: str, specs: EpisodeSpecs) -> bool:
     return True
 
 
-def fixed_views(
-    name: str, specs: EpisodeSpecs, rng: np.random.Generator
-) -> NDArray[np.int64] | None:
+def fixed_views(name: str, specs: EpisodeSpecs, rng: np.random.Generator) -> Index | None:
     """Return the views of an entry that always takes the same views.
 
     Args:
@@ -231,7 +229,7 @@ def fixed_views(
     Raises:
         EntryError: there are fewer views than the name asks for.
     """
-    match = re.fullmatch(rf"({'|'.join([*FIXED, 'true-[a-z0-9_]+'])})-(\d+)", name)
+    match = re.fullmatch(rf"({'|'.join([*FIXED_ENTRIES, 'true-[a-z0-9_]+'])})-(\d+)", name)
     if not match:
         return None
 

@@ -45,6 +45,7 @@ from nextview.recognition.model_card import find_models
 from nextview.session.episode import Episodes
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.training.rollout import OBJECTIVES, value_of
+from nextview.types import Float, Float32, Index, Mask
 
 with extras():
     import gymnasium
@@ -52,7 +53,6 @@ with extras():
     from gymnasium.vector.utils import batch_space
 
 log = logging.getLogger(__name__)
-Rows = NDArray[np.int64]
 PredictionsSource = str | Path | Predictions
 CAMERAS = 16  # meshes that are kept ready to be looked at
 _HERE = "nextview.benchmark.environments"
@@ -67,7 +67,7 @@ gymnasium.register(
     "nextview.benchmark.thing_environment:RecogniseThingsEnv",
 )
 # objects to learn from, or objects to judge by; None for all
-Split = Literal["train", "test"] | None
+EnvironmentSplit = Literal["train", "test"] | None
 Info = dict[str, Any]
 # bound of the observation space for what a map network says; the networks of this project stay far
 # below
@@ -127,12 +127,12 @@ class Rules:
 class AfterAction(Stopping):
     """Stops as ``Stopping`` does, but never at the first view."""
 
-    def threshold_at(self, n_views: NDArray[np.int64] | int) -> NDArray[np.float64]:
+    def threshold_at(self, n_views: Index | int) -> Float:
         """See ``Stopping``; infinity for one view."""
         return np.where(np.asarray(n_views) < 2, np.inf, super().threshold_at(n_views))
 
 
-def rows(values: Any, n: int, below: int, what: str) -> Rows:
+def rows(values: Any, n: int, below: int, what: str) -> Index:
     """Check whole numbers that an agent or a user chose.
 
     Args:
@@ -159,14 +159,14 @@ def rows(values: Any, n: int, below: int, what: str) -> Rows:
 
 
 @dataclass(frozen=True)
-class Task:
+class EnvironmentTask:
     """N objects, what is seen of them, and the rules."""
 
-    labels: Rows
+    labels: Index
     classes: tuple[str, ...]
     sphere: ViewSphere
     calibration: Calibration
-    observe: Callable[[Rows, Rows], Evidence] = field(repr=False)
+    observe: Callable[[Index, Index], Evidence] = field(repr=False)
     rules: Rules = Rules()
     balanced: bool = False
 
@@ -223,10 +223,10 @@ class Task:
 
 def replayed(
     predictions: PredictionsSource,
-    split: Split = "train",
+    split: EnvironmentSplit = "train",
     balanced: bool = False,
     rules: Rules = Rules(),
-) -> Task:
+) -> EnvironmentTask:
     """Create the task of recognising the objects of predictions.
 
     Train on objects that the recogniser was not trained on (``nextview predict --held-out``).
@@ -269,7 +269,9 @@ def replayed(
         )
 
     p = replace(p, maps={name: p.maps[name] for name in rules.maps})
-    return Task(p.labels, p.classes, p.sphere, p.calibration, p.evidence, rules, balanced)
+    return EnvironmentTask(
+        p.labels, p.classes, p.sphere, p.calibration, p.evidence, rules, balanced
+    )
 
 
 @dataclass
@@ -277,10 +279,10 @@ class Asked:
     """The policy of a cohort: goes to the free view nearest to the action."""
 
     sphere: ViewSphere
-    views: Rows
+    views: Index
     needs: tuple[str, ...] = ()
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Rows:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Take the free view that is nearest to the one that the agent asked for.
 
         Args:
@@ -304,10 +306,10 @@ class Seen:
     yet, (A, V) int8.
     """
 
-    observation: NDArray[np.float32]
-    change: NDArray[np.float64]
-    price: NDArray[np.float64]
-    ended: NDArray[np.bool_]
+    observation: Float32
+    change: Float
+    price: Float
+    ended: Mask
     info: dict[str, NDArray[Any]]
 
 
@@ -317,7 +319,7 @@ class Cohort:
     ``first`` is what is seen before any action.
     """
 
-    def __init__(self, task: Task, objects: Rows, starts: Rows) -> None:
+    def __init__(self, task: EnvironmentTask, objects: Index, starts: Index) -> None:
         self.task = task
         self.objects = objects
         self._asked = Asked(task.sphere, np.array(starts))
@@ -330,7 +332,7 @@ class Cohort:
         self._travel = np.zeros(len(objects))
         self.first = self._look(np.zeros(len(objects)))
 
-    def step(self, actions: Rows) -> Seen:
+    def step(self, actions: Index) -> Seen:
         """Continue all running episodes; a visited view is replaced by the nearest unvisited."""
         sphere = self.task.sphere
         running = self.episodes.running
@@ -343,7 +345,7 @@ class Cohort:
         self._travel[running] += way
         return self._look(rules.view_price + rules.travel_price * way)
 
-    def _look(self, price: NDArray[np.float64]) -> Seen:
+    def _look(self, price: Float) -> Seen:
         task = self.task
         running = self.episodes.running
         k = len(self.episodes.steps) + 1
@@ -389,7 +391,7 @@ class TaskEnv(gymnasium.Env[Any, Any]):
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: EnvironmentTask) -> None:
         self.task = task
         self.observation_space = task.observation_space
         self.action_space = task.action_space
@@ -444,31 +446,31 @@ class RecogniseEnv(TaskEnv):
     def __init__(
         self,
         predictions: PredictionsSource,
-        split: Split = "train",
+        split: EnvironmentSplit = "train",
         balanced: bool = False,
         **rules: Any,
     ) -> None:
         super().__init__(replayed(predictions, split, balanced, Rules(**rules)))
 
 
-class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
+class TaskVectorEnv(VectorEnv[Float32, Any, NDArray[Any]]):
     """Many episodes of a task at once, in at most as many cohorts as numbers of views."""
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
     metadata["autoreset_mode"] = AutoresetMode.SAME_STEP
 
-    def __init__(self, task: Task, num_envs: int) -> None:
+    def __init__(self, task: EnvironmentTask, num_envs: int) -> None:
         self.task = task
         self.num_envs = whole(num_envs, "the number of environments", 1)
         self.single_observation_space = task.observation_space
         self.single_action_space = task.action_space
         self.observation_space = batch_space(task.observation_space, num_envs)
         self.action_space = batch_space(task.action_space, num_envs)
-        self._cohorts: list[tuple[Cohort, Rows]] = []
+        self._cohorts: list[tuple[Cohort, Index]] = []
 
     def reset(
         self, *, seed: int | None = None, options: Info | None = None
-    ) -> tuple[NDArray[np.float32], Info]:
+    ) -> tuple[Float32, Info]:
         """Begin an episode in every environment; see Gymnasium.
 
         Args:
@@ -483,9 +485,7 @@ class TaskVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         self._cohorts = [(cohort, np.arange(self.num_envs))]
         return cohort.first.observation, cohort.first.info
 
-    def step(
-        self, actions: Any
-    ) -> tuple[NDArray[np.float32], NDArray, NDArray[np.bool_], NDArray[np.bool_], Info]:
+    def step(self, actions: Any) -> tuple[Float32, NDArray, Mask, Mask, Info]:
         seen, info = self.go(actions)
         return (
             seen.observation,
@@ -549,7 +549,7 @@ class RecogniseVectorEnv(TaskVectorEnv):
         self,
         num_envs: int,
         predictions: PredictionsSource,
-        split: Split = "train",
+        split: EnvironmentSplit = "train",
         balanced: bool = False,
         **rules: Any,
     ) -> None:
@@ -571,7 +571,7 @@ class RecogniseMeshEnv(TaskEnv):
     def __init__(
         self,
         meshes: str | Path | None = None,
-        split: Split = "train",
+        split: EnvironmentSplit = "train",
         models: str | Path = "modelnet10",
         viewpoints: str = "40",
         depth: bool = False,
@@ -613,7 +613,7 @@ class RecogniseMeshEnv(TaskEnv):
             lambda k: SimulatedCamera(objects[k][1](), size, sphere.distance)
         )
         super().__init__(
-            Task(labels, classes, sphere, calibration, self._rendered, given, balanced)
+            EnvironmentTask(labels, classes, sphere, calibration, self._rendered, given, balanced)
         )
 
         self._depth = depth
@@ -623,7 +623,7 @@ class RecogniseMeshEnv(TaskEnv):
                 {"state": self.task.observation_space, "depth": image}
             )
 
-    def _rendered(self, objects: Rows, views: Rows) -> Evidence:
+    def _rendered(self, objects: Index, views: Index) -> Evidence:
         poses = self.task.sphere.poses
         seen = [self._camera(int(k)).observe(poses[v]) for k, v in zip(objects, views, strict=True)]
         self._last = seen[-1]

@@ -17,7 +17,7 @@ from nextview.errors import ResultsError
 from nextview.recognition.belief import Calibration
 from nextview.recognition.map_names import CONFIDENCE, measure_of
 from nextview.recognition.model_card import ModelCard
-from nextview.types import Float, Index
+from nextview.types import Float, Float32, Floats, Index, Mask
 
 with extras():
     import pandas as pd
@@ -98,12 +98,12 @@ def _judged(p: Predictions) -> dict[int, NDArray]:
 
 
 def fused_views(
-    log_evidence: NDArray[np.floating],
+    log_evidence: Floats,
     labels: Index,
     calibration: Calibration,
     rng: np.random.Generator,
     classes: int,
-) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+) -> tuple[Mask, Float32]:
     """Fuse 1, 2, ... V views of each object, in a random order and in all its rotations.
 
     Args:
@@ -189,9 +189,7 @@ def _accuracy(p: Predictions, judged: dict[int, NDArray], weights: Float) -> pd.
     )
 
 
-def _fusion(
-    p: Predictions, right: NDArray[np.bool_], confidence: NDArray[np.float32], weights: Float
-) -> pd.DataFrame:
+def _fusion(p: Predictions, right: Mask, confidence: Float32, weights: Float) -> pd.DataFrame:
     top = right.mean(2).T
     one = np.ones_like(top)
     low, high = st.interval(metrics.ratio(top, one, weights))
@@ -225,7 +223,7 @@ def _confusion(p: Predictions, judged: dict[int, NDArray]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["n_views", "label", "answer", "answers"])
 
 
-def _reliability(right: NDArray[np.bool_], confidence: NDArray[np.float32]) -> pd.DataFrame:
+def _reliability(right: Mask, confidence: Float32) -> pd.DataFrame:
     rows = []
     v = len(right)
     for n_views in [k for k in RELIABILITY_LOOKS if k < v] + [v]:
@@ -253,7 +251,7 @@ def judged_objects(p: Predictions, name: str) -> Index:
     return np.flatnonzero(right.any(1)) if measure_of(name) == CONFIDENCE else np.arange(len(p))
 
 
-def baselines(true: NDArray[np.floating], labels: Index) -> dict[str, NDArray[np.floating]]:
+def baselines(true: Floats, labels: Index) -> dict[str, Floats]:
     """Return maps that networks are compared with.
 
     Args:

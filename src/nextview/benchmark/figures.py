@@ -28,7 +28,7 @@ from nextview.session.style import (
 with extras():
     import pandas as pd
 
-COLOURS = {
+POLICY_COLOURS = {
     "random": GREY,
     "gain": "#b5179e",
     "random-all": "#4a5560",
@@ -92,9 +92,9 @@ def look_of(policy: str, results: Results) -> dict:
     own = [
         name
         for name in (*compared(results), *results.tables.sweep["policy"].unique())
-        if name not in COLOURS
+        if name not in POLICY_COLOURS
     ]
-    colour = COLOURS.get(policy) or OWN[list(dict.fromkeys(own)).index(policy) % len(OWN)]
+    colour = POLICY_COLOURS.get(policy) or OWN[list(dict.fromkeys(own)).index(policy) % len(OWN)]
     line = ":" if policy.startswith("oracle-gain") else "--" if is_oracle(policy) else "-"
     return {"color": colour, "linestyle": line}
 

@@ -14,7 +14,7 @@ with extras():
 SIGNIFICANT = 0.05
 # with fewer objects, or wider intervals of differences in accuracy, little can be told
 FEW_OBJECTS = 200
-WIDE = 0.03
+WIDE_INTERVAL = 0.03
 
 
 def headline_threshold(thresholds: Sequence[float]) -> float:
@@ -125,7 +125,7 @@ def too_few(tables: Tables, threshold: float, objects: int) -> str | None:
     """
     tests = _robot_tests(tables, threshold)
     half = float((tests["high"] - tests["low"]).median() / 2)  # NaN if nothing was compared
-    if objects >= FEW_OBJECTS and not half > WIDE:
+    if objects >= FEW_OBJECTS and not half > WIDE_INTERVAL:
         return None
     unclear = (
         ""
@@ -136,7 +136,7 @@ def too_few(tables: Tables, threshold: float, objects: int) -> str | None:
         f"Too few objects to tell: there are {objects:,}{unclear}. Take no order of the policies"
         " from this"
     )
-    return f"{what}; it wants at least {FEW_OBJECTS} objects and ±{100 * WIDE:g} points."
+    return f"{what}; it wants at least {FEW_OBJECTS} objects and ±{100 * WIDE_INTERVAL:g} points."
 
 
 def _tests(tables: Tables, threshold: float) -> pd.DataFrame:

@@ -10,7 +10,7 @@ from nextview.data.predictions import Predictions
 from nextview.recognition.map_names import LCM, LEM
 from nextview.simulation.scene_layout import clutter_level
 
-COLUMNS = {  # policies of tables 5, 8 to 11 under their published names
+PUBLISHED_COLUMNS = {  # policies of tables 5, 8 to 11 under their published names
     "random": "random",
     "furthest": "furthest",
     "unidirectional": "unidirectional",
@@ -55,8 +55,8 @@ def comparable_classes(p: Predictions) -> tuple[str, ...]:
 def published_threshold(policy: str) -> float | None:
     """Return the published threshold of a policy (table 5); None if there is none."""
     return (
-        read_table("table5_nbv_modelnet10")["threshold"][COLUMNS[policy]]
-        if policy in COLUMNS
+        read_table("table5_nbv_modelnet10")["threshold"][PUBLISHED_COLUMNS[policy]]
+        if policy in PUBLISHED_COLUMNS
         else None
     )
 
@@ -94,7 +94,7 @@ def published(
         "travel_moved",
     ):
         rows = read_table((ACCURACY if kind == "accuracy" else TRAVEL)[n])
-        column = {name: rows[name][COLUMNS[policy]] for name in classes}
+        column = {name: rows[name][PUBLISHED_COLUMNS[policy]] for name in classes}
     else:
         return None
 
@@ -106,7 +106,7 @@ def published(
         return None
 
     row = "instance_accuracy" if kind == "accuracy" else "instance_travel"
-    return read_table("table5_nbv_modelnet10")[row][COLUMNS[policy]]
+    return read_table("table5_nbv_modelnet10")[row][PUBLISHED_COLUMNS[policy]]
 
 
 def published_recognisers(classes: tuple[str, ...], views: int) -> list[tuple[str, int, float]]:

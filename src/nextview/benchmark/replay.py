@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.benchmark.entries import EpisodeSpecs, entry_policy, fixed_views
 from nextview.benchmark.true_maps import TRUE, true_map
@@ -22,9 +21,10 @@ from nextview.recognition.belief import FixedLength, Stopping
 from nextview.recognition.map_names import maps_among
 from nextview.recognition.own_stopping import Rule, own_stopping
 from nextview.session.episode import Outcome, run_episodes
+from nextview.types import Float, Index, Mask
 
-THRESHOLDS = (0.85, 0.9, 0.95, 0.97, 0.99)  # the thesis's (section 5.3)
-PART = 4096  # episodes of fixed views that are run at once
+THESIS_THRESHOLDS = (0.85, 0.9, 0.95, 0.97, 0.99)  # the thesis's (section 5.3)
+EPISODES_TOGETHER = 4096  # episodes of fixed views that are run at once
 
 
 @dataclass(frozen=True)
@@ -36,14 +36,14 @@ class Trajectories:
         beliefs: in all classes, (E, K, classes), for rules that look at more than one.
     """
 
-    views: NDArray[np.int64]
-    answers: NDArray[np.int64]
-    confidences: NDArray[np.float64]
-    travel: NDArray[np.float64]
-    arc: NDArray[np.float64]
-    seen: NDArray[np.int64]
+    views: Index
+    answers: Index
+    confidences: Float
+    travel: Float
+    arc: Float
+    seen: Index
     fixed: bool
-    beliefs: NDArray[np.float64] | None = None
+    beliefs: Float | None = None
 
 
 def make_specs(predictions: Predictions, runs: int, seed: int) -> EpisodeSpecs:
@@ -101,8 +101,8 @@ def replay(
         return replay_policy(name, entry_policy(name, specs), specs, to_the_end, rng, beliefs)
     # Fixed views draw nothing more and may be long: in parts, whose steps are not all held at once.
     parts = []
-    for start in range(0, len(views), PART):
-        part = slice(start, start + PART)
+    for start in range(0, len(views), EPISODES_TOGETHER):
+        part = slice(start, start + EPISODES_TOGETHER)
         here = replace(specs, objects=specs.objects[part], starts=views[part, 0])
         parts.append(
             replay_policy(
@@ -143,7 +143,7 @@ def replay_policy(
     }
     p = replace(p, maps=maps)
 
-    def observe(which: NDArray[np.int64], views: NDArray[np.int64]) -> Evidence:
+    def observe(which: Index, views: Index) -> Evidence:
         return p.evidence(objects[which], views)
 
     sight = sight_of(specs.scenes, objects)
@@ -263,7 +263,7 @@ class Grid:
             for threshold in (None,) if paths.fixed else self.thresholds:
                 yield name, threshold, self.ends(name, threshold)
 
-    def right(self, answer: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def right(self, answer: Index) -> Mask:
         """Which answers, (E,), name the true class, (runs, N)."""
         return (answer == self.specs.labels).reshape(self.runs, -1)
 

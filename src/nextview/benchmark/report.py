@@ -15,7 +15,7 @@ from nextview.benchmark import figures as draw
 from nextview.benchmark import leaderboard as board
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.page import numbers, origin, picture, render, write_figures
-from nextview.benchmark.published import COLUMNS, published_threshold
+from nextview.benchmark.published import PUBLISHED_COLUMNS, published_threshold
 from nextview.benchmark.run import Results, load
 from nextview.benchmark.true_maps import stored_rows
 from nextview.benchmark.views import as_rows
@@ -26,13 +26,13 @@ from nextview.data.store import ViewStore
 from nextview.errors import EntryError, ResultsError
 from nextview.files import check_new, new_file
 from nextview.geometry.depth import headlight
-from nextview.policies.registry import DEFAULT
+from nextview.policies.registry import DEFAULT_POLICY
 from nextview.recognition.map_names import LEM
 
 with extras():
     import pandas as pd
 
-PICTURE = 112  # side of a view's picture, pixels
+REPORT_PICTURE = 112  # side of a view's picture, pixels
 # nothing, target, others, table
 OWNERS = np.array([[255, 255, 255], [11, 95, 165], [209, 73, 91], [225, 225, 225]])
 
@@ -125,7 +125,7 @@ def page(results: Results, store: ViewStore | None, why_not: str) -> str:
         .set_index("policy")
         .to_dict("index")
     )
-    wanted = dict.fromkeys((reference, best, DEFAULT, *draw.ceiling(results)))
+    wanted = dict.fromkeys((reference, best, DEFAULT_POLICY, *draw.ceiling(results)))
     shown = [name for name in wanted if name in policies]
 
     def spoken(measure: str) -> str:
@@ -214,7 +214,9 @@ def _thresholds(results: Results, at: float) -> dict[str, float]:
         return {name: at for name in draw.compared(results) if not is_oracle(name)}
     ran = set(results.tables.sweep["policy"])
     thresholds = results.settings["thresholds"]
-    wanted = {name: published_threshold(name) or 0.99 for name in (LEM, *COLUMNS) if name in ran}
+    wanted = {
+        name: published_threshold(name) or 0.99 for name in (LEM, *PUBLISHED_COLUMNS) if name in ran
+    }
     return {name: t if t in thresholds else at for name, t in wanted.items()}
 
 
@@ -302,7 +304,9 @@ def _images(store: ViewStore, name: str, views: list[int]) -> dict[str, str]:
     found = {}
     for view in views:
         file = BytesIO()
-        small = Image.fromarray(images[view]).resize((PICTURE, PICTURE), Image.Resampling.LANCZOS)
+        small = Image.fromarray(images[view]).resize(
+            (REPORT_PICTURE, REPORT_PICTURE), Image.Resampling.LANCZOS
+        )
         small.save(file, "WEBP", quality=70)
         found[f"{name} from view {view}"] = (
             "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()

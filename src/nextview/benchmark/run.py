@@ -8,12 +8,12 @@ from typing import Any, Literal
 import numpy as np
 
 from nextview.benchmark.entries import default_entries
-from nextview.benchmark.replay import THRESHOLDS, Grid, make_specs, run_grid
+from nextview.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
 from nextview.benchmark.summary import Tables, summarise
 from nextview.benchmark.views import as_rows, markdown
 from nextview.checks import extras
 from nextview.data.predictions import Predictions
-from nextview.data.progress import Track, silently
+from nextview.data.progress import TrackProgress, silently
 from nextview.errors import EntryError, ResultsError, UsageError
 from nextview.files import check_new, command, new_folder, sha256_of
 from nextview.policies.registry import with_cards
@@ -53,7 +53,7 @@ class BenchmarkSettings:
 
     policies: tuple[str, ...] = ()
     models: str = "modelnet10"
-    thresholds: tuple[float, ...] = THRESHOLDS
+    thresholds: tuple[float, ...] = THESIS_THRESHOLDS
     risks: tuple[float, ...] = ()
     views: tuple[int, ...] = ()
     stopping: str | None = None
@@ -97,7 +97,7 @@ def run_benchmark(
     settings: BenchmarkSettings = BenchmarkSettings(),
     *,
     overwrite: bool = False,
-    track: Track = silently,
+    track: TrackProgress = silently,
 ) -> Results:
     """Run all policies at all thresholds from the same first views, and compare them.
 

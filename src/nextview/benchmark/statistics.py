@@ -4,11 +4,10 @@ What is drawn anew is the object: the views and runs of one object are not indep
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
 from nextview.data import metrics
-from nextview.types import Float
+from nextview.types import Float, Index, Mask
 
 
 def resample(n: int, samples: int, rng: np.random.Generator) -> Float:
@@ -33,7 +32,7 @@ def interval(samples: Float) -> tuple[Float, Float]:
 
 
 def estimate(
-    top: Float, bottom: Float, weights: Float, labels: NDArray[np.int64] | None = None
+    top: Float, bottom: Float, weights: Float, labels: Index | None = None
 ) -> tuple[Float, Float]:
     """Return ratios of sums over objects and their bootstrap samples.
 
@@ -68,7 +67,7 @@ def bootstrap_p(difference: Float, samples: Float) -> Float:
     return 2 * norm.sf(np.abs(difference) / np.where(error > 0, error, np.inf))
 
 
-def mcnemar(right: NDArray[np.bool_], reference: NDArray[np.bool_]) -> float:
+def mcnemar(right: Mask, reference: Mask) -> float:
     """Return the two-sided p-value of McNemar's test, clustered by object.
 
     Args:

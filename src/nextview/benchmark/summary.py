@@ -11,17 +11,17 @@ from nextview.benchmark import statistics as st
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.published import comparable_classes, published
 from nextview.benchmark.replay import Grid
-from nextview.benchmark.views import COLUMNS, measured
+from nextview.benchmark.views import RESULT_COLUMNS, measured
 from nextview.checks import extras
 from nextview.data import metrics
 from nextview.session.episode import Outcome
 from nextview.simulation.scene_layout import CLUTTER_LEVELS, clutter_level
-from nextview.types import Float
+from nextview.types import Float, Index
 
 with extras():
     import pandas as pd
 
-Drawn = dict[tuple, NDArray[np.float64]]  # what resampling gives, by policy, threshold and measure
+Drawn = dict[tuple, Float]  # what resampling gives, by policy, threshold and measure
 Cell = tuple[str, float | None, Outcome]
 TESTED = ("accuracy", "clean_accuracy", "n_views", "travel_all")
 # from the first view for all to the last for most
@@ -72,7 +72,7 @@ class Tables:
     reliability: pd.DataFrame
     risks: pd.DataFrame
     levels: pd.DataFrame
-    views: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=COLUMNS))
+    views: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=RESULT_COLUMNS))
 
 
 def summarise(
@@ -365,7 +365,7 @@ def by_level(grid: Grid, reference: str, samples: int, rng: np.random.Generator)
     return table.assign(p_holm=st.holm(table["p"].to_numpy(np.float64)))
 
 
-def _after(values: NDArray, views: NDArray[np.int64], counts: list[int]) -> NDArray:
+def _after(values: NDArray, views: Index, counts: list[int]) -> NDArray:
     """Return values after numbers of views, or at the end of shorter episodes, (E, counts)."""
     return values[
         np.arange(len(values))[:, None], np.minimum((views >= 0).sum(1)[:, None], counts) - 1

@@ -15,14 +15,14 @@ import msgspec
 import numpy as np
 
 from nextview.benchmark.confusable import how_alike
-from nextview.benchmark.thing_episodes import SPHERE, Occlusion, Setting, ThingEpisode
-from nextview.benchmark.thing_policies import POLICIES, policies_of
+from nextview.benchmark.thing_episodes import EPISODE_SPHERE, Occlusion, Setting, ThingEpisode
+from nextview.benchmark.thing_policies import THING_POLICIES, policies_of
 from nextview.benchmark.thing_replay import EpisodeRuns, ThingRun, policies_in, run
 from nextview.benchmark.thing_results import write_results
 from nextview.benchmark.thing_tables import Compared, ThingTables, summarise_things
 from nextview.checks import number, whole
 from nextview.data import pool
-from nextview.data.progress import Track, silently
+from nextview.data.progress import TrackProgress, silently
 from nextview.errors import DatasetError, ResultsError, UsageError
 from nextview.files import check_new, command, only_one, read_record, write_record
 from nextview.geometry.mesh import UNITS, Mesh, load_mesh
@@ -35,7 +35,7 @@ from nextview.teaching.thing_views import TeachingOptions
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.taught import TaughtThings
 
-EPISODES = "episodes.json"  # how the episodes of a folder are shown
+EPISODES_FILE = "episodes.json"  # how the episodes of a folder are shown
 MEMORY = "memory"  # folder of what is taught, where no models are given
 
 
@@ -67,7 +67,7 @@ class ThingSettings:
     occlusion: Occlusion = "none"
     draws: int = 1
     views: tuple[int, ...] = (1, 2, 3, 5)
-    policies: tuple[str, ...] = POLICIES
+    policies: tuple[str, ...] = THING_POLICIES
     threshold: float = 0.97
     repeats: int = 2
     unit: str = "m"
@@ -86,8 +86,8 @@ class ThingSettings:
         whole(self.samples, "the samples of the bootstrap", 100)
         if not self.views or list(self.views) != sorted(set(self.views)):
             raise UsageError("the numbers of views ascend, as in --views 1 2 3 5")
-        whole(self.views[0], "a number of views", 1, len(SPHERE))
-        whole(self.views[-1], "a number of views", 2, len(SPHERE))
+        whole(self.views[0], "a number of views", 1, len(EPISODE_SPHERE))
+        whole(self.views[-1], "a number of views", 2, len(EPISODE_SPHERE))
         if number(self.threshold, "the threshold", 0) >= 1:
             raise UsageError(f"a threshold is below 1, not {self.threshold}")
         if self.unit not in UNITS:
@@ -144,7 +144,7 @@ def benchmark_things(
     out: Path,
     settings: ThingSettings = ThingSettings(),
     workers: int | None = None,
-    track: Track = silently,
+    track: TrackProgress = silently,
 ) -> ThingTables:
     """Compare where to look next at things of known geometry: from scans to a table.
 
@@ -206,7 +206,7 @@ def benchmark_things(
 def _check_place(out: Path) -> None:
     """See that a folder is new, or holds results of this benchmark."""
     check_new(out, overwrite=True, folder=True)
-    if not out.is_dir() or (out / EPISODES).is_file() or (out / MEMORY).is_dir():
+    if not out.is_dir() or (out / EPISODES_FILE).is_file() or (out / MEMORY).is_dir():
         return
     strange = [path.name for path in out.iterdir() if not path.name.startswith(".")]
     if strange:
@@ -214,7 +214,7 @@ def _check_place(out: Path) -> None:
 
 
 def _taught(
-    scans: Path, out: Path, settings: ThingSettings, workers: int | None, track: Track
+    scans: Path, out: Path, settings: ThingSettings, workers: int | None, track: TrackProgress
 ) -> str:
     """The memory of the scans, taught if it is not there."""
     if settings.models is not None:
@@ -250,7 +250,7 @@ def _check_same(out: Path, settings: ThingSettings, things: TaughtThings) -> Non
         repeats=settings.repeats,
         seed=settings.seed,
     )
-    file = out / EPISODES
+    file = out / EPISODES_FILE
     if not file.exists():
         write_record(file, made)
         return

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.benchmark.environments import Rules, rows
 from nextview.benchmark.thing_benchmark import opened
-from nextview.benchmark.thing_episodes import SPHERE, Occlusion, Setting, ThingEpisode
+from nextview.benchmark.thing_episodes import EPISODE_SPHERE, Occlusion, Setting, ThingEpisode
 from nextview.checks import extras, whole
 from nextview.errors import DatasetError, SessionError
 from nextview.geometry.mesh import load_mesh
@@ -26,12 +25,11 @@ from nextview.training.rollout import value_of
 with extras():
     import gymnasium
 
-Float = NDArray[np.float64]
 
 KEPT_EPISODES = 64  # whose views are kept in memory
 FAR_METRES = 10.0  # bound of the places of hypotheses
 MOST_NATS = 20.0  # bound of the information of a view
-LEAST_BELIEF = 1e-12  # whose logarithm is paid for
+LEAST_PAID_BELIEF = 1e-12  # whose logarithm is paid for
 
 
 class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
@@ -77,7 +75,7 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
             UsageError: rules that make no sense.
         """
         self.rules = Rules(**rules)
-        whole(self.rules.max_views, "the number of views", 2, len(SPHERE))
+        whole(self.rules.max_views, "the number of views", 2, len(EPISODE_SPHERE))
         self.draws = whole(draws, "the number of draws", 1)
         self.things: TaughtThings = opened(models)
         files = {thing.name: thing.path for thing in find_things(Path(scans)).things}
@@ -95,7 +93,7 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
                 setting,
             )
         )
-        self.action_space = gymnasium.spaces.Discrete(len(SPHERE))
+        self.action_space = gymnasium.spaces.Discrete(len(EPISODE_SPHERE))
         self.observation_space = self._space()
         self._episode: ThingEpisode | None = None
         self._views: list[int] = []
@@ -103,7 +101,7 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
     def _space(self) -> gymnasium.spaces.Dict:
         box = partial(gymnasium.spaces.Box, dtype=np.float32)
         count = len(self.things.names)
-        views = len(SPHERE)
+        views = len(EPISODE_SPHERE)
         return gymnasium.spaces.Dict(
             {
                 "belief": box(0, 1, (count,)),
@@ -148,11 +146,13 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
         if self._episode is None or self._over:
             raise SessionError("no episode is under way; call reset")
         here = self._views[-1]
-        wanted = cells_from(SPHERE)[here, int(rows(action, 1, len(SPHERE), "action")[0])]
-        free = np.ones(len(SPHERE), bool)
+        wanted = cells_from(EPISODE_SPHERE)[
+            here, int(rows(action, 1, len(EPISODE_SPHERE), "action")[0])
+        ]
+        free = np.ones(len(EPISODE_SPHERE), bool)
         free[self._views] = False
-        view = int(np.where(free, SPHERE.travel[wanted], np.inf).argmin())
-        way = float(SPHERE.travel[here, view])
+        view = int(np.where(free, EPISODE_SPHERE.travel[wanted], np.inf).argmin())
+        way = float(EPISODE_SPHERE.travel[here, view])
         self._views.append(view)
         self._travel += way
 
@@ -168,7 +168,7 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
         """The objective now."""
         assert self._episode is not None
         self._belief = self._episode.verified(self._views)[0].belief
-        logs = np.log(np.maximum(self._belief, LEAST_BELIEF))[None]
+        logs = np.log(np.maximum(self._belief, LEAST_PAID_BELIEF))[None]
         truth = np.array([self._episode.thing])
         return float(value_of(logs, truth, self.rules.objective)[0])
 
@@ -178,8 +178,8 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
         leading = outlook.hypotheses
         count = len(leading.things)
         order = np.argsort(-leading.belief, kind="stable")
-        reached = cells_from(SPHERE)[self._views[-1]]
-        cameras = outlook.cameras(SPHERE.directions[[*reached, self._views[-1]]])
+        reached = cells_from(EPISODE_SPHERE)[self._views[-1]]
+        cameras = outlook.cameras(EPISODE_SPHERE.directions[[*reached, self._views[-1]]])
 
         belief = np.zeros(MOST_LEADING, np.float32)
         belief[:count] = leading.belief[order]
@@ -206,5 +206,7 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
             "travel": self._travel,
             "answer": int(self._belief.argmax()),
             "confidence": float(self._belief.max()),
-            "travel_to": SPHERE.travel[self._views[-1]][cells_from(SPHERE)[self._views[-1]]],
+            "travel_to": EPISODE_SPHERE.travel[self._views[-1]][
+                cells_from(EPISODE_SPHERE)[self._views[-1]]
+            ],
         }

@@ -37,21 +37,21 @@ from nextview.things.expected_views import Outlook
 from nextview.things.registration import FINE, align, start
 from nextview.things.taught import TaughtThings
 from nextview.things.verifier import FINE_SIDE, Verified
+from nextview.types import Float, Floats
 
-Float = NDArray[np.float64]
 Occlusion = Literal["none", "half", "heavy"]
 
-SPHERE = ViewSphere.named("40")
+EPISODE_SPHERE = ViewSphere.named("40")
 NEAREST_SURFACE = 0.25  # metres between the camera and the surface, at least
 USUAL_DISTANCE = 0.45  # metres between the camera and the centre, at most
 RADII_AWAY = 5.0  # of the camera from the centre, between these
 VISIBLE_SHARES = {"half": (0.45, 0.65), "heavy": (0.25, 0.45)}  # means over the viewpoints
 FEWEST_BOXES = 3  # around a thing that is partly hidden
 MOST_BOXES = 40
-LAYOUTS_TRIED = 60  # of boxes; then the one that comes nearest is taken
+BOX_LAYOUTS_TRIED = 60  # of boxes; then the one that comes nearest is taken
 SHARE_SIDE = 24  # rows and columns of the pictures by which a share is measured
 SHARE_EVERY = 3  # every so many viewpoints
-SURFACE_POINTS = 500  # by which the error of a pose is measured
+POSE_ERROR_POINTS = 500  # by which the error of a pose is measured
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class ThingEpisode:
     def _first_view(self) -> int:
         """A view that shows the thing."""
         rng = np.random.default_rng((*self._seed, 3))
-        for view in rng.permutation(len(SPHERE)):
+        for view in rng.permutation(len(EPISODE_SPHERE)):
             if self.observation(int(view)).seen:
                 return int(view)
         raise UsageError(f"{self.things.names[self.thing]}: shows from no viewpoint")
@@ -136,7 +136,7 @@ class ThingEpisode:
     def _sense(self, view: int) -> None:
         """Look from one viewpoint."""
         camera = self.stage.camera(view)
-        observation = camera.observe(SPHERE.poses[view])
+        observation = camera.observe(EPISODE_SPHERE.poses[view])
         for name, values in _arrays_of(observation).items():
             self._kept[f"{view}.{name}"] = values
         in_camera = np.full((4, 4), np.nan)
@@ -146,7 +146,7 @@ class ThingEpisode:
         if "true_pose" not in self._kept:
             self._kept["true_pose"] = self.stage.true_pose
 
-    def log_evidence(self, view: int) -> NDArray[np.floating]:
+    def log_evidence(self, view: int) -> Floats:
         """What the features say of a view that shows the thing."""
         name = f"{view}.evidence"
         if name not in self._kept:
@@ -204,7 +204,7 @@ class ThingEpisode:
         pose[:3, 3] += found.cameras[rows[0], sorted(seen).index(seen[-1])]
 
         surface = self.things.verifier.caster.surfaces[self.thing]
-        points = surface.sample(SURFACE_POINTS, np.random.default_rng(0))
+        points = surface.sample(POSE_ERROR_POINTS, np.random.default_rng(0))
         true = self._kept[f"{seen[-1]}.in_camera"]
         there, here = (
             points @ each[:3, :3].T + each[:3, 3] for each in (true, np.linalg.inv(camera) @ pose)
@@ -233,12 +233,12 @@ class ThingEpisode:
         seen = self.seen(views)
         recogniser = self.things.recogniser
         classes = len(recogniser.classes)
-        visited = np.zeros((1, len(SPHERE)), bool)
+        visited = np.zeros((1, len(EPISODE_SPHERE)), bool)
         visited[0, list(views)] = True
         joint = None
         if "joint" in needs:
             total = np.sum([self.log_evidence(view) for view in seen], axis=0)
-            here = SPHERE.azimuth[views[-1]]
+            here = EPISODE_SPHERE.azimuth[views[-1]]
             joint = recogniser.calibration.joint(total, len(seen), classes, here)[None]
 
         return EpisodeState(
@@ -331,12 +331,12 @@ def hiding_boxes(standing: Mesh, wanted: tuple[float, float], seed: tuple[int, .
         The first layout in this range, or else the one that comes nearest to it.
     """
     rng = np.random.default_rng(seed)
-    poses = SPHERE.poses[::SHARE_EVERY]
+    poses = EPISODE_SPHERE.poses[::SHARE_EVERY]
     alone = SimulatedCamera(standing, SHARE_SIDE)
     own = [alone.observe(pose).depth for pose in poses]
     found: list[tuple[float, Mesh]] = []
 
-    for _ in range(LAYOUTS_TRIED):
+    for _ in range(BOX_LAYOUTS_TRIED):
         boxes = boxes_around(
             standing.vertices, int(rng.integers(FEWEST_BOXES, MOST_BOXES + 1)), rng
         )

@@ -4,9 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from nextview.benchmark.thing_episodes import SPHERE, ThingEpisode
+from nextview.benchmark.thing_episodes import EPISODE_SPHERE, ThingEpisode
 from nextview.errors import UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState, Policy, best_view
@@ -16,8 +15,9 @@ from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.policies.registry import make_policy
 from nextview.things.leading import Hypotheses
 from nextview.things.taught import TaughtThings
+from nextview.types import Index
 
-POLICIES = (
+THING_POLICIES = (
     "random",
     "spread",
     "furthest",
@@ -41,7 +41,7 @@ class RingSteps:
     sphere: ViewSphere
     needs: tuple[str, ...] = ()
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """The free view that comes next, of each episode.
 
         Args:
@@ -71,7 +71,7 @@ class FairCeiling:
     episode: ThingEpisode
     needs: tuple[str, ...] = ("outlook",)
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """The free view that is expected to raise the log-belief in the truth most.
 
         Args:
@@ -90,11 +90,13 @@ class FairCeiling:
             np.concatenate([self.episode.aligned_truth(views)[None], others.poses[rivals]]),
             belief / belief.sum(),
         )
-        cameras = outlook.cameras(SPHERE.directions)
+        cameras = outlook.cameras(EPISODE_SPHERE.directions)
         expected = replace(outlook, hypotheses=hypotheses).expect(cameras)
         value = expected.found * expected.gain(0)
 
-        return best_view(SPHERE, state, value[None] + 1e-9 * rng.random((1, len(SPHERE))))
+        return best_view(
+            EPISODE_SPHERE, state, value[None] + 1e-9 * rng.random((1, len(EPISODE_SPHERE)))
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +112,7 @@ class Foresight:
     episode: ThingEpisode
     needs: tuple[str, ...] = ()
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """The free view after which the belief in the truth is largest.
 
         Args:
@@ -119,11 +121,11 @@ class Foresight:
         """
         views = np.flatnonzero(state.visited[0]).tolist()
         if state.step > 1 and self.episode.belief_in_truth(views) >= SETTLED_BELIEF:
-            return Spread(SPHERE).next_views(state, rng)
-        values = np.full((1, len(SPHERE)), -np.inf)
+            return Spread(EPISODE_SPHERE).next_views(state, rng)
+        values = np.full((1, len(EPISODE_SPHERE)), -np.inf)
         for view in np.flatnonzero(state.free[0]).tolist():
             values[0, view] = self.episode.belief_in_truth([*views, view])
-        return best_view(SPHERE, state, values)
+        return best_view(EPISODE_SPHERE, state, values)
 
 
 def policies_of(
@@ -132,33 +134,34 @@ def policies_of(
     """Policies by name, each made for an episode.
 
     Args:
-        names: of POLICIES, or MODULE:CLASS for one of your own, which is made with the viewpoints.
+        names: of THING_POLICIES, or MODULE:CLASS for one of your own, which is made with the
+            viewpoints.
         things: the things, for the one that goes by remembered pictures.
 
     Raises:
         UsageError: there is no policy of one of these names.
         PolicyError: one cannot be made.
     """
-    geometry = DiscriminateGeometry(SPHERE)
+    geometry = DiscriminateGeometry(EPISODE_SPHERE)
     known: dict[str, Callable[[ThingEpisode], Policy]] = {
-        "random": lambda _: RandomAll(SPHERE),
-        "spread": lambda _: Spread(SPHERE),
-        "furthest": lambda _: Furthest(SPHERE),
-        "fixed": lambda _: RingSteps(SPHERE),
+        "random": lambda _: RandomAll(EPISODE_SPHERE),
+        "spread": lambda _: Spread(EPISODE_SPHERE),
+        "furthest": lambda _: Furthest(EPISODE_SPHERE),
+        "fixed": lambda _: RingSteps(EPISODE_SPHERE),
         "geometry": lambda _: geometry,
         "pose": lambda _: replace(geometry, goal="pose"),
         "foresight": Foresight,
         "ceiling": FairCeiling,
     }
     if "picture" in names:
-        picture = Discriminate.from_card(things.recogniser.card.card_path, SPHERE)
+        picture = Discriminate.from_card(things.recogniser.card.card_path, EPISODE_SPHERE)
         known["picture"] = lambda _: picture
     for name in names:
         if name in known:
             continue
         if ":" not in name:
-            raise UsageError(f"no policy is called {name}; there are {', '.join(POLICIES)}")
-        known[name] = _always(make_policy(name, SPHERE))
+            raise UsageError(f"no policy is called {name}; there are {', '.join(THING_POLICIES)}")
+        known[name] = _always(make_policy(name, EPISODE_SPHERE))
 
     return {name: known[name] for name in names}
 

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from nextview.benchmark.thing_episodes import ThingEpisode
-from nextview.benchmark.thing_policies import POLICIES
+from nextview.benchmark.thing_policies import THING_POLICIES
 from nextview.errors import PolicyError
 from nextview.policies.base import Policy
 
@@ -84,5 +84,5 @@ def run(episode: ThingEpisode, policy: Policy, count: int, rng: np.random.Genera
 def policies_in(runs: Sequence[EpisodeRuns]) -> tuple[str, ...]:
     """The policies that all episodes were replayed with: the package's own first."""
     there = set.intersection(*(set(each.runs) for each in runs))
-    own = sorted(there - set(POLICIES))
-    return (*(name for name in POLICIES if name in there), *own)
+    own = sorted(there - set(THING_POLICIES))
+    return (*(name for name in THING_POLICIES if name in there), *own)

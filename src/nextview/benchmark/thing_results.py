@@ -25,7 +25,7 @@ from nextview.session.style import (
     to_png,
 )
 
-COLOURS = {
+THING_POLICY_COLOURS = {
     "random": GREY,
     "spread": "#d99000",
     "furthest": LIGHT_BLUE,
@@ -183,8 +183,8 @@ def look_of_policy(policy: str, tables: ThingTables) -> dict[str, Any]:
         policy: its name.
         tables: that name all policies.
     """
-    own = [name for name in policies_of_tables(tables) if name not in COLOURS]
-    colour = COLOURS.get(policy) or OWN[own.index(policy) % len(OWN)]
+    own = [name for name in policies_of_tables(tables) if name not in THING_POLICY_COLOURS]
+    colour = THING_POLICY_COLOURS.get(policy) or OWN[own.index(policy) % len(OWN)]
     return {"color": colour, "linestyle": ":" if policy in CEILINGS else "-"}
 
 

@@ -4,19 +4,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.benchmark.confusable import Alikeness
 from nextview.benchmark.statistics import bootstrap_p, holm, interval, resample
-from nextview.benchmark.thing_episodes import SPHERE
+from nextview.benchmark.thing_episodes import EPISODE_SPHERE
 from nextview.benchmark.thing_policies import CEILINGS
 from nextview.benchmark.thing_replay import EpisodeRuns, ThingRun
 from nextview.checks import extras
+from nextview.types import Float, Index, Mask
 
 with extras():
     import pandas as pd
 
-Float = NDArray[np.float64]
 
 REFERENCE = "random"  # the policy that all others are compared with
 ALL = "all"
@@ -81,7 +80,7 @@ class _Runs:
         verification: seconds of each verification of all views.
     """
 
-    things: NDArray[np.int64]
+    things: Index
     weight: Float
     right: Float
     sure: Float
@@ -106,7 +105,7 @@ class _Runs:
         ever = sure.any(1)
         last = np.where(ever, sure.argmax(1), sure.shape[1] - 1)
         rows = np.arange(len(runs))
-        arcs = [SPHERE.arc[each.views[:-1], each.views[1:]] for _, each in runs]
+        arcs = [EPISODE_SPHERE.arc[each.views[:-1], each.views[1:]] for _, each in runs]
         travel = np.concatenate([np.zeros((len(runs), 1)), np.cumsum(arcs, axis=1)], 1)
 
         return cls(
@@ -214,9 +213,7 @@ def summarise_things(runs: Sequence[EpisodeRuns], alike: Alikeness, how: Compare
     )
 
 
-def _drawn(
-    chosen: NDArray[np.bool_], names: Sequence[str], how: Compared, rng: np.random.Generator
-) -> Float:
+def _drawn(chosen: Mask, names: Sequence[str], how: Compared, rng: np.random.Generator) -> Float:
     """How often each thing is drawn in each sample, (1 + S, T); in the first each once."""
     bodies = [name.partition("_")[0] if how.families else name for name in names]
     family = np.unique(np.array(bodies)[chosen], return_inverse=True)[1]

@@ -10,6 +10,7 @@ from nextview.data.predictions import Predictions
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, EntryError
 from nextview.recognition.map_names import CONFIDENCE, map_name, measure_of
+from nextview.types import Float32
 
 TRUE = "true-"  # how the names of true maps begin
 IN_PREDICTIONS: dict[str, Callable[[Predictions], NDArray]] = {  # (N, V); others: in the store
@@ -19,7 +20,7 @@ IN_PREDICTIONS: dict[str, Callable[[Predictions], NDArray]] = {  # (N, V); other
 }
 
 
-def true_map(p: Predictions, name: str) -> NDArray[np.float32]:
+def true_map(p: Predictions, name: str) -> Float32:
     """Return the local windows of a true map.
 
     Args:
@@ -46,7 +47,7 @@ def known_maps(p: Predictions) -> tuple[str, ...]:
     return tuple(map(map_name, dict.fromkeys((*IN_PREDICTIONS, *stored))))
 
 
-def true_measure(p: Predictions, measure: str) -> NDArray[np.float32]:
+def true_measure(p: Predictions, measure: str) -> Float32:
     """Return a measure of the views of predictions.
 
     Args:

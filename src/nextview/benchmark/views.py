@@ -21,7 +21,7 @@ with extras():
     import pandas as pd
 
 CEILING = "oracle-gain"
-COLUMNS = ["policy", "n_views", "measure", "value", "low", "high", "p", "p_holm"]
+RESULT_COLUMNS = ["policy", "n_views", "measure", "value", "low", "high", "p", "p_holm"]
 # value, low, high, p, Holm's p
 Numbers = dict[tuple[str, int, str], tuple[float, float, float, float, float]]
 
@@ -60,7 +60,7 @@ def measured(
         references: names of the reference policies.
 
     Returns:
-        One number per row, with the columns COLUMNS.
+        One number per row, with the columns RESULT_COLUMNS.
     """
     names = [
         name
@@ -100,7 +100,7 @@ def measured(
             share = value[name, f"to_{references[0]}"] / gap if gap > 0 else np.nan
             rows.append((name, k, "share_of_gap", share, np.nan, np.nan, np.nan))
 
-    table = pd.DataFrame(rows, columns=COLUMNS[:-1])
+    table = pd.DataFrame(rows, columns=RESULT_COLUMNS[:-1])
     table["p_holm"] = holm(
         np.where(~table["policy"].map(knows_truth).astype(bool), table["p"], np.nan)
     )

@@ -16,7 +16,7 @@ from nextview.types import Float, Float32
 
 NO_DEPTH = np.iinfo(np.uint16).max  # what some sensors give for "nothing" besides 0
 DEEP = ("I;16", "I;16B", "I")  # Pillow's names of grey images of 16 bits
-GREY = ("1", "L", "LA", "La")  # its names of grey images of 8 bits or fewer
+GREY_MODES = ("1", "L", "LA", "La")  # its names of grey images of 8 bits or fewer
 LARGEST_TEXT = 2**28  # bytes of a list of images or poses
 MILLIMETRES = 0.001
 
@@ -279,7 +279,7 @@ def _as_grey(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
 def _picture(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     """A picture, (H, W) uint8 if it is grey, else (H, W, 3) uint8, RGB."""
     image = _opened_as(path, shape)
-    return np.asarray(image.convert("L" if image.mode in GREY else "RGB"))
+    return np.asarray(image.convert("L" if image.mode in GREY_MODES else "RGB"))
 
 
 def _opened_as(path: Path, shape: tuple[int, ...]) -> Image.Image:

@@ -17,7 +17,7 @@ from nextview.cli.episode_table import plain
 from nextview.cli.progress import Terminal, console, track
 from nextview.errors import ObservationError, UsageError
 from nextview.files import new_file
-from nextview.scene.report import COLUMNS, doubts_of, row_of, scene_as_json
+from nextview.scene.report import REPORT_COLUMNS, doubts_of, row_of, scene_as_json
 from nextview.scene.scene import Look, Scene
 from nextview.sensing.object_frame import Box, upright_axes
 from nextview.session.system import load
@@ -170,7 +170,7 @@ def print_scene(scene: Scene, name: str) -> None:
     table = Table(box=box.SIMPLE, pad_edge=False, padding=(0, 1, 0, 0))
     frames = len(scene.frames)
     table.title = f"On the table in {name}, {frames} frame{'s' * (frames > 1)}"
-    for column in COLUMNS:
+    for column in REPORT_COLUMNS:
         table.add_column(column, justify="right" if column in ("", "frames") else "left")
     for thing in objects:
         table.add_row(*row_of(thing))

@@ -12,14 +12,14 @@ from nextview.files import check_new
 from nextview.geometry.mesh import MAX_FACES, load_mesh
 from nextview.geometry.viewsphere import ViewSphere
 
-Level = Literal["light", "medium", "heavy"]
+ClutterLevel = Literal["light", "medium", "heavy"]
 
 
 def scenes(
     meshes: Path,
     out: Path,
     /,
-    levels: tuple[Level, ...] = ("light", "medium", "heavy"),
+    levels: tuple[ClutterLevel, ...] = ("light", "medium", "heavy"),
     scenes: int | None = None,
     split: NamedSplit | None = None,
     held_out: str | None = None,

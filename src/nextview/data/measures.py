@@ -66,7 +66,7 @@ class MeasuredView:
 
 
 # gives an object of a store, from all its views
-Views = Callable[[ViewStore, int], Iterator[MeasuredView]]
+MeasuredViews = Callable[[ViewStore, int], Iterator[MeasuredView]]
 
 
 @dataclass(frozen=True)
@@ -221,7 +221,7 @@ def measure(
     scheduler: str | None = None,
     objects: Index | None = None,
     overwrite: bool = False,
-    views: Views = depth_views,
+    views: MeasuredViews = depth_views,
 ) -> Iterator[tuple[int, int]]:
     """Compute measures of rendered views and add them to their store.
 
@@ -253,7 +253,7 @@ def measure(
     )
 
 
-def _measure(names: tuple[str, ...], views: Views, store: ViewStore, i: int) -> Made:
+def _measure(names: tuple[str, ...], views: MeasuredViews, store: ViewStore, i: int) -> Made:
     object_name = store.names[i]
     functions = {name: find_measure(name) for name in names}
     values = {name: np.empty(len(store.sphere), np.float32) for name in names}

@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Iterable
 
-Track = Callable[[Iterable[int], int, str], None]
+TrackProgress = Callable[[Iterable[int], int, str], None]
 """Follows one part of a job to its end, given counts of what is done, their last one and its name.
 
 ``cli.progress.track``, a progress bar, is one; ``silently`` is another.

@@ -8,10 +8,10 @@ from nextview.errors import UsageError
 from nextview.geometry.mesh import Mesh, make_mesh
 
 # two opposite corners, centimetres, z up
-Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+BoxCorners = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
-def _legs(x: float, y: float, thick: float, height: float) -> list[Box]:
+def _legs(x: float, y: float, thick: float, height: float) -> list[BoxCorners]:
     return [
         ((i * x, j * y, 0), (i * (x - thick), j * (y - thick), height))
         for i in (-1, 1)
@@ -19,29 +19,29 @@ def _legs(x: float, y: float, thick: float, height: float) -> list[Box]:
     ]
 
 
-def chair() -> list[Box]:
+def chair() -> list[BoxCorners]:
     """A chair with four legs and a slatted back; it faces +x."""
     x = 21.0
     y = 22.0
     seat = 45.0
     back = 48.0
     leg = 4.0
-    posts: list[Box] = [
+    posts: list[BoxCorners] = [
         ((-x, s * y, seat), (-x + leg, s * (y - leg), seat + back)) for s in (-1, 1)
     ]
-    slats: list[Box] = [
+    slats: list[BoxCorners] = [
         ((-x, -y, seat + h * back), (-x + 2, y, seat + (h + 0.16) * back))
         for h in (0.3, 0.56, 0.84)
     ]
     return [((-x, -y, seat), (x, y, seat + 4)), *_legs(x, y, leg, seat), *posts, *slats]
 
 
-def table() -> list[Box]:
+def table() -> list[BoxCorners]:
     """A table with four legs."""
     return [((-70, -40, 72), (70, 40, 75)), *_legs(70, 40, 7, 72)]
 
 
-def monitor() -> list[Box]:
+def monitor() -> list[BoxCorners]:
     """A flat screen on a foot; it faces +x."""
     return [
         ((-2, -30, 12), (2, 30, 48)),
@@ -50,7 +50,7 @@ def monitor() -> list[Box]:
     ]
 
 
-SAMPLE_MESHES: dict[str, Callable[[], list[Box]]] = {
+SAMPLE_MESHES: dict[str, Callable[[], list[BoxCorners]]] = {
     "chair": chair,
     "table": table,
     "monitor": monitor,
@@ -64,7 +64,7 @@ def sample_mesh(name: str) -> Mesh:
     return boxes_mesh(SAMPLE_MESHES[name](), name)
 
 
-def boxes_mesh(boxes: list[Box], name: str) -> Mesh:
+def boxes_mesh(boxes: list[BoxCorners], name: str) -> Mesh:
     """Create a mesh of axis-aligned boxes, each closed by twelve triangles.
 
     Args:

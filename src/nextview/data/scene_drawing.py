@@ -26,7 +26,7 @@ from nextview.simulation.scene import (
     FOOTPRINT,
     SCENE_TABLE,
     Item,
-    Scene,
+    TargetScene,
     block_item,
     cached_mesh,
     footprint,
@@ -267,7 +267,7 @@ def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) ->
         )
 
         if placed is not None:
-            scene = Scene(mesh, tuple(item for _, item in placed))
+            scene = TargetScene(mesh, tuple(item for _, item in placed))
             objects = tuple(thing for thing, _ in placed if isinstance(thing, Placement))
             blocks = tuple(thing for thing, _ in placed if isinstance(thing, Block))
             shares = tuple(
@@ -331,7 +331,7 @@ class _Hiding:
         )
 
 
-Thing = tuple[Placement | Block, Item]
+PlacedThing = tuple[Placement | Block, Item]
 
 
 def _layout(
@@ -342,12 +342,12 @@ def _layout(
     level: str,
     goal: float,
     rng: np.random.Generator,
-) -> list[Thing] | None:
+) -> list[PlacedThing] | None:
     """Place things that hide a given share of a target; None if that does not work."""
     walls = int(rng.choice(3, p=WALLS[level]))
     middle = footprint(mesh.vertices)
     floor = float(mesh.vertices[:, 2].min())
-    placed: list[Thing] = []
+    placed: list[PlacedThing] = []
     free = np.ones(len(hiding.views), bool)
 
     for _ in range(THINGS_TRIED):

@@ -22,7 +22,7 @@ from nextview.sensing.expected_visibility import (
     sight_lines,
 )
 from nextview.session.episode import Constrain, Visible, unconstrained
-from nextview.simulation.scene import Scene
+from nextview.simulation.scene import TargetScene
 from nextview.simulation.scene_layout import clutter_level
 from nextview.simulation.simulated import SHOWS_TARGET, SceneCamera, visible_shares
 from nextview.types import Float, Float32, Index, Mask
@@ -48,7 +48,7 @@ def scene_intrinsics(distance: float, side: int = SCENE_SIDE) -> Float:
     return PinholeCamera.centred(focal, (side, side)).matrix
 
 
-def render_scene(scene: Scene, sphere: ViewSphere) -> dict[str, NDArray]:
+def render_scene(scene: TargetScene, sphere: ViewSphere) -> dict[str, NDArray]:
     """Render what is kept of a scene besides the views of its target.
 
     The images contain no sensor errors.

@@ -5,13 +5,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import Viewpoints, ViewSphere
 from nextview.recognition.evidence import Evidence, items_at
-from nextview.types import Float
+from nextview.types import Float, Floats, Index, Mask
 
 if TYPE_CHECKING:
     from nextview.things.expected_views import Outlook  # SciPy, which few policies need
@@ -59,14 +58,14 @@ class EpisodeState:
         39
     """
 
-    current: NDArray[np.int64]
-    visited: NDArray[np.bool_]
+    current: Index
+    visited: Mask
     belief: Float
     evidence: Evidence
     step: int
-    episodes: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
+    episodes: Index = field(default_factory=lambda: np.zeros(1, np.int64))
     azimuth_bins: Float | None = None
-    reachable: NDArray[np.bool_] | None = None
+    reachable: Mask | None = None
     travel: Float | None = None
     places: Float | None = None
     observations: Sequence[Sequence[Observation]] | None = None
@@ -75,7 +74,7 @@ class EpisodeState:
     outlook: "Sequence[Outlook | None] | None" = None
 
     @property
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> Mask:
         """The views that may be chosen: reachable and not visited, (B, V) bool."""
         return ~self.visited if self.reachable is None else ~self.visited & self.reachable
 
@@ -107,7 +106,7 @@ class Policy(Protocol):
         "visibility".
         """
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Choose the next view of each episode.
 
         Args:
@@ -175,7 +174,7 @@ def check_weight(travel_weight: float) -> None:
         raise PolicyError(f"a travel weight is a number from 0 on, not {travel_weight}")
 
 
-def in_window(sphere: ViewSphere, state: EpisodeState, values: NDArray[np.floating]) -> Float:
+def in_window(sphere: ViewSphere, state: EpisodeState, values: Floats) -> Float:
     """Place the values of the local window's cells on the whole sphere.
 
     Args:
@@ -196,9 +195,7 @@ def in_window(sphere: ViewSphere, state: EpisodeState, values: NDArray[np.floati
     return found
 
 
-def window_of(
-    sphere: ViewSphere, state: EpisodeState, values: NDArray[np.floating]
-) -> NDArray[np.floating]:
+def window_of(sphere: ViewSphere, state: EpisodeState, values: Floats) -> Floats:
     """Select the values of the local window's cells.
 
     Args:
@@ -230,8 +227,8 @@ def considered(sphere: ViewSphere, state: EpisodeState, values: Float, scope: Sc
 
 
 def best_view(
-    sphere: Viewpoints, state: EpisodeState, values: NDArray[np.floating], scope: Scope = "global"
-) -> NDArray[np.int64]:
+    sphere: Viewpoints, state: EpisodeState, values: Floats, scope: Scope = "global"
+) -> Index:
     """Return the free view with the highest value.
 
     Args:
@@ -249,9 +246,7 @@ def best_view(
     return best_in_window(sphere, state, window_of(sphere, state, values))
 
 
-def best_in_window(
-    sphere: ViewSphere, state: EpisodeState, scores: NDArray[np.floating]
-) -> NDArray[np.int64]:
+def best_in_window(sphere: ViewSphere, state: EpisodeState, scores: Floats) -> Index:
     """Return the free view of the local window with the highest score.
 
     If no view of the window is free, it is the free view with the shortest travel; if no view is

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import Viewpoints, ViewSphere
@@ -20,6 +19,7 @@ from nextview.policies.base import (
     travel_from,
     visibility_of,
 )
+from nextview.types import Float, Floats, Index
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Baseline:
 class Random(Baseline):
     """Any unvisited view of the local window, with equal chance."""
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Draw a free view of the local window.
 
         Args:
@@ -55,7 +55,7 @@ class Random(Baseline):
 class RandomAll(Baseline):
     """Any unvisited view of the whole sphere, with equal probability."""
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Draw any free view.
 
         Args:
@@ -71,7 +71,7 @@ class RandomAll(Baseline):
 class Furthest(Baseline):
     """The unvisited view of the local window with the largest travel; ties are drawn."""
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Choose the view of the local window with the longest travel; ties are drawn.
 
         Args:
@@ -90,7 +90,7 @@ class Furthest(Baseline):
 class Unidirectional(Baseline):
     """The next unvisited azimuth on the same ring, always the same way round."""
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Choose the next free view round the ring; a local view once the ring is complete.
 
         Args:
@@ -120,7 +120,7 @@ class Spread:
     scope: Scope = "global"
     needs: tuple[str, ...] = ()
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Choose the view whose nearest visited view is farthest away; ties are drawn.
 
         Args:
@@ -139,7 +139,7 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class Visibility:
+class MostVisible:
     """The free view with the highest expected visible share, less weighted travel.
 
     Ties are drawn.
@@ -152,11 +152,11 @@ class Visibility:
     def __post_init__(self) -> None:
         check_weight(self.travel_weight)
 
-    def view_values(self, state: EpisodeState) -> NDArray[np.float64]:
+    def view_values(self, state: EpisodeState) -> Float:
         """Expected share less the weighted travel there, (B, V)."""
         return visibility_of(state) - self.travel_weight * travel_from(self.sphere, state)
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Choose the view with the highest expected visible share, less its travel; ties are drawn.
 
         Args:
@@ -179,10 +179,10 @@ class ViewList:
         views: of each episode in order, (E, k); the first of them are the first views.
     """
 
-    views: NDArray[np.int64]
+    views: Index
     needs: tuple[str, ...] = ()
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Take the next view of the list.
 
         Args:
@@ -200,7 +200,7 @@ class ViewList:
         return self.views[state.episodes, state.step]
 
 
-def orbit(sphere: ViewSphere, starts: NDArray[np.int64], k: int) -> NDArray[np.int64]:
+def orbit(sphere: ViewSphere, starts: Index, k: int) -> Index:
     """Return the next views round the ring of each start, then round the ring above.
 
     The lowest ring follows the top one.
@@ -219,7 +219,7 @@ def orbit(sphere: ViewSphere, starts: NDArray[np.int64], k: int) -> NDArray[np.i
     return ring * n + (sphere.azimuth_index[starts][:, None] + step) % n
 
 
-def ranked(values: NDArray[np.floating], k: int) -> NDArray[np.int64]:
+def ranked(values: Floats, k: int) -> Index:
     """Return the views with the highest values.
 
     Args:

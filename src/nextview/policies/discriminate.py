@@ -4,14 +4,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.errors import OtherUseError, PolicyError
 from nextview.geometry.viewsphere import Viewpoints, azimuth_of
 from nextview.policies.base import EpisodeState, best_view, check_weight, travel_from
 from nextview.things.memory import AZIMUTHS, RINGS, open_memory
+from nextview.types import Float, Floats, Index, Mask
 
-Float = NDArray[np.float64]
 WEIGHT = 40.0  # of a cosine, as a log-likelihood: for one view whose noise is not known yet
 # pairs of a thing, in a resting pose, and an azimuth that are weighed: those believed most
 LEADING = 24
@@ -29,10 +28,10 @@ class Rivals:
         alike: cosine of the two views, (V,); NaN where one of them is not remembered.
     """
 
-    classes: NDArray[np.int64]
-    hypotheses: NDArray[np.int64]
-    rings: NDArray[np.int64]
-    azimuths: NDArray[np.int64]
+    classes: Index
+    hypotheses: Index
+    rings: Index
+    azimuths: Index
     alike: Float
 
 
@@ -55,8 +54,8 @@ class Discriminate:
     """
 
     viewpoints: Viewpoints
-    views: NDArray[np.floating]
-    classes: NDArray[np.int64]
+    views: Floats
+    classes: Index
     travel_weight: float = 0.0
     needs: tuple[str, ...] = ("joint",)
 
@@ -87,7 +86,7 @@ class Discriminate:
             )
         return cls(viewpoints, memory.views, np.array(card.calibration.hypotheses))
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Choose the view from which the leading things look least alike; ties are drawn.
 
         Args:
@@ -132,16 +131,14 @@ class Discriminate:
         shown = self.views[hypothesis[:, None], ring, bins].astype(np.float32)
         shown = shown.swapaxes(0, 1)
         alike = shown @ shown.swapaxes(1, 2)  # (V, leading, leading)
-        known: NDArray[np.bool_] = np.asarray(shown.any(2))
+        known: Mask = np.asarray(shown.any(2))
         # what is not known tells nothing
         alike = np.where(known[:, :, None] & known[:, None], alike, 1)
         kept = np.exp(-WEIGHT * (1 - alike.astype(np.float64))) * belief
         same = self.classes[hypothesis][:, None] == self.classes[hypothesis]
         return np.log((kept * same).sum(2) / kept.sum(2)) @ belief
 
-    def _remembered(
-        self, azimuth: NDArray[np.int64], here: float
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _remembered(self, azimuth: Index, here: float) -> tuple[Index, Index]:
         """Return ring, (V,), and azimuth bin, (n, V), of the nearest remembered views."""
         ahead = np.rint((self.viewpoints.azimuth - here) / (2 * np.pi) * AZIMUTHS).astype(np.int64)
         ring = np.abs(np.degrees(self.viewpoints.elevation)[:, None] - RINGS).argmin(1)

@@ -3,14 +3,12 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import Viewpoints
 from nextview.policies.base import EpisodeState, best_view, check_weight, travel_from
 from nextview.things.expected_views import Goal, Outlook
-
-Float = NDArray[np.float64]
+from nextview.types import Float, Index, Mask
 
 NEAR_TIE = 0.05  # of the best value: among views that are worth so nearly the same, travel decides
 LEAST_INFORMATION = 1e-3  # nats, below which no view is expected to tell anything
@@ -43,7 +41,7 @@ class DiscriminateGeometry:
         """The same policy for the thing, or for the thing and its pose."""
         return replace(self, goal=goal)
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Choose the free view with the highest value; ties are drawn.
 
         Args:
@@ -70,8 +68,8 @@ class DiscriminateGeometry:
     def _values(
         self,
         outlook: Outlook | None,
-        free: NDArray[np.bool_],
-        visited: NDArray[np.bool_],
+        free: Mask,
+        visited: Mask,
         travel: Float,
     ) -> Float:
         """Values of the views of one episode, (V,); NaN for those that are not free."""
@@ -95,7 +93,7 @@ class DiscriminateGeometry:
         values[some] = information - NEAR_TIE * best * share - self.travel_weight * way
         return values
 
-    def _apart(self, views: NDArray[np.int64], visited: NDArray[np.bool_]) -> Float:
+    def _apart(self, views: Index, visited: Mask) -> Float:
         """Values below LEAST_INFORMATION, by the distance from all visited views, (N,)."""
         if not visited.any():
             return np.zeros(len(views))

@@ -30,7 +30,7 @@ from nextview.policies.base import (
 from nextview.policies.learned_tables import cells_from, cells_to
 from nextview.recognition.inference import OnnxFile, check_end, open_onnx, run_onnx
 from nextview.recognition.map_names import SPHERE_SUFFIX, in_order, maps_among
-from nextview.types import Float, Index
+from nextview.types import Float, Float32, Floats, Index
 
 INPUTS = ("belief", "view", "place", "azimuth_bin")
 """What a network may take: the belief over all views; that by the last view alone; the ring and the
@@ -220,7 +220,7 @@ class Gain:
 
     sphere: ViewSphere
     classes: int
-    score: Callable[[NDArray[np.float32]], NDArray[np.floating]]
+    score: Callable[[Float32], Floats]
     inputs: tuple[str, ...]
     travel_weight: float = 0.0
     scope: Scope = "global"
@@ -346,7 +346,7 @@ class GainTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     frame: CellFrame
 
 
-def _cells(weights: Path, session: OnnxFile, features: NDArray[np.float32]) -> NDArray[np.float32]:
+def _cells(weights: Path, session: OnnxFile, features: Float32) -> Float32:
     return run_onnx(weights, session, ["cells"], features)[0]
 
 

@@ -8,21 +8,21 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState, Scope, best_view, considered
 from nextview.policies.baselines import Spread
+from nextview.types import Float, Index
 
 
-def cells_from(sphere: ViewSphere) -> NDArray[np.int64]:
+def cells_from(sphere: ViewSphere) -> Index:
     """The view that lies in each cell, seen from each view, (V, V) int64: ``[view, cell]``."""
     n = sphere.azimuths
     return sphere.ring[None] * n + (sphere.azimuth_index[:, None] + sphere.azimuth_index[None]) % n
 
 
-def cells_to(sphere: ViewSphere) -> NDArray[np.int64]:
+def cells_to(sphere: ViewSphere) -> Index:
     """The cell in which each view lies, seen from each view, (V, V) int64: ``[view, other]``."""
     n = sphere.azimuths
     return sphere.ring[None] * n + (sphere.azimuth_index[None] - sphere.azimuth_index[:, None]) % n
@@ -39,7 +39,7 @@ class FixedSequence:
     """
 
     sphere: ViewSphere
-    moves: NDArray[np.int64]
+    moves: Index
     scope: Scope = "global"
     needs: tuple[str, ...] = ()
 
@@ -51,14 +51,14 @@ class FixedSequence:
             )
 
     @cached_property
-    def paths(self) -> NDArray[np.int64]:
+    def paths(self) -> Index:
         """The views of the whole sequence from each start, (V, K + 1) int64."""
         views = [np.arange(len(self.sphere))]
         for move in self.moves[self.sphere.ring].T:
             views.append(cells_from(self.sphere)[views[-1], move])
         return np.stack(views, 1)
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Follow the path of the first view; where that is not possible, choose as ``Spread`` does.
 
         Args:
@@ -100,7 +100,7 @@ class FixedRing:
         if not 0 <= self.ring < self.sphere.rings or not 1 <= self.steps < self.sphere.azimuths:
             raise PolicyError(f"there is no ring {self.ring} to be walked in steps of {self.steps}")
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Choose the next free view of the ring; as ``Spread`` does once the ring is complete.
 
         Args:
@@ -129,7 +129,7 @@ class ClassTable:
     """
 
     sphere: ViewSphere
-    values: NDArray[np.float64]
+    values: Float
     scope: Scope = "global"
     needs: tuple[str, ...] = ()
 
@@ -145,7 +145,7 @@ class ClassTable:
                 f" {wanted[1]})"
             )
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Choose the view with the highest value for the believed classes.
 
         Args:
@@ -159,10 +159,10 @@ class ClassTable:
 
     travel_weight = 0.0
 
-    def scores(self, state: EpisodeState) -> NDArray[np.float64]:
+    def scores(self, state: EpisodeState) -> Float:
         """The table where it may go; see ``ScoresViews``."""
         return considered(self.sphere, state, self._looked_up(state), self.scope)
 
-    def _looked_up(self, state: EpisodeState) -> NDArray[np.float64]:
+    def _looked_up(self, state: EpisodeState) -> Float:
         values = self.values[state.belief.argmax(1), self.sphere.ring[state.current]]
         return values[np.arange(len(values))[:, None], cells_to(self.sphere)[state.current]]

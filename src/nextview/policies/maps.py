@@ -3,14 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.errors import PolicyError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState, best_in_window, best_view, in_window
+from nextview.types import Float, Floats, Index, Mask
 
 
-def local_peaks(maps: NDArray[np.floating]) -> NDArray[np.bool_]:
+def local_peaks(maps: Floats) -> Mask:
     """Return the cells of maps, (B, rows, columns), that no neighbour exceeds.
 
     Neighbours are 3x3, and there are none beyond the border.
@@ -23,13 +23,13 @@ def local_peaks(maps: NDArray[np.floating]) -> NDArray[np.bool_]:
     ).max((-2, -1))
 
 
-def peaks_first(maps: NDArray[np.floating]) -> NDArray[np.float64]:
+def peaks_first(maps: Floats) -> Float:
     """Return scores that put peaks before all other cells, each group by value."""
     maps = np.asarray(maps, np.float64)
     return maps + (np.ptp(maps, axis=(1, 2), keepdims=True) + 1.0) * local_peaks(maps)
 
 
-def sphere_peaks(values: NDArray[np.floating]) -> NDArray[np.float64]:
+def sphere_peaks(values: Floats) -> Float:
     """Return such scores for maps of the whole sphere, (B, rings, azimuths).
 
     The last azimuth is next to the first.
@@ -59,17 +59,17 @@ class MapPeak:
     def needs(self) -> tuple[str, ...]:
         return (self.map_name,)
 
-    def view_values(self, state: EpisodeState) -> NDArray[np.float64]:
+    def view_values(self, state: EpisodeState) -> Float:
         """The predicted map where it lies on the sphere, (B, V); NaN outside the window."""
         return in_window(self.sphere, state, np.asarray(state.evidence.maps[self.map_name]))
 
     travel_weight = 0.0
 
-    def scores(self, state: EpisodeState) -> NDArray[np.float64]:
+    def scores(self, state: EpisodeState) -> Float:
         """Peaks, or valleys, before all else; see ``ScoresViews``."""
         return in_window(self.sphere, state, self._climbed(state))
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Choose the highest peak, or the deepest valley, of the predicted local map.
 
         Args:
@@ -81,7 +81,7 @@ class MapPeak:
         """
         return best_in_window(self.sphere, state, self._climbed(state))
 
-    def _climbed(self, state: EpisodeState) -> NDArray[np.float64]:
+    def _climbed(self, state: EpisodeState) -> Float:
         """What makes each cell of the window a better view, (B, rings, 3)."""
         maps = np.asarray(state.evidence.maps[self.map_name], np.float64)
         if maps.shape[1:] != (self.sphere.rings, 3):
@@ -114,15 +114,15 @@ class SpherePeak:
     def needs(self) -> tuple[str, ...]:
         return (self.map_name,)
 
-    def view_values(self, state: EpisodeState) -> NDArray[np.float64]:
+    def view_values(self, state: EpisodeState) -> Float:
         """The predicted map where it lies on the sphere, (B, V)."""
         return self._on_sphere(state, np.asarray(state.evidence.maps[self.map_name], np.float64))
 
-    def scores(self, state: EpisodeState) -> NDArray[np.float64]:
+    def scores(self, state: EpisodeState) -> Float:
         """Peaks before all else; see ``ScoresViews``."""
         return self._on_sphere(state, sphere_peaks(state.evidence.maps[self.map_name]))
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Choose the highest peak of the predicted map of the whole sphere.
 
         Args:
@@ -134,7 +134,7 @@ class SpherePeak:
         """
         return best_view(self.sphere, state, self.scores(state))
 
-    def _on_sphere(self, state: EpisodeState, maps: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _on_sphere(self, state: EpisodeState, maps: Float) -> Float:
         n = self.sphere.azimuths
         if maps.shape[1:] != (self.sphere.rings, n):
             raise PolicyError(

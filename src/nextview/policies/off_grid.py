@@ -8,7 +8,6 @@ values are interpolated.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.geometry.viewsphere import (
     Viewpoints,
@@ -18,7 +17,7 @@ from nextview.geometry.viewsphere import (
     elevation_of,
 )
 from nextview.policies.base import EpisodeState, Policy, ScoresViews, ValuesViews, travel_from
-from nextview.types import Float
+from nextview.types import Float, Index
 
 
 def anywhere(policy: Policy, sphere: Viewpoints) -> Policy:
@@ -56,7 +55,7 @@ class OffGrid:
     def needs(self) -> tuple[str, ...]:
         return self.policy.needs
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Ask the policy on its own grid and interpolate between its cells.
 
         Args:
@@ -141,7 +140,7 @@ class OffGrid:
         flat = np.cos(elevation)
         return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], 2)
 
-    def _nearest_to(self, cells: NDArray[np.int64], state: EpisodeState) -> NDArray[np.int64]:
+    def _nearest_to(self, cells: Index, state: EpisodeState) -> Index:
         """The free view nearest to a cell of the turned grid, (B,)."""
         towards = self._grid_directions(state)[np.arange(len(cells)), cells]
         return np.where(

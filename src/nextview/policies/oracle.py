@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState, Scope, best_in_window, best_view
 from nextview.policies.maps import peaks_first, sphere_peaks
 from nextview.recognition.belief import PLAIN_SUM, Calibration, of_true_class
+from nextview.types import Float, Floats, Index
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class OracleValley:
     """
 
     sphere: ViewSphere
-    labels: NDArray[np.int64]
+    labels: Index
     valley_classes: tuple[int, ...]
     map_name: str
 
@@ -28,7 +28,7 @@ class OracleValley:
     def needs(self) -> tuple[str, ...]:
         return (self.map_name,)
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Choose the valley of the map if the true class asks for it, else the peak.
 
         Args:
@@ -58,15 +58,15 @@ class OracleMeasure:
     """
 
     sphere: ViewSphere
-    values: NDArray[np.floating]
+    values: Floats
     peaks: bool = False
     needs: tuple[str, ...] = ()
 
-    def view_values(self, state: EpisodeState) -> NDArray[np.float64]:
+    def view_values(self, state: EpisodeState) -> Float:
         """The true values, (B, V)."""
         return np.asarray(self.values[state.episodes], np.float64)
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Choose the highest value, or the highest peak, of the true measure.
 
         Args:
@@ -95,15 +95,15 @@ class OracleGain:
     """
 
     sphere: ViewSphere
-    log_evidence: NDArray[np.floating]
+    log_evidence: Floats
     classes: int
-    labels: NDArray[np.int64]
-    objects: NDArray[np.int64]
+    labels: Index
+    objects: Index
     scope: Scope = "local"
     calibration: Calibration = PLAIN_SUM
     needs: tuple[str, ...] = ()
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Choose the view that raises the belief in the true class most.
 
         Args:
@@ -120,7 +120,7 @@ class OracleGain:
             return best_view(self.sphere, state, gain)
         return best_in_window(self.sphere, state, gain.reshape(b, -1, 3))
 
-    def _gains(self, state: EpisodeState, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _gains(self, state: EpisodeState, rows: Index) -> Float:
         """Return the log-belief in the truth after each view, or each of the window."""
         objects = self.objects[state.episodes[rows]]
         current = state.current[rows]

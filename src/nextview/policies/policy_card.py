@@ -14,14 +14,14 @@ from nextview.policies.base import Policy, Scope
 from nextview.policies.gain import GainTable, read_gain
 from nextview.policies.learned_tables import ClassTable, FixedRing, FixedSequence
 
-BUNDLED = Path(__file__).parent / "bundled"
-Sha256 = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")]
+BUNDLED_POLICIES = Path(__file__).parent / "bundled"
+OptionalHash = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")]
 
 
 class LearnedFrom(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Predictions that a policy was learned from: hash of the file, and the models."""
 
-    sha256: Sha256
+    sha256: OptionalHash
     models: dict[str, tuple[str, str]]
 
 
@@ -59,7 +59,7 @@ class PolicyCard(
     calibration: tuple[tuple[float, float], ...] = ()
     settings: dict[str, Any] = {}  # how it was learned
     commands: tuple[str, ...] = ()  # all that made it from the models, in order
-    sha256: Sha256 = ""  # of the ONNX file; "" if there is none
+    sha256: OptionalHash = ""  # of the ONNX file; "" if there is none
 
     def make(self, sphere: ViewSphere, weights: Path) -> Policy:
         """Create the policy that the card describes.
@@ -95,7 +95,7 @@ class PolicyCard(
 
 def bundled_policies() -> dict[str, Path]:
     """Cards of the learned policies that ship with the package, by name."""
-    return {path.stem: path for path in sorted(BUNDLED.glob("*.json"))}
+    return {path.stem: path for path in sorted(BUNDLED_POLICIES.glob("*.json"))}
 
 
 def write_policy_card(path: Path, card: PolicyCard, overwrite: bool = False) -> None:

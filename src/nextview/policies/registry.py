@@ -11,11 +11,11 @@ from nextview.geometry.viewsphere import Viewpoints, ViewSphere
 from nextview.policies.base import Policy
 from nextview.policies.baselines import (
     Furthest,
+    MostVisible,
     Random,
     RandomAll,
     Spread,
     Unidirectional,
-    Visibility,
 )
 from nextview.policies.discriminate import Discriminate
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
@@ -34,13 +34,15 @@ POLICIES: dict[str, Callable[[Any], Policy]] = {
     "unidirectional": Unidirectional,
     "spread": Spread,
     "spread-local": lambda sphere: Spread(sphere, "local"),
-    "visibility": Visibility,
+    "visibility": MostVisible,
 }
-GROUP = "nextview.policies"  # entry points by which packages add policies of their own
+POLICY_ENTRY_POINTS = (
+    "nextview.policies"  # entry points by which packages add policies of their own
+)
 ANYWHERE = ("random-all", "spread", "visibility")  # those that need no grid
 # before a gain policy's name: its values times the share that is expected to show
 VISIBLE = "visible-"
-DEFAULT = "gain"  # the policy where none is named
+DEFAULT_POLICY = "gain"  # the policy where none is named
 
 
 def make_policy(
@@ -103,7 +105,7 @@ def make_policy(
             )
         return VisibleGain(policy, policy.travel_weight)
 
-    path = plugins(GROUP).get(name, name)
+    path = plugins(POLICY_ENTRY_POINTS).get(name, name)
     if ":" in path:
         return _import_policy(path, sphere)
 
@@ -116,7 +118,12 @@ def make_policy(
             f"{name} uses information that no robot has, so it runs only in nextview benchmark"
         )
 
-    known = [*policy_names(), *map_policy_names(maps), *bundled_policies(), f"{VISIBLE}{DEFAULT}"]
+    known = [
+        *policy_names(),
+        *map_policy_names(maps),
+        *bundled_policies(),
+        f"{VISIBLE}{DEFAULT_POLICY}",
+    ]
     raise PolicyError(
         "no policy is called"
         f" {name!r}{did_you_mean(name, known) or '; there are ' + ', '.join(known)}"
@@ -156,7 +163,7 @@ def make_policy_anywhere(
 
 def policy_names() -> list[str]:
     """POLICIES, and those that installed packages add."""
-    return [*POLICIES, *plugins(GROUP)]
+    return [*POLICIES, *plugins(POLICY_ENTRY_POINTS)]
 
 
 def _card(name: str) -> Path | None:
@@ -232,7 +239,7 @@ def _of_memory(card: Path, sphere: Viewpoints, classes: tuple[str, ...] | None) 
 
 def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:
     if not isinstance(
-        policy, Discriminate | DiscriminateGeometry | Gain | Visibility | VisibleGain
+        policy, Discriminate | DiscriminateGeometry | Gain | MostVisible | VisibleGain
     ):
         raise PolicyError(f"{name}: this policy does not weigh travel")
     try:

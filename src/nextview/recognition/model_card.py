@@ -10,7 +10,7 @@ import msgspec
 from msgspec.structs import replace
 
 from nextview.errors import ModelError
-from nextview.files import LARGEST_RECORD, Sha256, read_record, regular_file, write_record
+from nextview.files import LARGEST_RECORD, HashText, read_record, regular_file, write_record
 from nextview.recognition.belief import PLAIN_SUM, Calibration, SizeEvidence
 from nextview.recognition.map_names import LCM, LEM, SPHERE_SUFFIX, Good
 from nextview.recognition.network_input import InputSpec
@@ -127,7 +127,7 @@ class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     things: Annotated[tuple[Thing, ...], msgspec.Meta(min_length=1)]
-    features_sha256: Sha256
+    features_sha256: HashText
     weight: Annotated[float, msgspec.Meta(gt=0, le=LARGEST_WEIGHT)]
     attribution: str = ""
     novelty: tuple[tuple[float, ...], ...] = ()
@@ -208,7 +208,7 @@ class ModelCard(
     name: str
     kind: str
     input: InputSpec
-    sha256: Sha256
+    sha256: HashText
     path: Path = NO_FOLDER
     network: str = ""
     classes: tuple[str, ...] = ()

@@ -11,24 +11,21 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, Polygon
 from matplotlib.patheffects import withStroke
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from nextview.geometry.ray_caster import RayCaster
-from nextview.scene.objects import UNKNOWN, SceneObject
+from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.object_frame import upright_axes
 from nextview.sensing.tabletop import TableTop
 from nextview.session.style import ACCENT, BLUE, FAINT, FIGURE_STYLE, GREY, INK, PAPER, PlainFigure
+from nextview.types import Float, Floats, Mask
 
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
-HEIGHT = 5.2  # inches, of both pictures
-MARGIN = 0.25  # inches
+FIGURE_HEIGHT = 5.2  # inches, of both pictures
+FIGURE_MARGIN = 0.25  # inches
 TOP = 0.75  # inches, for the heading
-COLOURS = (
+OBJECT_COLOURS = (
     "#0b6e99",
     "#c4532d",
     "#4b8b3b",
@@ -43,11 +40,11 @@ COLOURS = (
 AXIS_COLOURS = ("#d1495b", "#3f9b4f", "#2f6fd0")  # x, y and z, as is usual
 AXIS_LENGTH = 0.7  # of the radius of a thing
 NEAREST_SHADE, FARTHEST_SHADE = 0.25, 0.95  # of grey, where there is no picture
-AROUND = 0.08  # metres around all that is drawn from above
+FIGURE_BORDER = 0.08  # metres around all that is drawn from above
 LINE_SHARE = 0.026  # of the picture's height, of a line of text
 NAME_LINES = 4.0  # lines that a name is wide, about
 CONTEXT = 0.15  # of the picture's height and width around what was found
-CELL = 0.002  # metres, of what is drawn from above
+FIGURE_CELL = 0.002  # metres, of what is drawn from above
 SHORT_CAMERA = 0.06  # length of the arrow of a camera, of the picture's width
 
 
@@ -68,23 +65,27 @@ def draw_scene(
     top = tops[-1]
     number = len(tops) - 1
     colours = {
-        thing.number: GREY if thing.name == UNKNOWN else COLOURS[k % len(COLOURS)]
+        thing.number: GREY
+        if thing.name == UNKNOWN_NAME
+        else OBJECT_COLOURS[k % len(OBJECT_COLOURS)]
         for k, thing in enumerate(objects)
     }
     rc = FIGURE_STYLE | {"axes.grid": False, "figure.facecolor": PAPER, "axes.facecolor": PAPER}
     with matplotlib.rc_context(rc):
         rows, columns = _part(top.frame, [thing.pixels.get(number) for thing in objects])
         aspect = (columns.stop - columns.start) / (rows.stop - rows.start)
-        width = HEIGHT * (aspect + 1) + 3 * MARGIN
-        height = HEIGHT + TOP + MARGIN
+        width = FIGURE_HEIGHT * (aspect + 1) + 3 * FIGURE_MARGIN
+        height = FIGURE_HEIGHT + TOP + FIGURE_MARGIN
         figure = PlainFigure(figsize=(width, height))
         _heading(figure, len(tops), objects, title, width, height)
 
-        high = HEIGHT / height
-        left = figure.add_axes((MARGIN / width, MARGIN / height, HEIGHT * aspect / width, high))
+        high = FIGURE_HEIGHT / height
+        left = figure.add_axes(
+            (FIGURE_MARGIN / width, FIGURE_MARGIN / height, FIGURE_HEIGHT * aspect / width, high)
+        )
         _draw_frame(left, top.frame, number, objects, colours, (rows, columns))
-        start = (2 * MARGIN + HEIGHT * aspect) / width
-        right = figure.add_axes((start, MARGIN / height, HEIGHT / width, high))
+        start = (2 * FIGURE_MARGIN + FIGURE_HEIGHT * aspect) / width
+        right = figure.add_axes((start, FIGURE_MARGIN / height, FIGURE_HEIGHT / width, high))
         _draw_from_above(right, tops, objects, colours, target)
         return figure
 
@@ -98,7 +99,7 @@ def _heading(
     height: float,
 ) -> None:
     """Say how many objects were found, and in how many frames."""
-    named = sum(thing.name != UNKNOWN for thing in objects)
+    named = sum(thing.name != UNKNOWN_NAME for thing in objects)
     said = f"{named} known thing{'s' * (named != 1)}"
     if named < len(objects):
         said += f", {len(objects) - named} unknown"
@@ -106,7 +107,7 @@ def _heading(
         said = "nothing on the plane"
     more = f"{title}: " if title else ""
     more += f"{frames} frame{'s' * (frames > 1)}; names in italics are not confident"
-    x = MARGIN / width
+    x = FIGURE_MARGIN / width
     figure.text(x, 1 - 0.16 / height, said, fontsize=15, weight="bold", color=BLUE, va="top")
     figure.text(x, 1 - 0.5 / height, more, fontsize=9.5, color=GREY, va="top")
 
@@ -140,7 +141,7 @@ def _draw_frame(
             continue
         colour = colours[thing.number]
         shape = ndimage.gaussian_filter(ndimage.binary_closing(mask).astype(float), 1.0)
-        style = ":" if thing.name == UNKNOWN else "-"
+        style = ":" if thing.name == UNKNOWN_NAME else "-"
         axes.contour(shape, [0.5], colors=[colour], linewidths=1.8, linestyles=style)
         tint = np.zeros((*mask.shape, 4))
         tint[mask] = (*matplotlib.colors.to_rgb(colour), 0.22)
@@ -164,7 +165,7 @@ def _draw_frame(
         _name(axes, thing, x, y, colours, "bottom")
 
 
-def _picture(frame: Frame) -> NDArray[np.floating]:
+def _picture(frame: Frame) -> Floats:
     """A grey picture of what a frame shows, (H, W), 0 to 1."""
     if frame.image is not None:
         # pale, so that outlines and names can be read on it
@@ -206,15 +207,15 @@ def _name(
 ) -> None:
     """Write the name of an object, in italics where it is not confident."""
     options: dict[str, Any] = {"ha": "center", "va": side, "clip_on": True}
-    sure = thing.confident or thing.name == UNKNOWN
+    sure = thing.confident or thing.name == UNKNOWN_NAME
     axes.text(
         x,
         y,
         thing.name.replace("_", " "),
         fontsize=8.5,
-        color=INK if thing.name == UNKNOWN else colours[thing.number],
+        color=INK if thing.name == UNKNOWN_NAME else colours[thing.number],
         style="normal" if sure else "italic",
-        weight="bold" if sure and thing.name != UNKNOWN else "normal",
+        weight="bold" if sure and thing.name != UNKNOWN_NAME else "normal",
         path_effects=[withStroke(linewidth=2.6, foreground="white")],
         zorder=20,
         **options,
@@ -244,13 +245,13 @@ def _draw_from_above(
     everything = np.concatenate([*ends, np.zeros((0, 2))])
     if not len(everything):
         everything = (cameras[:, :3, 3] + cameras[:, :3, 2]) @ upright[:2].T
-    low = everything.min(0) - AROUND
-    high = everything.max(0) + AROUND
+    low = everything.min(0) - FIGURE_BORDER
+    high = everything.max(0) + FIGURE_BORDER
     side = float((high - low).max())
     low, high = (low + high) / 2 - side / 2, (low + high) / 2 + side / 2
 
     for thing, (corners, picture) in zip(objects, outlines, strict=True):
-        _draw_outline(axes, corners, picture, colours[thing.number], thing.name != UNKNOWN)
+        _draw_outline(axes, corners, picture, colours[thing.number], thing.name != UNKNOWN_NAME)
     for thing, (corners, _) in zip(objects, outlines, strict=True):
         middle = (corners.min(0) + corners.max(0)) / 2
         _name(axes, thing, float(middle[0]), float(middle[1]), colours, "center")
@@ -285,10 +286,10 @@ def _from_above(thing: SceneObject, upright: Float) -> tuple[Float, Mask | None]
             return flat, None
     placed = posed.vertices @ posed.pose[:3, :3].T + posed.pose[:3, 3]
     corners = placed @ upright.T
-    low = corners[:, :2].min(0) - 2 * CELL
-    count = np.ceil((corners[:, :2].max(0) + 2 * CELL - low) / CELL).astype(int) + 1
+    low = corners[:, :2].min(0) - 2 * FIGURE_CELL
+    count = np.ceil((corners[:, :2].max(0) + 2 * FIGURE_CELL - low) / FIGURE_CELL).astype(int) + 1
     at = np.stack(np.meshgrid(*(np.arange(n) for n in count), indexing="ij"), -1).reshape(-1, 2)
-    start = np.column_stack([low + at * CELL, np.full(len(at), corners[:, 2].max() + 1.0)])
+    start = np.column_stack([low + at * FIGURE_CELL, np.full(len(at), corners[:, 2].max() + 1.0)])
     caster = RayCaster([(corners, posed.faces)])
     away, _ = caster.cast(start, np.broadcast_to([0.0, 0.0, -1.0], start.shape))
 
@@ -307,8 +308,8 @@ def _draw_outline(
         )
         axes.add_patch(patch)
         return
-    low = corners.min(0) - 2 * CELL
-    x, y = (low[k] + CELL * np.arange(picture.shape[k]) for k in (0, 1))
+    low = corners.min(0) - 2 * FIGURE_CELL
+    x, y = (low[k] + FIGURE_CELL * np.arange(picture.shape[k]) for k in (0, 1))
     shape = ndimage.gaussian_filter(picture.astype(float), 0.8).T
     axes.contourf(x, y, shape, [0.5, 2.0], colors=[colour], alpha=0.25)
     axes.contour(x, y, shape, [0.5], colors=[colour], linewidths=1.6, linestyles=style)

@@ -7,7 +7,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
@@ -15,14 +14,14 @@ from nextview.scene.tracks import Track, render_track
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import upright_axes
 from nextview.sensing.tabletop import TableTop
+from nextview.types import Float, Index, Mask
 
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
-MARGIN = 0.012  # metres around an object, seen from above, within which pixels may be its own
-SAME_PLACE = 0.5  # share of a segment over an object, from which it is that object
+SEGMENT_MARGIN = (
+    0.012  # metres around an object, seen from above, within which pixels may be its own
+)
+SAME_OBJECT_SHARE = 0.5  # share of a segment over an object, from which it is that object
 SECOND = 0.2  # share of a segment over another object, from which the segment is cut
-COMPARED = 400  # points of a segment that are looked at
+SEGMENT_POINTS = 400  # points of a segment that are looked at
 FEWEST_TESTED = 30  # pixels in which an object should show before it is called gone
 GONE = 0.6  # share of these through which something behind it is seen
 STEP_BEHIND = 0.02  # metres by which that lies behind it, at least
@@ -57,7 +56,7 @@ class Outline:
         else:
             points = np.concatenate([sighting.hull for sighting in track.thing.sightings])
         flat = points @ axes.T
-        around = MARGIN / 4 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1.0]])
+        around = SEGMENT_MARGIN / 4 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1.0]])
         with suppress(QhullError):
             hull = ConvexHull((flat[:, None] + around).reshape(-1, 2))
             return cls(hull.equations, axes)
@@ -66,7 +65,7 @@ class Outline:
     def holds(self, points: Float) -> Mask:
         """Which points, (N, 3), lie inside of it or beside it, seen from above, (N,) bool."""
         flat = points @ self.axes.T
-        return np.asarray((flat @ self.sides[:, :2].T + self.sides[:, 2] <= MARGIN).all(1))
+        return np.asarray((flat @ self.sides[:, :2].T + self.sides[:, 2] <= SEGMENT_MARGIN).all(1))
 
 
 def assign(
@@ -93,7 +92,7 @@ def assign(
         )
         rows = np.flatnonzero(shares >= SECOND)
         best = int(shares.argmax()) if len(shares) else -1
-        if best < 0 or shares[best] < SAME_PLACE:
+        if best < 0 or shares[best] < SAME_OBJECT_SHARE:
             new.append(segment)
         elif len(rows) == 1:
             own[best] = own.get(best, np.zeros_like(segment)) | segment
@@ -107,13 +106,13 @@ def assign(
 def _points(mask: Mask, frame: Frame) -> Float:
     """Some points that pixels show, (N, 3), world, metres."""
     rows, columns = np.nonzero(mask & (frame.depth > 0))
-    few = slice(None, None, max(1, len(rows) // COMPARED))
+    few = slice(None, None, max(1, len(rows) // SEGMENT_POINTS))
     return frame.positions(rows[few], columns[few])
 
 
 def _divided(
     segment: Mask,
-    rows: NDArray[np.int64],
+    rows: Index,
     tracks: Sequence[Track],
     outlines: Sequence[Outline | None],
     top: TableTop,
@@ -145,7 +144,7 @@ def _divided(
 
 
 @dataclass(frozen=True)
-class Agreement:
+class SegmentAgreement:
     """How a frame agrees with an object that it may show.
 
     Attributes:
@@ -169,7 +168,7 @@ class Agreement:
         return self.tested >= FEWEST_TESTED and self.seen >= THERE
 
 
-def agreement(track: Track, top: TableTop) -> Agreement:
+def agreement(track: Track, top: TableTop) -> SegmentAgreement:
     """How a frame, which was not taken in yet, agrees with an object.
 
     Args:
@@ -183,18 +182,18 @@ def agreement(track: Track, top: TableTop) -> Agreement:
     inner = tested & ndimage.binary_erosion(np.isfinite(rendered.depth), iterations=2)
     count = int(np.count_nonzero(inner))
     if not count:
-        return Agreement(0, 0.0, 0.0)
-    return Agreement(
+        return SegmentAgreement(0, 0.0, 0.0)
+    return SegmentAgreement(
         count,
         float((rendered.agrees & inner).sum() / count),
         float((rendered.through & inner).sum() / count),
     )
 
 
-def _agreement_of_points(track: Track, frame: Frame) -> Agreement:
+def _agreement_of_points(track: Track, frame: Frame) -> SegmentAgreement:
     """The same for an object of unknown shape, by the points of it that were seen last."""
     last = track.thing.sightings[-1]
-    few = slice(None, None, max(1, len(last.facets.planes) // COMPARED))
+    few = slice(None, None, max(1, len(last.facets.planes) // SEGMENT_POINTS))
     pose = last.frame.camera_to_world
     points = last.facets.some(few).points @ pose[:3, :3].T + pose[:3, 3]
     now = frame.camera_to_world
@@ -206,16 +205,16 @@ def _agreement_of_points(track: Track, frame: Frame) -> Agreement:
     depth = frame.depth[row[inside], column[inside]]
     off = (depth - in_camera[inside, 2])[depth > 0]
     if not len(off):
-        return Agreement(0, 0.0, 0.0)
+        return SegmentAgreement(0, 0.0, 0.0)
 
-    return Agreement(
+    return SegmentAgreement(
         len(off),
         float((np.abs(off) < STEP_BEHIND).mean()),
         float((off > STEP_BEHIND).mean()),
     )
 
 
-def contradicted(found: Sequence[Agreement]) -> bool:
+def contradicted(found: Sequence[SegmentAgreement]) -> bool:
     """Whether a frame contradicts so many objects that its pose is wrong, not that they moved."""
     against = sum(one.contradicts for one in found)
     return against >= FEWEST_AGAINST and against >= sum(one.confirms for one in found)

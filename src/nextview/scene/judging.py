@@ -8,7 +8,6 @@ from dataclasses import replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, direction_of
@@ -22,8 +21,7 @@ from nextview.session.result import SUSPICIOUS, Recognition
 from nextview.session.session import THING_SIZE
 from nextview.session.system import System
 from nextview.session.view import View
-
-Float = NDArray[np.float64]
+from nextview.types import Floats
 
 
 class Judge:
@@ -92,7 +90,7 @@ class Judge:
         )
         return replace(result, confident=self._confident(result, joint))
 
-    def _log_evidence(self, seen: Observation) -> NDArray[np.floating]:
+    def _log_evidence(self, seen: Observation) -> Floats:
         """What the networks say of a view, in a form that can be summed over views, (D,)."""
         found = self._said[seen]
         azimuth = azimuth_of(direction_of(seen.pose)[None])
@@ -104,7 +102,7 @@ class Judge:
         sphere = self.system.sphere
         classes = len(self.system.classes)
         even = np.full(classes, 1 / classes)
-        total: NDArray[np.floating] = np.zeros(())
+        total: Floats = np.zeros(())
         counted = 0
         belief = even
         views = []

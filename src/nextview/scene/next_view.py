@@ -12,28 +12,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.geometry.viewsphere import angle_between
+from nextview.policies.discriminate_geometry import NEAR_TIE
 from nextview.recognition.protocol import LooksAhead
 from nextview.scene.tracks import Track
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import ObjectFrame, upright_axes
 from nextview.sensing.tabletop import TableTop
 from nextview.session.system import System
+from nextview.types import Float, Mask
 
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
-CELL = 0.02  # metres, side of a cell of the table
-MARGIN = 0.08  # metres around the objects within which the table is looked at
+TABLE_CELL = 0.02  # metres, side of a cell of the table
+OBJECT_MARGIN = 0.08  # metres around the objects within which the table is looked at
 HIDDEN_STEP = 0.015  # metres by which something stands before a cell that it hides
 RAY_STEPS = 48  # places along a ray at which something may stand in its way
 FEWEST_HIDDEN = 12  # cells that nobody saw, below which nothing can hide there
-NEAR_TIE = 0.05  # of the best value: among views of nearly the same value the nearer one is taken
-LOWEST_CAMERA = 0.10  # metres above the plane
-VISITED = np.radians(15.0)  # between two views that show the same
+
+LOWEST_SCENE_CAMERA = 0.10  # metres above the plane
+SAME_VIEW_ANGLE = np.radians(15.0)  # between two views that show the same
 UNKNOWN_WORTH = 1.0  # nats that another view of an unknown object is worth, from behind
 SURE_WORTH = 0.1  # the same of one that is sure: it may be two, or hide another
 SOME_POINTS = 60  # of an object, for which it is asked whether others hide it
@@ -41,7 +39,7 @@ ENOUGH_VIEWS = 2  # of an object that fits none of the known things
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class TableGround:
     """The table seen from above, in cells.
 
     Attributes:
@@ -63,7 +61,7 @@ class Ground:
     floor: float
 
     @classmethod
-    def of(cls, tops: Sequence[TableTop], tracks: Sequence[Track]) -> Ground:
+    def of(cls, tops: Sequence[TableTop], tracks: Sequence[Track]) -> TableGround:
         """Lay a grid over all that was seen on the plane.
 
         Args:
@@ -77,11 +75,11 @@ class Ground:
         flat = corners @ axes.T
         plane = tops[0].plane
         floor = float(np.median(flat[:, 2] - plane.height(corners)))
-        low = flat[:, :2].min(0) - MARGIN
-        count = np.ceil((flat[:, :2].max(0) + MARGIN - low) / CELL).astype(int) + 1
+        low = flat[:, :2].min(0) - OBJECT_MARGIN
+        count = np.ceil((flat[:, :2].max(0) + OBJECT_MARGIN - low) / TABLE_CELL).astype(int) + 1
         shape = (int(count[0]), int(count[1]))
         at = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 2)
-        middle = np.column_stack([low + (at + 0.5) * CELL, np.full(len(at), floor)])
+        middle = np.column_stack([low + (at + 0.5) * TABLE_CELL, np.full(len(at), floor)])
         level = middle @ axes
         # the plane may lean a little
         points = level - plane.height(level)[:, None] * axes[2] / (plane.normal @ axes[2])
@@ -108,7 +106,7 @@ class Ground:
         Args:
             camera: where it stands, (3,), world.
         """
-        own = np.full(len(self.points), CELL / 2)
+        own = np.full(len(self.points), TABLE_CELL / 2)
         return self.clear(camera, self.points, (self.points @ self.axes.T)[:, 2], own)
 
     def share_visible(self, camera: Float, track: Track) -> float:
@@ -123,7 +121,7 @@ class Ground:
         middle = points.mean(0)
         aside = np.linalg.norm((points - middle) @ self.axes[:2].T, axis=1)
         # its own body does not count, in whatever direction the camera stands
-        own = aside + aside.max() + CELL
+        own = aside + aside.max() + TABLE_CELL
         floor = np.full(len(points), self.floor)
         return float(self.clear(camera, points, floor, own).mean())
 
@@ -141,11 +139,11 @@ class Ground:
         # Nothing stands higher than the highest, so only the last part of each ray is looked at.
         highest = float(self.top.max()) if len(self.top) else 0.0
         rise = max(start[2] - self.floor, 1e-6)
-        last = min(1.0, (highest + CELL) / rise)
+        last = min(1.0, (highest + TABLE_CELL) / rise)
         shares = np.linspace(0, last, RAY_STEPS, endpoint=False)[1:]
         along = ends[:, None] + shares[:, None] * (start - ends)[:, None]
 
-        cell = np.floor((along[..., :2] - self.low) / CELL).astype(np.int64)
+        cell = np.floor((along[..., :2] - self.low) / TABLE_CELL).astype(np.int64)
         inside = ((cell >= 0) & (cell < self.shape)).all(-1)
         index = np.where(inside, cell[..., 0] * self.shape[1] + cell[..., 1], 0)
         beyond = np.linalg.norm(along[..., :2] - ends[:, None, :2], axis=-1) > own[:, None]
@@ -158,7 +156,7 @@ def _raise_over(top: Float, one: TableTop, low: Float, shape: tuple[int, int], a
     rows, columns = np.nonzero(one.above)
     few = slice(None, None, max(1, len(rows) // 20_000))
     points = one.frame.positions(rows[few], columns[few])
-    cell = np.floor((points @ axes[:2].T - low) / CELL).astype(np.int64)
+    cell = np.floor((points @ axes[:2].T - low) / TABLE_CELL).astype(np.int64)
     inside = ((cell >= 0) & (cell < shape)).all(1)
     index = cell[inside, 0] * shape[1] + cell[inside, 1]
     np.maximum.at(top, index, one.height[rows[few], columns[few]][inside].astype(np.float64))
@@ -223,11 +221,11 @@ def candidates(
     poses = ObjectFrame(middle, away / 3, axes).pose_in_world(system.sphere.poses, away)
 
     directions = (poses[:, :3, 3] - middle) @ axes.T / away
-    free = tops[0].plane.height(poses[:, :3, 3]) > LOWEST_CAMERA
+    free = tops[0].plane.height(poses[:, :3, 3]) > LOWEST_SCENE_CAMERA
     for place in places:
         towards = (place - middle) @ axes.T
         towards = towards / np.linalg.norm(towards)
-        free &= np.array([angle_between(one, towards) > VISITED for one in directions])
+        free &= np.array([angle_between(one, towards) > SAME_VIEW_ANGLE for one in directions])
     return Candidates(poses, directions, free)
 
 
@@ -243,7 +241,7 @@ def values(
         views: the candidates.
     """
     worth = np.zeros(len(views.poses))
-    ground = Ground.of(tops, tracks)
+    ground = TableGround.of(tops, tracks)
     for track in tracks:
         told = None if is_sure(track) else _information(system, track, views)
         if told is None:  # nothing foretells what another side shows

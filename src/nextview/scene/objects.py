@@ -7,15 +7,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.recognition.poses import PoseCandidate, PoseUncertainty, place_in_words
 from nextview.scene.tracks import Track
 from nextview.sensing.plausibility import ViewWarning
 from nextview.session.result import Recognition
+from nextview.types import Float, Mask
 
-Float = NDArray[np.float64]
-UNKNOWN = "unknown"
+UNKNOWN_NAME = "unknown"
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +41,7 @@ class SceneObject:
     confident: bool
     place: Float
     size: Float
-    pixels: dict[int, NDArray[np.bool_]] = field(repr=False)
+    pixels: dict[int, Mask] = field(repr=False)
     seen_points: Float = field(repr=False)
     touches: tuple[int, ...]
     result: Recognition = field(repr=False)
@@ -65,7 +64,7 @@ class SceneObject:
 
         return cls(
             number=track.number,
-            name=result.answer or UNKNOWN,
+            name=result.answer or UNKNOWN_NAME,
             confidence=result.confidence,
             confident=result.confident,
             place=frame.centre if result.place is None else result.place,
@@ -107,7 +106,7 @@ class SceneObject:
     def __repr__(self) -> str:
         """One line: ``3: mug, belief 0.998, confident, at [0.412, -0.103, 0.050] m``."""
         where = f"at {place_in_words(self.place)}"
-        if self.name == UNKNOWN:
+        if self.name == UNKNOWN_NAME:
             sides = " x ".join(f"{100 * side:.0f}" for side in self.size)
             return f"{self.number}: unknown, {sides} cm, {where}"
         sure = "confident" if self.confident else "not confident"

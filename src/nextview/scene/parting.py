@@ -14,23 +14,21 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.errors import ObservationError
 from nextview.recognition.poses import PoseCandidate
-from nextview.scene.tracks import Rendered, Track, render_track
+from nextview.scene.tracks import RenderedObject, Track, render_track
 from nextview.sensing.observed_object import FEWEST_OBJECT_PIXELS, ObservedObject, Sighting
 from nextview.sensing.tabletop import NEAR_TABLE, TableTop
-
-Mask = NDArray[np.bool_]
+from nextview.types import Float, Index, Mask
 
 GOOD_FIT = 0.85  # share of an object's pixels that its scan explains, from which none is in doubt
 LEAST_GAIN = 0.03  # by which another parting explains more of the pixels, at least
 # the same where an unknown object is cut: any surface has small parts that some thing explains
 LEAST_OF_UNKNOWN = 0.3
 KNOWN_SHARE = 0.5  # share of an object's pixels that are explained, from which it is a known one
-MOST_TRIMMED = 0.25  # share of an object's pixels that may be the plane's
+MOST_PLANE_SHARE = 0.25  # share of an object's pixels that may be the plane's
 LEAST_TRIMMED = 0.02
 SHARED = 0.5  # share of a segment that another object's scan explains, from which they may be one
 NEAR_GAP = 0.02  # metres between segments in the picture that are tried as one object, at most
@@ -55,11 +53,11 @@ class Bench:
     number: int
     judge: Callable[[Sequence[Track]], list[Track]]
 
-    def render(self, track: Track) -> Rendered | None:
+    def render(self, track: Track) -> RenderedObject | None:
         """What the frame would see of an object that was named."""
         return render_track(track, self.top, self.number, track.posed)
 
-    def render_likeliest(self, track: Track) -> Rendered | None:
+    def render_likeliest(self, track: Track) -> RenderedObject | None:
         """What the frame would see of an object if it were what it is most like."""
         return render_track(track, self.top, self.number, track.likeliest)
 
@@ -174,7 +172,7 @@ def _in_each_other(one: PoseCandidate | None, other: PoseCandidate | None) -> bo
     return apart < IN_EACH_OTHER * min(first[1], second[1])
 
 
-def _sphere_of(posed: PoseCandidate | None) -> tuple[NDArray[np.float64], float] | None:
+def _sphere_of(posed: PoseCandidate | None) -> tuple[Float, float] | None:
     """Middle, (3,), world, and radius of a thing that was found, metres; None without a scan."""
     if posed is None or posed.vertices is None:
         return None
@@ -257,7 +255,7 @@ def _trimmed(tracks: Sequence[Track], bench: Bench, before: Mapping[int, Track])
         else:
             kept |= mask & (bench.top.height > NEAR_TABLE)
         lost = 1 - float(kept.sum() / max(mask.sum(), 1))
-        if LEAST_TRIMMED < lost < MOST_TRIMMED:
+        if LEAST_TRIMMED < lost < MOST_PLANE_SHARE:
             with suppress(ObservationError):
                 changed[row] = track.with_mask(bench.number, kept, bench.top)
 
@@ -316,7 +314,7 @@ def _groups(tracks: Sequence[Track], bench: Bench) -> list[tuple[int, ...]]:
     return pairs + [group for group in whole if 2 < len(group) <= MOST_GROUP]
 
 
-def _components(linked: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
+def _components(linked: Mask) -> tuple[Index, int]:
     """The connected component of each of N nodes, (N,), and how many there are."""
     from scipy.sparse.csgraph import connected_components
 

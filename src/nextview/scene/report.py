@@ -6,20 +6,20 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.recognition.poses import place_in_words
-from nextview.scene.objects import UNKNOWN, SceneObject
+from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Look, Scene
 from nextview.session.pose_json import pose_as_json
+from nextview.types import Mask
 
-COLUMNS = ("", "name", "belief", "place, m", "± mm, °", "frames", "touches")
+REPORT_COLUMNS = ("", "name", "belief", "place, m", "± mm, °", "frames", "touches")
 MOST_CANDIDATES = 3  # other things that are shown beside a name
 LEAST_LISTED = 0.01  # of what is shown
 
 
 def row_of(thing: SceneObject) -> list[str]:
-    """One row of a table, in ``COLUMNS``.
+    """One row of a table, in ``REPORT_COLUMNS``.
 
     Args:
         thing: an object of a scene.
@@ -27,9 +27,9 @@ def row_of(thing: SceneObject) -> list[str]:
     off = thing.pose_uncertainty
     name = thing.name
     belief = f"{thing.confidence:.3f}"
-    if thing.name == UNKNOWN:
+    if thing.name == UNKNOWN_NAME:
         sides = " x ".join(f"{100 * side:.0f}" for side in thing.size)
-        name = f"{UNKNOWN} ({sides} cm)"
+        name = f"{UNKNOWN_NAME} ({sides} cm)"
         belief = ""
     elif not thing.confident:
         name = f"{name} ?"
@@ -53,7 +53,7 @@ def doubts_of(scene: Scene) -> list[str]:
     """
     said = []
     for thing in scene.objects:
-        if thing.confident or thing.name == UNKNOWN:
+        if thing.confident or thing.name == UNKNOWN_NAME:
             continue
         beliefs = sorted(thing.result.beliefs.items(), key=lambda pair: -pair[1])
         rest = [f"{one} {belief:.2f}" for one, belief in beliefs[:MOST_CANDIDATES]]
@@ -113,7 +113,7 @@ def scene_as_json(
     return {"unit": "m", "objects": objects, "frames": frames, "left_out": left_out}
 
 
-def _box_of(mask: NDArray[np.bool_]) -> list[int]:
+def _box_of(mask: Mask) -> list[int]:
     """Left, top, width and height of what a mask holds, pixels, as BOP has it."""
     rows, columns = np.nonzero(mask)
     left, top = int(columns.min()), int(rows.min())

@@ -13,15 +13,15 @@ from threading import RLock
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from nextview.checks import number, one_line
 from nextview.errors import ObservationError, SessionError
-from nextview.scene.following import Agreement, agreement, assign, contradicted
+from nextview.scene.following import SegmentAgreement, agreement, assign, contradicted
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import (
     FEWEST_HIDDEN,
-    Ground,
+    TableGround,
     best,
     candidates,
     is_sure,
@@ -35,12 +35,11 @@ from nextview.sensing.object_frame import Box, upright_axes
 from nextview.sensing.plausibility import ViewWarning, check_frame
 from nextview.sensing.tabletop import TableTop
 from nextview.session.system import System, load
+from nextview.types import Float, Mask
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 ENOUGH_FRAMES = 2  # of an object that is sure, after which it is not judged anew
 CORES = 2  # objects that are judged at the same time
@@ -53,7 +52,7 @@ MOVED_OR_POSE = ViewWarning(
     "what was known is not where it was, and nothing else stands where it was: it is taken to have"
     " moved, but the frame's pose may be wrong",
 )
-NOTHING = ViewWarning("empty", "nothing stands on the plane in this frame")
+EMPTY_WARNING = ViewWarning("empty", "nothing stands on the plane in this frame")
 
 
 @dataclass(frozen=True)
@@ -146,7 +145,7 @@ class Scene:
                 return False
             if not self._tracks:
                 return True
-            return Ground.of(self._tops, self._tracks).largest_hidden < FEWEST_HIDDEN
+            return TableGround.of(self._tops, self._tracks).largest_hidden < FEWEST_HIDDEN
 
     @property
     def target(self) -> Float | None:
@@ -227,7 +226,7 @@ class Scene:
                 "a second frame needs a pose, and the first one too: how else do they fit together?"
             )
 
-    def _take(self, top: TableTop, found: Sequence[Agreement]) -> Look:
+    def _take(self, top: TableTop, found: Sequence[SegmentAgreement]) -> Look:
         """Take in a frame that fits."""
         number = len(self._tops)
         segments = top.segments()
@@ -298,7 +297,7 @@ class Scene:
         self._note_touching(top, number)
         warnings = tuple(check_frame(top.frame))
         if not kept:
-            warnings += (NOTHING,)
+            warnings += (EMPTY_WARNING,)
         return Look(True, tuple(appeared), tuple(moved), gone, tuple(joined), warnings)
 
     def _note_touching(self, top: TableTop, number: int) -> None:

@@ -18,9 +18,7 @@ from nextview.sensing.sighting import Sighting
 from nextview.sensing.tabletop import TableTop
 from nextview.session.result import Recognition
 from nextview.things.surface import Surface, SurfaceCaster
-
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from nextview.types import Float, Float32, Mask
 
 RENDERED_ROWS = 120  # rows and columns in which a scan is rendered into a frame, at most
 AGREES = 0.006  # metres by which depth may be off from a scan, beside the noise
@@ -143,7 +141,7 @@ class Track:
 
 
 @dataclass(frozen=True, eq=False)
-class Rendered:
+class RenderedObject:
     """What a frame would see of an object that was named, where it was found.
 
     Attributes:
@@ -156,7 +154,7 @@ class Rendered:
     """
 
     part: Part
-    depth: NDArray[np.float32]
+    depth: Float32
     agrees: Mask
     hidden: Mask
     through: Mask
@@ -191,7 +189,7 @@ class Rendered:
 
 def render_track(
     track: Track, top: TableTop, number: int, posed: PoseCandidate | None
-) -> Rendered | None:
+) -> RenderedObject | None:
     """Render the scan of an object into a frame.
 
     Args:
@@ -230,7 +228,7 @@ def render_track(
     hidden = shows & (seen > 0) & (off < -error)
     through = shows & (seen > 0) & (off > error)
     near = ndimage.binary_dilation(shows, iterations=EDGE_WIDTH)
-    return Rendered(part, depth, agrees, hidden, through, near)
+    return RenderedObject(part, depth, agrees, hidden, through, near)
 
 
 def _window(corners: Float, intrinsics: Float, shape: tuple[int, int]) -> Part | None:
@@ -250,9 +248,9 @@ def _window(corners: Float, intrinsics: Float, shape: tuple[int, int]) -> Part |
 def _cast(
     posed: PoseCandidate,
     in_camera: Float,
-    rays: tuple[NDArray[np.float32], NDArray[np.float32]],
+    rays: tuple[Float32, Float32],
     part: Part,
-) -> NDArray[np.float32]:
+) -> Float32:
     """Depth of a scan in a part of a frame, (h, w) float32, metres; infinity where it is not."""
     assert posed.vertices is not None
     assert posed.faces is not None
@@ -279,7 +277,7 @@ def _cast(
 class _Triangles:
     """Vertices and faces as a key. Two are equal if they are the same arrays."""
 
-    def __init__(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
+    def __init__(self, vertices: Float32, faces: NDArray[np.int32]) -> None:
         self.vertices = vertices
         self.faces = faces
 
@@ -300,7 +298,7 @@ def _caster(name: str, triangles: _Triangles) -> SurfaceCaster:
     return SurfaceCaster([Surface(name, triangles.vertices, triangles.faces)])
 
 
-def _rim(depth: NDArray[np.float32]) -> Mask:
+def _rim(depth: Float32) -> Mask:
     """Pixels at the outline of a scan, (h, w) bool."""
     shows = np.isfinite(depth)
     return shows & ~ndimage.binary_erosion(shows, iterations=EDGE_WIDTH)

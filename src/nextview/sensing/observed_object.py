@@ -41,7 +41,7 @@ from nextview.sensing.walls import before_walls, find_walls
 from nextview.types import Float, Index, Mask
 
 # earlier and new, the side of a cell, whether it may be two things
-Found = tuple[list["Sighting"], float, bool]
+FoundSightings = tuple[list["Sighting"], float, bool]
 
 SIZE = 224  # side of the observations' images: what the bundled networks take
 FEWEST_OBJECT_PIXELS = 60  # pixels that an object has to have in a frame
@@ -501,7 +501,7 @@ class ObservedObject:
 
     def _find(
         self, frame: Frame, axes: Float, plane: Plane | None, samples: Samples | None, noise: Noise
-    ) -> Found:
+    ) -> FoundSightings:
         if frame.mask is not None:
             mask = frame.mask
             if self.known is None:  # else its size does not hang on pixels at the edge
@@ -569,7 +569,7 @@ class ObservedObject:
         plane: Plane | None,
         samples: Samples,
         noise: Noise,
-    ) -> Found:
+    ) -> FoundSightings:
         """Find the object among what rises above a plane.
 
         It is the plane on which the object stands, if that is seen, or else one as low as all that

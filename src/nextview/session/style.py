@@ -20,7 +20,7 @@ from nextview.types import Floats
 INK = "#1f2933"
 GREY = "#8a949e"
 FAINT = "#d5dbe1"
-# of all figures; policies: ``figures.COLOURS``
+# of all figures; policies: ``figures.POLICY_COLOURS``
 BLUE = "#0b5fa5"
 LIGHT_BLUE = "#38a0d9"
 ACCENT = "#d1495b"

@@ -16,7 +16,7 @@ from nextview.geometry.viewsphere import (
 )
 from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.object_frame import Box, ObjectFrame
-from nextview.simulation.scene import SCENE_TABLE, Scene
+from nextview.simulation.scene import SCENE_TABLE, TargetScene
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import Sensor, SensorMix, sensor_named
 from nextview.types import Float
@@ -26,7 +26,7 @@ SAME_DIRECTION = 1e-6  # radians between directions that are the same
 
 
 def sensed_camera(
-    scene: Scene, sensor: Sensor | SensorMix | str, rng: np.random.Generator
+    scene: TargetScene, sensor: Sensor | SensorMix | str, rng: np.random.Generator
 ) -> SensedCamera:
     """Create a camera three radii from a scene's target, which is segmented exactly.
 
@@ -60,7 +60,7 @@ class RobotCamera:
     knows_reach = True  # the scene says where a camera can stand; see ``session.FrameCamera``
 
     def __init__(
-        self, scene: Scene, sensor: Sensor | SensorMix | str = "none", named: Named = "point"
+        self, scene: TargetScene, sensor: Sensor | SensorMix | str = "none", named: Named = "point"
     ) -> None:
         if named not in get_args(Named):
             raise UsageError(

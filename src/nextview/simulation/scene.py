@@ -48,7 +48,7 @@ class Item:
 
 
 @dataclass(frozen=True)
-class Scene:
+class TargetScene:
     """A target, and the other things that stand on its table.
 
     Attributes:
@@ -105,7 +105,7 @@ class Scene:
         return free
 
 
-def build_scene(layout: SceneLayout, meshes: str | Path, max_faces: int = MAX_FACES) -> Scene:
+def build_scene(layout: SceneLayout, meshes: str | Path, max_faces: int = MAX_FACES) -> TargetScene:
     """Build a scene from the mesh files of a folder.
 
     Args:
@@ -132,7 +132,7 @@ def build_scene(layout: SceneLayout, meshes: str | Path, max_faces: int = MAX_FA
     target, *others = loaded
     floor = float(target.vertices[:, 2].min())
     objects = [place(mesh, at, floor) for mesh, at in zip(others, layout.objects, strict=True)]
-    return Scene(target, (*objects, *(block_item(block, floor) for block in layout.blocks)))
+    return TargetScene(target, (*objects, *(block_item(block, floor) for block in layout.blocks)))
 
 
 def place(mesh: Mesh, at: Placement, floor: float) -> Item:

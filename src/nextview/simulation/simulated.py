@@ -16,7 +16,7 @@ from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.types import Float, Float32, Mask
 
 if TYPE_CHECKING:
-    from nextview.simulation.scene import Scene
+    from nextview.simulation.scene import TargetScene
 
 EDGE_ON = 0.01
 SLIVER = 1e-6
@@ -140,7 +140,9 @@ class SimulatedCamera:
 class OccludedCamera:
     """A camera in front of the target of a scene; what hides it is cut out."""
 
-    def __init__(self, scene: "Scene", size: int = 224, distance: float = CAMERA_DISTANCE) -> None:
+    def __init__(
+        self, scene: "TargetScene", size: int = 224, distance: float = CAMERA_DISTANCE
+    ) -> None:
         self.scene = scene
         self._target = SimulatedCamera(scene.target, size, distance)
         self._others = RayCaster(
@@ -177,7 +179,7 @@ class OccludedCamera:
 class SceneCamera:
     """Shows a whole scene through a pinhole, (3, 3), pixels, first pixel's centre at 0.5."""
 
-    def __init__(self, scene: "Scene", intrinsics: Float, shape: tuple[int, int]) -> None:
+    def __init__(self, scene: "TargetScene", intrinsics: Float, shape: tuple[int, int]) -> None:
         meshes = (scene.target, scene.table, scene.around)
         self._caster = RayCaster([(mesh.vertices, mesh.faces) for mesh in meshes if mesh])
         self._rays = PinholeCamera.of(checked_intrinsics(intrinsics, shape), shape).rays
@@ -198,7 +200,7 @@ class SceneCamera:
         ].reshape(shape)
 
 
-def visible_shares(scene: "Scene", poses: Float, size: int, distance: float) -> Float:
+def visible_shares(scene: "TargetScene", poses: Float, size: int, distance: float) -> Float:
     """Return the share of the target's picture that nothing hides, from each pose.
 
     Args:

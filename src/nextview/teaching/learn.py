@@ -17,7 +17,7 @@ from safetensors.numpy import load_file, save_file
 
 from nextview.data.pool import WorkerDied, each
 from nextview.data.pool import count as count_workers
-from nextview.data.progress import Track, silently
+from nextview.data.progress import TrackProgress, silently
 from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.files import check_new, command, new_file, new_folder, only_one, sha256_of, unfinished
 from nextview.recognition.belief import Calibration
@@ -92,7 +92,7 @@ class Work:
     part: Path
     workers: int | None
     scheduler: str | None
-    track: Track
+    track: TrackProgress
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ class LearnOptions(TypedDict, total=False):
     workers: int | None
     scheduler: str | None
     overwrite: bool
-    track: Track
+    track: TrackProgress
 
 
 def learn(folder: str | Path, out: str | Path, **options: Unpack[LearnOptions]) -> Learned:
@@ -237,7 +237,7 @@ def learn_things(
     workers: int | None = None,
     scheduler: str | None = None,
     overwrite: bool = False,
-    track: Track = silently,
+    track: TrackProgress = silently,
 ) -> Learned:
     """Teach the things in a folder, and write a memory that recognises them.
 

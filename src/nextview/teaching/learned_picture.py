@@ -29,10 +29,10 @@ PICTURE_INK = "#1d1d1f"
 QUIET = "#8a8a8e"
 BAR = "#2f6fde"
 
-Pictures = Mapping[str, NDArray[np.uint8]]
+ThingPictures = Mapping[str, NDArray[np.uint8]]
 
 
-def draw_learned(path: Path, pictures: Pictures, fit: Fit) -> None:
+def draw_learned(path: Path, pictures: ThingPictures, fit: Fit) -> None:
     """Draw the things, the accuracy by the number of views, and the confused pairs.
 
     It is as high as what is on it.
@@ -68,7 +68,7 @@ def _even_choice(names: list[str]) -> list[str]:
     return [names[k * len(names) // MOST_THINGS_SHOWN] for k in range(MOST_THINGS_SHOWN)]
 
 
-def _draw_things(page: Axes, pictures: Pictures, shown: list[str]) -> None:
+def _draw_things(page: Axes, pictures: ThingPictures, shown: list[str]) -> None:
     title = "1 thing learned" if len(pictures) == 1 else f"{len(pictures)} things learned"
     page.text(PICTURE_MARGIN, 0.45, title, size=17, color=PICTURE_INK, weight="bold")
     if len(shown) < len(pictures):
@@ -111,7 +111,7 @@ def _draw_bars(figure: Figure, fit: Fit, height: float) -> None:
 
 
 def _draw_pairs(
-    page: Axes, pictures: Pictures, pairs: list[tuple[str, str, float]], top: float
+    page: Axes, pictures: ThingPictures, pairs: list[tuple[str, str, float]], top: float
 ) -> None:
     heading = (
         "confused most, share of the cases after two views"

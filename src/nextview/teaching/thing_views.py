@@ -54,7 +54,7 @@ FACES = "faces"
 SYMMETRIES = "symmetries"  # and the axis and order of each of its symmetries, (S, 4)
 # of the radius: a camera stands farther from a large thing, and measures it less exactly
 COARSER = 0.002
-Parts = Iterator[Float32]  # of embeddings, (.., F) each, in order
+EmbeddingParts = Iterator[Float32]  # of embeddings, (.., F) each, in order
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ def of_surface(surface: Surface) -> Arrays:
     }
 
 
-def _around(clean: Parts, sensed: Parts) -> Float32:
+def _around(clean: EmbeddingParts, sensed: EmbeddingParts) -> Float32:
     """Return embeddings of the grid of views, (rings, azimuths, F).
 
     They are the mean of clean and sensed views.
@@ -211,7 +211,7 @@ def _around(clean: Parts, sensed: Parts) -> Float32:
     return joined(ideal, through)
 
 
-def _clean(pool: ThreadPoolExecutor, mesh: Mesh) -> Parts:
+def _clean(pool: ThreadPoolExecutor, mesh: Mesh) -> EmbeddingParts:
     """Embeddings of the views of the grid without errors."""
     camera = SimulatedCamera(mesh)
     return pool.map(
@@ -221,7 +221,7 @@ def _clean(pool: ThreadPoolExecutor, mesh: Mesh) -> Parts:
 
 def _sensed(
     pool: ThreadPoolExecutor, mesh: Mesh, poses: Float, sensor: str, rng: Generator
-) -> Parts:
+) -> EmbeddingParts:
     """Embeddings of a mesh from poses, (B, 4, 4), through a sensor."""
     parts = np.split(poses, range(SETUP, len(poses), SETUP))
     cameras = (partial(SensedCamera, mesh, sensor, own) for own in rng.spawn(len(parts)))

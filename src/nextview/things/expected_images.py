@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from nextview.errors import ObservationError
@@ -16,10 +15,8 @@ from nextview.geometry.observation import Observation
 from nextview.things.depth_view import THING, DepthView
 from nextview.things.leading import Hypotheses
 from nextview.things.surface import SurfaceCaster
-from nextview.things.unseen_space import DepthImage, chance_of_sight
-
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
+from nextview.things.unseen_space import MeasuredDepth, chance_of_sight
+from nextview.types import Float, Float32, Mask
 
 LOWEST_COSINE = 0.15  # of incidence, in the judgement of a pixel
 SUPPORT_NEAR = 0.01  # metres from the height of the support, within which a point lies on it
@@ -63,7 +60,7 @@ class ExpectedSensor:
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
+class SeenSurroundings:
     """What is known of the scene around the thing.
 
     Attributes:
@@ -77,17 +74,17 @@ class Surroundings:
     obstacles: Float
     floor: float = -np.inf
     reach: float = 0.0
-    seen: tuple[DepthImage, ...] = ()
+    seen: tuple[MeasuredDepth, ...] = ()
 
     @classmethod
-    def nothing(cls) -> "Surroundings":
+    def nothing(cls) -> "SeenSurroundings":
         """The thing alone, with nothing that is measured behind it."""
         return cls(np.zeros((0, 3)))
 
     @classmethod
     def of(
         cls, observations: Sequence[Observation], caster: SurfaceCaster, hypotheses: Hypotheses
-    ) -> "Surroundings":
+    ) -> "SeenSurroundings":
         """Gather what some views saw beside the thing.
 
         Args:
@@ -117,7 +114,7 @@ class Surroundings:
         own = ((in_file > low) & (in_file < high)).all(1)
         near = np.linalg.norm(points, axis=1) < OBSTACLE_REACH * radius
         obstacles = points[(height > SUPPORT_NEAR) & near & ~own]
-        images = (DepthImage.of(observation) for observation in observations)
+        images = (MeasuredDepth.of(observation) for observation in observations)
         return cls(obstacles, floor, reach, tuple(image for image in images if image is not None))
 
 
@@ -159,11 +156,11 @@ class HypothesisImages:
     rays: Float32
     lengths: Float32
     depth: Float32
-    hidden: NDArray[np.bool_]
+    hidden: Mask
     clear: Float32
     normals: Float32
     cosine: Float32
-    behind: NDArray[np.bool_]
+    behind: Mask
     origins: Float32
     centre: Float32
     step: Float32
@@ -183,7 +180,7 @@ def rendered_images(
     caster: SurfaceCaster,
     hypotheses: Hypotheses,
     cameras: Float,
-    scene: Surroundings,
+    scene: SeenSurroundings,
     side: int,
 ) -> HypothesisImages:
     """Render all hypotheses from all cameras with few pixels.
@@ -293,7 +290,7 @@ def _obstacle_depth(obstacles: Float, cameras: Float, x: Float, y: Float, step: 
 
 
 def _clear(
-    scene: Surroundings,
+    scene: SeenSurroundings,
     origins: Float,
     rays: Float32,
     depth: Float32,
@@ -321,7 +318,7 @@ def _clear(
     return fine[:, :side, :side].reshape(views, pixels)
 
 
-def _support_shows(scene: Surroundings, origins: Float, rays: Float32) -> NDArray[np.bool_]:
+def _support_shows(scene: SeenSurroundings, origins: Float, rays: Float32) -> Mask:
     """Where the support was seen behind the thing, (V, P) bool."""
     if not np.isfinite(scene.floor) or scene.reach == 0:
         return np.zeros(rays.shape[:2], bool)

@@ -13,20 +13,16 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.things.expected_images import LOWEST_COSINE, ExpectedSensor, HypothesisImages
 from nextview.things.registration import SCAN_ERROR, RegistrationPrior
 from nextview.things.verification import PixelModel
-
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Index = NDArray[np.int64]
+from nextview.types import Float, Float32, Index, Mask
 
 FITTED_EVERY = 3  # every so many pixels take part in the fit of one hypothesis to another
 FITTED_REACH = 0.004  # metres of deviation at which a pixel of this fit counts half
 GRAZING_COSINE = 0.3  # of incidence, below which holes become usual: see the cameras of simulation
-SURFACE_ERROR = 0.001  # metres by which a surface is off from its scan, in this fit
+FITTED_SURFACE_ERROR = 0.001  # metres by which a surface is off from its scan, in this fit
 LARGEST_DEVIATION = 12.0  # standard deviations, beyond which a pixel is an outlier
 TABLE_STEPS = 20  # entries of a table per standard deviation
 
@@ -104,7 +100,7 @@ def gaps_after_alignment(
     some = slice(None, None, FITTED_EVERY)
     distance = (gap * along)[..., some]
     noise = sensor.noise * middle[..., some] ** 2
-    weights = both[..., some] / (SURFACE_ERROR**2 + noise**2)
+    weights = both[..., some] / (FITTED_SURFACE_ERROR**2 + noise**2)
     weights = weights / (1 + (distance / FITTED_REACH) ** 2)
     used = np.maximum(both[..., some].sum(2, keepdims=True), 1)
     weights = (weights * np.minimum(1, prior.pixels / used)).astype(np.float32)
@@ -162,7 +158,7 @@ def divergences(
 
 def different_pixels(
     images: HypothesisImages, sensor: ExpectedSensor, pixels: PixelModel, prior: RegistrationPrior
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Where the first two hypotheses differ by more than the noise, once they are aligned.
 
     Args:
@@ -199,13 +195,13 @@ class _Judged:
         matches: expected log-likelihood of a depth by its deviation, see ``_match_table``.
     """
 
-    shows: NDArray[np.bool_]
+    shows: Mask
     lost: Float32
     deviation: Float32
     hole: Float32
     missing: Float32
     apart: Float32
-    behind: NDArray[np.bool_]
+    behind: Mask
     clear: Float32
     area: Float
     enough: float
@@ -294,7 +290,7 @@ class _Judged:
         sight = (self.clear * either).sum(2) / np.maximum(union, 1)
         return -mean.astype(np.float64) * sight * np.minimum(1, union * self.area / self.enough)
 
-    def different(self, first: Index, second: Index, gaps: Float32) -> NDArray[np.bool_]:
+    def different(self, first: Index, second: Index, gaps: Float32) -> Mask:
         """Return the pixels in which two hypotheses differ by more than the noise.
 
         Args:
@@ -326,7 +322,7 @@ def _match_table(outlier: float) -> Float32:
     return (match @ shares / shares.sum()).astype(np.float32)
 
 
-def _rings(shows: NDArray[np.bool_], side: int) -> tuple[Float32, Float32]:
+def _rings(shows: Mask, side: int) -> tuple[Float32, Float32]:
     """Distance to the outline within it, and beside it, (V, H, P) each, pixels; at most 2.5."""
     image = shows.reshape(*shows.shape[:2], side, side)
     within = np.full(image.shape, 0.5, np.float32)
@@ -341,7 +337,7 @@ def _rings(shows: NDArray[np.bool_], side: int) -> tuple[Float32, Float32]:
     return within.reshape(shows.shape), beside.reshape(shows.shape)
 
 
-def _neighbours(image: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _neighbours(image: Mask) -> Mask:
     """The four neighbours of each pixel of images, (4, V, H, rows, columns)."""
     padded = np.pad(image, ((0, 0), (0, 0), (1, 1), (1, 1)))
     up = padded[..., :-2, 1:-1]

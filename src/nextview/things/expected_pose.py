@@ -7,7 +7,6 @@ camera sees it: so turns of a round thing about its axis, which nothing can tell
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nextview.things.expected_images import ExpectedSensor, HypothesisImages
 from nextview.things.registration import (
@@ -17,9 +16,7 @@ from nextview.things.registration import (
     inverses,
 )
 from nextview.things.surface import Surface
-
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
+from nextview.types import Float, Float32, Mask
 
 
 @lru_cache(maxsize=256)
@@ -121,7 +118,7 @@ def _summed(
     return np.asarray(weighted.swapaxes(1, 2) @ moved, np.float64)
 
 
-def _outward(images: HypothesisImages, shows: NDArray[np.bool_]) -> Float32:
+def _outward(images: HypothesisImages, shows: Mask) -> Float32:
     """Directions out of the outline, (V, P, 3) float32: unit vectors at the rim, else zero.
 
     Where something stands before the thing, its outline is not its own.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, elevation_of, look_at_origin
 from nextview.things.depth_view import DepthView, depth_view
-from nextview.things.expected_images import ExpectedSensor, Surroundings, rendered_images
+from nextview.things.expected_images import ExpectedSensor, SeenSurroundings, rendered_images
 from nextview.things.expected_likelihood import (
     different_pixels,
     divergences,
@@ -29,8 +29,8 @@ from nextview.things.surface import SurfaceCaster
 from nextview.things.verification import PixelModel
 from nextview.things.verifier import Verified, Verifier
 from nextview.things.weighing import EvidenceWeights
+from nextview.types import Float, Index, Mask
 
-Float = NDArray[np.float64]
 Goal = Literal["thing", "pose"]
 
 SENSOR_SIDE = 24  # rows and columns of a view by which the camera's noise is judged
@@ -159,7 +159,7 @@ def expected_views(
     hypotheses: Hypotheses,
     cameras: Float,
     sensor: ExpectedSensor,
-    surroundings: Surroundings | None = None,
+    surroundings: SeenSurroundings | None = None,
     taken: int = 1,
     weights: EvidenceWeights = EvidenceWeights(),
     pixels: PixelModel = PixelModel(),
@@ -188,7 +188,7 @@ def expected_views(
         What each view would tell of each pair of hypotheses.
     """
     cameras = np.asarray(cameras, np.float64)
-    scene = Surroundings.nothing() if surroundings is None else surroundings
+    scene = SeenSurroundings.nothing() if surroundings is None else surroundings
     rendered = rendered_images(caster, hypotheses, cameras, scene, side)
     weight = weights.geometry / (1 + weights.correlation * taken)
     moved = gaps_after_alignment(rendered, sensor, prior)
@@ -213,9 +213,9 @@ class RivalPictures:
         different: pixels in which they differ by more than the noise, (S, S) bool.
     """
 
-    things: NDArray[np.int64]
+    things: Index
     pictures: NDArray[np.uint8]
-    different: NDArray[np.bool_]
+    different: Mask
 
     @property
     def share(self) -> float:
@@ -244,7 +244,7 @@ class Outlook:
     caster: SurfaceCaster
     hypotheses: Hypotheses
     sensor: ExpectedSensor
-    surroundings: Surroundings
+    surroundings: SeenSurroundings
     place: Float
     taken: int
     weights: EvidenceWeights
@@ -277,7 +277,7 @@ class Outlook:
             caster=verifier.caster,
             hypotheses=hypotheses,
             sensor=sensor,
-            surroundings=Surroundings.of(used, verifier.caster, hypotheses),
+            surroundings=SeenSurroundings.of(used, verifier.caster, hypotheses),
             place=seen[-1][1].origin,
             taken=len(used),
             weights=verifier.weights,

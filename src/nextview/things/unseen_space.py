@@ -18,7 +18,7 @@ BEFORE = 0.01  # metres before a measured surface, from which on space is known 
 
 
 @dataclass(frozen=True, eq=False)
-class DepthImage:
+class MeasuredDepth:
     """All depth that one view measured.
 
     Attributes:
@@ -32,7 +32,7 @@ class DepthImage:
     intrinsics: Float
 
     @classmethod
-    def of(cls, observation: Observation) -> "DepthImage | None":
+    def of(cls, observation: Observation) -> "MeasuredDepth | None":
         """What the camera of a view saw, the thing and all else; None if that is not known."""
         scene = observation.scene
         if scene is None or observation.radius is None:
@@ -70,7 +70,7 @@ class DepthImage:
 
 
 def chance_of_sight(
-    seen: Sequence[DepthImage],
+    seen: Sequence[MeasuredDepth],
     ends: Float32,
     rays: Float32,
     hidden: Mask,

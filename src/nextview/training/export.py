@@ -16,7 +16,7 @@ from nextview.checks import extras
 from nextview.data.measures import find_measure
 from nextview.data.metrics import map_scores, recogniser_scores
 from nextview.data.predictions import Predictions
-from nextview.data.progress import Track, silently
+from nextview.data.progress import TrackProgress, silently
 from nextview.data.splits import deduplicate
 from nextview.data.store import ViewStore
 from nextview.errors import ModelError, UsageError
@@ -217,7 +217,7 @@ def export_recogniser(
     name: str | None = None,
     note: str = "",
     overwrite: bool = False,
-    track: Track = silently,
+    track: TrackProgress = silently,
 ) -> Exported:
     """Export a trained recogniser to ONNX with a card of its validation scores.
 
@@ -308,7 +308,7 @@ def export_map(
     name: str | None = None,
     note: str = "",
     overwrite: bool = False,
-    track: Track = silently,
+    track: TrackProgress = silently,
 ) -> Exported:
     """Export a trained map network: ONNX, with a card of its validation scores.
 
@@ -377,7 +377,9 @@ def _training(
     return Training(about, tuple(asdict(recipe) for recipe in recipes))
 
 
-def _export(candidate: _Candidate, out: Path, bits: int, overwrite: bool, track: Track) -> Exported:
+def _export(
+    candidate: _Candidate, out: Path, bits: int, overwrite: bool, track: TrackProgress
+) -> Exported:
     """Write ONNX file and card once the file agrees with the network; both or neither."""
     name = candidate.card.name
     sample = candidate.sample

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from nextview.checks import extras
 from nextview.data.predictions import Predictions
-from nextview.data.progress import Track, silently
+from nextview.data.progress import TrackProgress, silently
 from nextview.data.scene_views import scenes_of
 from nextview.errors import ModelError, PredictionsError, UsageError
 from nextview.files import check_new, command, new_folder, sha256_of
@@ -336,7 +336,7 @@ def train_gain(
     sensed: tuple[Path, ...] = (),
     recipe: GainRecipe = GainRecipe(),
     overwrite: bool = False,
-    track: Track = silently,
+    track: TrackProgress = silently,
 ) -> TrainedGain:
     """Train the gain policy, which predicts the value of each view.
 

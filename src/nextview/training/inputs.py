@@ -12,7 +12,7 @@ from numcodecs import Blosc
 from numpy.typing import NDArray
 
 from nextview.data.pool import WorkerDied, each
-from nextview.data.progress import Track, silently
+from nextview.data.progress import TrackProgress, silently
 from nextview.data.store import ViewStore
 from nextview.errors import DAMAGED, DatasetError
 from nextview.files import new_folder, only_one
@@ -73,7 +73,7 @@ def inputs_path(store: Path, size: int, kind: InputKind = "geometry") -> Path:
 
 
 def ready_inputs(
-    path: Path, size: int, kind: InputKind = "geometry", track: Track = silently
+    path: Path, size: int, kind: InputKind = "geometry", track: TrackProgress = silently
 ) -> PackedViews:
     """Return the inputs of a store and compute them if they are not there.
 

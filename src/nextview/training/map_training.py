@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from nextview.checks import extras
 from nextview.data.measures import confidence_maps, normalise_per_object
 from nextview.data.predictions import Predictions
-from nextview.data.progress import Track, silently
+from nextview.data.progress import TrackProgress, silently
 from nextview.data.splits import check_any, deduplicate, split_training
 from nextview.data.store import ViewStore
 from nextview.errors import ModelError, PredictionsError, UsageError
@@ -36,7 +36,7 @@ with extras():
     from torch import Tensor, nn
     from torch.nn import functional as F
 
-Seen = NDArray[Any] | PackedViews  # of N objects from V views, what the network sees
+NetworkViews = NDArray[Any] | PackedViews  # of N objects from V views, what the network sees
 
 
 class Windows(OwnBatches):
@@ -44,7 +44,7 @@ class Windows(OwnBatches):
 
     def __init__(
         self,
-        seen: Seen,
+        seen: NetworkViews,
         values: NDArray,
         sphere: ViewSphere,
         objects: NDArray,
@@ -192,7 +192,7 @@ def train_map(
     weights: Path | None = None,
     recipe: MapRecipe = MapRecipe(),
     hardware: Hardware = Hardware(),
-    track: Track = silently,
+    track: TrackProgress = silently,
 ) -> list[Path]:
     """Train a network that predicts a measure of the views around one; resumes.
 

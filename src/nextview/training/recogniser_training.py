@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.checks import extras
-from nextview.data.progress import Track, silently
+from nextview.data.progress import TrackProgress, silently
 from nextview.data.rendering import rotations
 from nextview.data.splits import check_any, deduplicate, split_training
 from nextview.data.store import ViewStore
@@ -348,7 +348,7 @@ def train_recogniser(
     weights: Path | None = None,
     recipe: RecogniserRecipe = RecogniserRecipe(),
     hardware: Hardware = Hardware(),
-    track: Track = silently,
+    track: TrackProgress = silently,
 ) -> list[Path]:
     """Train the recogniser on the training split of a store; resumes.
 
@@ -391,7 +391,7 @@ def _source(
     needed: Index,
     recipe: RecogniserRecipe,
     planes: Float | None,
-    track: Track,
+    track: TrackProgress,
 ) -> StoredInputs:
     """Inputs of a store, and the row of each object of ``views`` in them, -1 for none."""
     rows = store.rows_of(views.names)

@@ -12,7 +12,7 @@ from numpy.random import Generator
 
 from nextview.data.folders import Entry, left_out_phrases, list_dataset
 from nextview.data.pool import WorkerDied, each
-from nextview.data.progress import Track, silently
+from nextview.data.progress import TrackProgress, silently
 from nextview.data.rendering import Deform
 from nextview.errors import DatasetError, MeshError
 from nextview.geometry.mesh import load_mesh
@@ -66,7 +66,7 @@ def fit_unknown(
     sensor: str = "wrist",
     seed: int = 0,
     workers: int | None = None,
-    track: Track = silently,
+    track: TrackProgress = silently,
 ) -> FittedUnknown:
     """Teach a recogniser to notice objects of unknown classes at a chosen false-alarm rate.
 
