@@ -1,8 +1,10 @@
 """The benchmark of next views of taught things: scans to tables, replays, statistics."""
 
 import re
+import runpy
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,6 +31,7 @@ from nextview.policies.base import EpisodeState
 from nextview.recognition.evidence import Evidence
 from nextview.simulation.sensed_camera import SensedCamera
 
+JOINED = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "joined_things.py"))
 SETTINGS = ThingSettings(views=(1, 2), policies=("random", "geometry"), repeats=1, samples=200)
 
 
@@ -319,3 +322,20 @@ def test_the_latex_table_is_whole_and_names_are_escaped(results, knobs, settings
     assert len(bodies) == 1 + 2 * 3
     assert all(len(re.findall(r"(?<!\\)&", line)) == len(columns) - 1 for line in bodies)
     assert "| my_module:Best_50% |" in markdown(tables)
+
+
+def test_one_correction_joins_the_tests_of_several_runs(results, tmp_path, capsys):
+    again = shutil.copytree(results, tmp_path / "again")
+    _, alone = JOINED["read_runs"]([results])
+    measures, both = JOINED["read_runs"]([results, again])
+    assert set(measures["set"]) == {results.name, "again"}
+    # Twice as many tests: the least p-value is multiplied by twice as much, up to 1.
+    least = alone["p"].min()
+    count = alone["p"].notna().sum()
+    assert both["p_holm"].min() == pytest.approx(min(1, 2 * count * least))
+
+    JOINED["main"]([results, again])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(" | ")[1] for line in lines[2:]] == ["random", "geometry"] * 2
+    with pytest.raises(UsageError, match="holds no results"):
+        JOINED["main"]([tmp_path / "nothing"])

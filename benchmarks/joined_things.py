@@ -1,0 +1,105 @@
+"""One table of several runs of ``nextview benchmark-things``, with one correction of all tests.
+
+    python benchmarks/joined_things.py heavy half clear pairs
+
+Each argument is the folder of a run. Its name is that of the set in the table. Every test of every
+run, of all things and of the confusable half, counts in Holm's correction. A p-value in the table
+is the corrected one; ceilings are not tested. "Fewer" is by how much fewer views than random a
+policy takes until it is sure: of all views, and of those after the first, where all begin alike.
+"""
+
+from pathlib import Path
+
+from nextview.cli.exit_status import orderly_end, require
+
+require("benchmark")
+
+import numpy as np
+import pandas as pd
+import tyro
+
+from nextview.benchmark.statistics import holm
+from nextview.benchmark.thing_tables import ALL, FAR_POSE, POSE_AFTER
+from nextview.errors import UsageError
+
+COLUMNS = ("set", "policy", "right after 1", "2", "3", "5", "points after 2", "until sure", "fewer")
+COLUMNS += ("wrong, of the sure", "pose, mm: median, 95 %", "its change")
+SURE = "views until sure"
+
+
+def read_runs(runs: list[Path]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Measures and tests of all runs, each with a column "set"; "p_holm" is of all of them.
+
+    Args:
+        runs: folders of results.
+
+    Raises:
+        UsageError: a folder holds no tables.
+    """
+    for run in runs:
+        if not (run / "tests.csv").is_file():
+            raise UsageError(f"{run}: holds no results of nextview benchmark-things")
+    measures = [pd.read_csv(run / "measures.csv").assign(set=run.name) for run in runs]
+    tests = pd.concat([pd.read_csv(run / "tests.csv").assign(set=run.name) for run in runs])
+    tests["p_holm"] = holm(tests["p"].to_numpy(np.float64))
+    return pd.concat(measures), tests
+
+
+def tested(row: pd.Series, times: float, unit: str) -> str:
+    """A difference to random with its interval and corrected p, in words."""
+    low, high = (times * row[end] for end in ("low", "high"))
+    p = "" if np.isnan(row["p_holm"]) else f", p {max(row['p_holm'], 0.0001):.2g}"
+    return f"{times * row['difference']:+.1f}{unit} ({low:+.1f} to {high:+.1f}){p}"
+
+
+def row_of(values: pd.DataFrame, tests: pd.DataFrame, reference: float) -> list[str]:
+    """The cells of one policy, after set and policy.
+
+    Args:
+        values: its measures.
+        tests: its differences to random.
+        reference: views until random is sure.
+    """
+    found = values.set_index(["measure", "views"])["value"]
+    right = [found.get(("accuracy", k), np.nan) for k in (1, 2, 3, 5)]
+    cells = ["" if np.isnan(share) else f"{share:.3f}" for share in right]
+
+    apart = tests.set_index(["measure", "views"])
+    until = found[SURE, 0]
+    of_all = 100 * (1 - until / reference)
+    after_first = 100 * (reference - until) / (reference - 1) if reference > 1 else 0.0
+    has_tests = ("accuracy", 2) in apart.index
+    cells.append(tested(apart.loc["accuracy", 2], 100, "") if has_tests else "")
+    cells.append(f"{until:.2f}")
+    cells.append(f"{of_all:.0f} %, {after_first:.0f} %" if has_tests else "")
+    cells.append(f"{found['wrong, of the sure', 0]:.3f}")
+    pose = [found[f"pose error, {name}", POSE_AFTER] for name in ("median", "95 %")]
+    cells.append(", ".join(f"{error:.1f}" for error in pose))
+    cells.append(tested(apart.loc[FAR_POSE, POSE_AFTER], 1, " mm") if has_tests else "")
+    return cells
+
+
+def main(runs: tyro.conf.Positional[list[Path]], things: str = ALL) -> None:
+    """Print the table.
+
+    Args:
+        runs: folders of results.
+        things: "all", or "confusable half".
+    """
+    measures, tests = read_runs(runs)
+    print("| " + " | ".join(COLUMNS) + " |")
+    print("|---" * len(COLUMNS) + "|")
+    for run in runs:
+        own = measures[(measures["set"] == run.name) & (measures["things"] == things)]
+        apart = tests[(tests["set"] == run.name) & (tests["things"] == things)]
+        reference = own[(own["policy"] == "random") & (own["measure"] == SURE)]["value"].item()
+        for policy in own["policy"].unique():
+            cells = row_of(
+                own[own["policy"] == policy], apart[apart["policy"] == policy], reference
+            )
+            print("| " + " | ".join([run.name, policy, *cells]) + " |")
+
+
+if __name__ == "__main__":
+    with orderly_end("nothing was written"):
+        tyro.cli(main)
