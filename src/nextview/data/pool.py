@@ -24,7 +24,7 @@ PATIENCE = "10s"  # how long a scheduler may take to answer
 
 _starting = threading.Lock()
 
-Work = TypeVar("Work")
+GivenItem = TypeVar("GivenItem")
 Result = TypeVar("Result")
 
 
@@ -52,11 +52,11 @@ def count(workers: int | None) -> int:
 
 
 def each(
-    function: Callable[[Work], Result],
-    items: Sequence[Work],
+    function: Callable[[GivenItem], Result],
+    items: Sequence[GivenItem],
     workers: int | None = None,
     scheduler: str | None = None,
-) -> Iterator[tuple[Work, Result | WorkerDied]]:
+) -> Iterator[tuple[GivenItem, Result | WorkerDied]]:
     """Call a function for every item in parallel.
 
     Function and items must be picklable, items hashable. A script whose functions or classes are
@@ -102,10 +102,10 @@ def each(
 
 
 def counted(
-    function: Callable[[Work], None],
-    items: Sequence[Work],
+    function: Callable[[GivenItem], None],
+    items: Sequence[GivenItem],
     total: int,
-    name: Callable[[Work], str],
+    name: Callable[[GivenItem], str],
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> Iterator[tuple[int, int]]:
@@ -133,8 +133,8 @@ def counted(
 
 
 def _in_pool(
-    function: Callable[[Work], Result], items: Sequence[Work], workers: int
-) -> Iterator[tuple[Work, Result]]:
+    function: Callable[[GivenItem], Result], items: Sequence[GivenItem], workers: int
+) -> Iterator[tuple[GivenItem, Result]]:
     start = (
         multiprocessing.get_context("spawn") if _of_script(function, items) else _OwnMainContext()
     )
@@ -218,8 +218,8 @@ def _begin_worker() -> None:
 
 
 def _on_cluster(
-    function: Callable, items: Sequence[Work], scheduler: str
-) -> Iterator[tuple[Work, Any]]:
+    function: Callable, items: Sequence[GivenItem], scheduler: str
+) -> Iterator[tuple[GivenItem, Any]]:
     with extras():
         from distributed import Client, KilledWorker, as_completed
     try:

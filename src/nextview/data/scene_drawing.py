@@ -331,7 +331,7 @@ class _Hiding:
         )
 
 
-PlacedThing = tuple[Placement | Block, Item]
+PlacedItem = tuple[Placement | Block, Item]
 
 
 def _layout(
@@ -342,12 +342,12 @@ def _layout(
     level: str,
     goal: float,
     rng: np.random.Generator,
-) -> list[PlacedThing] | None:
+) -> list[PlacedItem] | None:
     """Place things that hide a given share of a target; None if that does not work."""
     walls = int(rng.choice(3, p=WALLS[level]))
     middle = footprint(mesh.vertices)
     floor = float(mesh.vertices[:, 2].min())
-    placed: list[PlacedThing] = []
+    placed: list[PlacedItem] = []
     free = np.ones(len(hiding.views), bool)
 
     for _ in range(THINGS_TRIED):
