@@ -403,9 +403,9 @@ import shutil
 import sys
 from pathlib import Path
 
-from nextview.recognition.model_card import BUNDLED
+from nextview.recognition.model_card import BUNDLED_MODELS
 
-for path in BUNDLED.glob("recogniser-modelnet10*"):
+for path in BUNDLED_MODELS.glob("recogniser-modelnet10*"):
     shutil.copy(path, Path(f"{sys.argv[1]}{path.name.removeprefix('recogniser-modelnet10')}"))
 """
     ),
