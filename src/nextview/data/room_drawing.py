@@ -72,6 +72,9 @@ FIELD = 0.9  # of that picture: its half width at unit distance
 
 NO_POSE = tuple(np.eye(4).ravel().tolist())  # the first pose of a layout that has none yet
 
+# the target, the other things, and the boxes beside them
+Furnished = tuple[Standing, list[Standing], list[Slab]]
+
 
 @dataclass(frozen=True)
 class LifeSize:
@@ -127,7 +130,7 @@ class RoomTask:
 
 
 @dataclass(frozen=True)
-class Source:
+class RoomMeshes:
     """What rooms are drawn of.
 
     Attributes:
@@ -233,7 +236,7 @@ def _in_turns(entries: list[Entry], seed: int) -> list[Entry]:
     return [shuffled[i] for i in sorted(range(len(shuffled)), key=turns.__getitem__)]
 
 
-def _source(dataset: Path, unit: str | None) -> Source:
+def _source(dataset: Path, unit: str | None) -> RoomMeshes:
     """What of a dataset may stand around a target."""
     furniture: dict[str, list[tuple[str, str]]] = {}
     small: dict[str, list[str]] = {}
@@ -243,7 +246,7 @@ def _source(dataset: Path, unit: str | None) -> Source:
             small.setdefault(entry.split, []).append(file)
         elif entry.label in LIFE_SIZES and entry.label not in ON_TABLES:
             furniture.setdefault(entry.split, []).append((file, entry.label))
-    return Source(
+    return RoomMeshes(
         dataset,
         unit,
         {split: tuple(sorted(some)) for split, some in furniture.items()},
@@ -251,7 +254,7 @@ def _source(dataset: Path, unit: str | None) -> Source:
     )
 
 
-def _draw(source: Source, seed: int, task: RoomTask) -> str | None:
+def _draw(source: RoomMeshes, seed: int, task: RoomTask) -> str | None:
     """Draw one room into its file; the reason if that cannot be."""
     try:
         draw_room(source, task, seed).save(task.path)
@@ -260,7 +263,7 @@ def _draw(source: Source, seed: int, task: RoomTask) -> str | None:
     return None
 
 
-def draw_room(source: Source, task: RoomTask, seed: int) -> RoomLayout:
+def draw_room(source: RoomMeshes, task: RoomTask, seed: int) -> RoomLayout:
     """A room around a target; seed and name decide all that is random.
 
     Args:
@@ -275,10 +278,8 @@ def draw_room(source: Source, task: RoomTask, seed: int) -> RoomLayout:
     rng = np.random.default_rng([seed, *task.name.encode()])
     mesh = load_mesh(source.folder / task.target, unit=source.unit)
     radius = life_radius(mesh, task.label, rng)
-    small = task.label in ON_TABLES or (mesh.metres is not None and radius < HAND_SIZED)
-    drawing = _on_table if small else _on_floor
     for _ in range(ROOM_LAYOUTS_TRIED):
-        layout = drawing(source, task, mesh, radius, rng)
+        layout = _layout(source, task, mesh, radius, rng)
         if layout is None:
             continue
         room = build_room(layout, source.folder, MAX_FACES)
@@ -313,22 +314,22 @@ def life_radius(mesh: Mesh, label: str, rng: np.random.Generator) -> float:
     return float(min(radius, MOST_LENGTH / max(extent[:2].max(), 1e-6)))
 
 
-def _on_floor(
-    source: Source, task: RoomTask, mesh: Mesh, radius: float, rng: np.random.Generator
+def _layout(
+    source: RoomMeshes, task: RoomTask, mesh: Mesh, radius: float, rng: np.random.Generator
 ) -> RoomLayout | None:
-    """A target on the floor, half of them with the back to a wall; None where nothing fits."""
+    """A room without a first view, its target on the floor or a table; None where nothing fits."""
     width, depth, height = rng.uniform(*np.transpose([ROOM_SIDE, ROOM_SIDE, ROOM_HEIGHT]))
-    back = np.radians(LIFE_SIZES[task.label].back) if task.label in LIFE_SIZES else 0.0
-    against = bool(rng.integers(2))
-    target = _standing(source, task.target, mesh, radius, (width, depth), back, against, rng)
-    if target is None:
+    small = task.label in ON_TABLES or (mesh.metres is not None and radius < HAND_SIZED)
+    furnish = _on_table if small else _on_floor
+
+    placed = furnish(source, task, mesh, radius, (width, depth), rng)
+    if placed is None:
         return None
 
-    taken = [footprint(at_rest(mesh.vertices, target))]
-    objects, slabs = _furniture(source, task.split, (width, depth), taken, rng)
+    target, objects, slabs = placed
     return RoomLayout(
         name=task.name,
-        kind="floor",
+        kind="table" if small else "floor",
         seed=0,
         label=task.label,
         target=target,
@@ -341,12 +342,36 @@ def _on_floor(
     )
 
 
+def _on_floor(
+    source: RoomMeshes,
+    task: RoomTask,
+    mesh: Mesh,
+    radius: float,
+    room: tuple[float, float],
+    rng: np.random.Generator,
+) -> Furnished | None:
+    """A target on the floor, half of them with the back to a wall; None where nothing fits."""
+    back = np.radians(LIFE_SIZES[task.label].back) if task.label in LIFE_SIZES else 0.0
+    against = bool(rng.integers(2))
+    target = _standing(source, task.target, mesh, radius, room, back, against, rng)
+    if target is None:
+        return None
+
+    taken = [footprint(at_rest(mesh.vertices, target))]
+    objects, slabs = _furniture(source, task.split, room, taken, rng)
+    return target, objects, slabs
+
+
 def _on_table(
-    source: Source, task: RoomTask, mesh: Mesh, radius: float, rng: np.random.Generator
-) -> RoomLayout | None:
+    source: RoomMeshes,
+    task: RoomTask,
+    mesh: Mesh,
+    radius: float,
+    room: tuple[float, float],
+    rng: np.random.Generator,
+) -> Furnished | None:
     """A target on a table; None where it does not fit."""
-    width, depth, height = rng.uniform(*np.transpose([ROOM_SIDE, ROOM_SIDE, ROOM_HEIGHT]))
-    slabs = _table((width, depth), rng)
+    slabs = _table(room, rng)
     top = slabs[0]
     upright = task.label in ON_TABLES
     poses = np.eye(3)[None] if upright else resting_poses(mesh)
@@ -367,20 +392,8 @@ def _on_table(
         elif other is not None:
             slabs.append(other)
     around = [footprint(_slab_corners(top))]
-    more, boxes = _furniture(source, task.split, (width, depth), around, rng)
-    return RoomLayout(
-        name=task.name,
-        kind="table",
-        seed=0,
-        label=task.label,
-        target=target,
-        width=_short(width),
-        depth=_short(depth),
-        height=_short(height),
-        pose=NO_POSE,
-        objects=(*objects, *more),
-        slabs=(*slabs, *boxes),
-    )
+    more, boxes = _furniture(source, task.split, room, around, rng)
+    return target, [*objects, *more], [*slabs, *boxes]
 
 
 def _with_pose(layout: RoomLayout, seed: int, pose: Float) -> RoomLayout:
@@ -389,7 +402,7 @@ def _with_pose(layout: RoomLayout, seed: int, pose: Float) -> RoomLayout:
 
 
 def _standing(
-    source: Source,
+    source: RoomMeshes,
     file: str,
     mesh: Mesh,
     radius: float,
@@ -419,7 +432,7 @@ def _standing(
 
 
 def _furniture(
-    source: Source,
+    source: RoomMeshes,
     split: str,
     room: tuple[float, float],
     taken: list[Float],
@@ -503,7 +516,7 @@ def _table(room: tuple[float, float], rng: np.random.Generator) -> list[Slab]:
 
 
 def _lying(
-    source: Source,
+    source: RoomMeshes,
     file: str,
     mesh: Mesh,
     how: tuple[float, float, Float],
@@ -540,7 +553,7 @@ def _lying(
 
 
 def _beside(
-    source: Source, task: RoomTask, top: Slab, taken: list[Float], rng: np.random.Generator
+    source: RoomMeshes, task: RoomTask, top: Slab, taken: list[Float], rng: np.random.Generator
 ) -> Standing | Slab | None:
     """Another thing on a table, or a box; None where it does not fit."""
     others = [file for file in source.small.get(task.split, ()) if file != task.target]
