@@ -14,10 +14,11 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import binary_dilation, binary_erosion
 
 from nextview.geometry.viewsphere import VIEW_LAYOUTS, great_circle, level_pose, look_at_origin
-from nextview.policies.discriminate import Rivals
 from nextview.session.style import heat
+from nextview.things.expected_views import RivalPictures
 
 Array = np.ndarray
 Colour = tuple[int, int, int]
@@ -27,6 +28,7 @@ SKY = np.array([0.46, 0.50, 0.56])
 """Where the lamp is, how bright it is and the sky: red, green, blue."""
 SAMPLES = 12
 """Rays to the lamp and to the sky from each point of a still."""
+BEFORE_THE_TABLE = (23.0, -63.0)  # elevation and azimuth of the film's camera, degrees
 REACH = 2.0
 """Object radii from which the camera is drawn."""
 
@@ -161,10 +163,26 @@ def wood(points: Array) -> Array:
     return (1 + 0.014 * fine + 0.05 * np.sin(2.4 * board + 1)) * joint
 
 
-def shot(stage: Stage, r: float, centre: Array, size: tuple[int, int]) -> Shot:
-    """A still of a thing of radius ``r`` from before the table."""
-    (width, height), rng = size, np.random.default_rng(0)
-    pose = look_at_origin(np.radians(23), np.radians(-63), 13 * r)
+def shot(
+    stage: Stage,
+    r: float,
+    centre: Array,
+    size: tuple[int, int],
+    towards: tuple[float, float] = BEFORE_THE_TABLE,
+) -> Shot:
+    """A still of a thing.
+
+    Args:
+        stage: what is seen.
+        r: radius of the thing, metres.
+        centre: of the thing, (3,), metres.
+        size: width and height, pixels.
+        towards: elevation and azimuth of the camera, degrees.
+    """
+    width, height = size
+    rng = np.random.default_rng(0)
+    elevation, azimuth = np.radians(towards)
+    pose = look_at_origin(elevation, azimuth, 13 * r)
     focal = width / 2 / (2.6 / 13)
     pose[:3, 3] += centre + np.array([0, 0, 0.5 * r])
     rays = rays_of(pose, focal, width, height)
@@ -190,14 +208,15 @@ def unit(x: Array) -> Array:
 @dataclass(frozen=True)
 class Look:
     """A view and what followed: the leading classes with their belief, what views are worth, and
-    the leading two.
+    the leading two as the next view would show them.
     """
 
     direction: Array
     picture: Array
     leading: list[tuple[str, float]]
     values: Array | None
-    rivals: Rivals | None
+    rivals: RivalPictures | None
+    names: tuple[str, str]
     next_view: int | None
     travel: float
 
@@ -272,6 +291,20 @@ def scene(shot: Shot, colour: Colour, looks: list[Look], at: int, progress: floa
         draw.line([*flat[1:], flat[1]], (*colour, 150), 2)
     pasted(picture, shot, hand, middle)
     return picture
+
+
+def outlined(
+    picture: Image.Image, shot: Shot, vertices: Array, faces: Array, colour: Colour
+) -> None:
+    """Draw the outline of a mesh, in the frame of the table, over a picture of the scene."""
+    width, height = picture.size
+    rays = rays_of(shot.pose, shot.focal, width, height)
+    hit = Stage([(vertices, faces, (1.0, 1.0, 1.0))]).hits(shot.pose[:3, 3], rays)[0]
+    shows = hit.reshape(height, width)
+    line = binary_dilation(shows, iterations=3) & ~binary_erosion(shows, iterations=2)
+    pixels = np.asarray(picture).copy()
+    pixels[line] = colour
+    picture.paste(Image.fromarray(pixels))
 
 
 SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))
