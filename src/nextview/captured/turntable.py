@@ -12,6 +12,7 @@ from nextview.captured.folders import (
 )
 from nextview.captured.frames import MILLIMETRES, Capture, CapturedFrame, DepthFile, read_table
 from nextview.errors import DatasetError, ObservationError
+from nextview.geometry.viewsphere import rotation_z
 from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.object_frame import smallest_circle, upright_axes
 from nextview.types import Float
@@ -90,7 +91,7 @@ def read_turntable(folder: Path, turn: str) -> Capture:
         )
     posed = []
     for i, frame in enumerate(frames):
-        back = _turned(-way * i, len(frames))
+        back = rotation_z(2 * np.pi * -way * i / len(frames))
         pose = np.eye(4)
         pose[:3, :3] = back @ axes
         pose[:3, 3] = back @ [*-axis, plane[3]]
@@ -107,7 +108,7 @@ def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
     """
     n = len(clouds)
     axis = smallest_circle(np.concatenate([points[::7, :2] for points, _ in clouds]))[0]
-    turns = [_turned(-way * i, n) for i in range(n)]
+    turns = [rotation_z(2 * np.pi * -way * i / n) for i in range(n)]
     apart = np.zeros(n)
 
     turned = [
@@ -136,10 +137,3 @@ def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
         if np.linalg.norm(axis - before) < 1e-6:
             break
     return axis, apart
-
-
-def _turned(steps: int, of: int) -> Float:
-    """A turn about z by so many steps of a full circle, (3, 3)."""
-    c = np.cos(2 * np.pi * steps / of)
-    s = np.sin(2 * np.pi * steps / of)
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])

@@ -195,8 +195,7 @@ def _draw_axes(axes: Axes, frame: Frame, thing: SceneObject) -> None:
     in_camera = (ends - camera[:3, 3]) @ camera[:3, :3]
     if (in_camera[:, 2] < 0.01).any():
         return
-    at = in_camera[:, :2] / in_camera[:, 2:] * frame.intrinsics[[0, 1], [0, 1]]
-    at = at + frame.intrinsics[:2, 2] - 0.5
+    at = frame.camera.project(in_camera) - 0.5
     for end, colour in zip(at[1:], AXIS_COLOURS, strict=True):
         line = axes.plot(*np.stack([at[0], end]).T, color=colour, lw=1.8, solid_capstyle="round")
         line[0].set_path_effects([withStroke(linewidth=3.0, foreground="white")])

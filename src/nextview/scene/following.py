@@ -199,8 +199,7 @@ def _agreement_of_points(track: Track, frame: Frame) -> SegmentAgreement:
     now = frame.camera_to_world
     in_camera = (points - now[:3, 3]) @ now[:3, :3]
     in_camera = in_camera[in_camera[:, 2] > 0.01]
-    at = in_camera[:, :2] / in_camera[:, 2:] * frame.intrinsics[[0, 1], [0, 1]]
-    column, row = np.floor(at + frame.intrinsics[:2, 2]).astype(np.int64).T
+    column, row = np.floor(frame.camera.project(in_camera)).astype(np.int64).T
     inside = (row >= 0) & (row < frame.shape[0]) & (column >= 0) & (column < frame.shape[1])
     depth = frame.depth[row[inside], column[inside]]
     off = (depth - in_camera[inside, 2])[depth > 0]

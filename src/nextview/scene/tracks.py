@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from nextview.geometry.pinhole import PinholeCamera
 from nextview.recognition.poses import PoseCandidate
 from nextview.sensing.frame import Part, spans
 from nextview.sensing.observed_object import ObservedObject
@@ -236,7 +237,7 @@ def _window(corners: Float, intrinsics: Float, shape: tuple[int, int]) -> Part |
     ahead = corners[corners[:, 2] > 0.01]
     if not len(ahead):
         return None
-    at = ahead[:, :2] / ahead[:, 2:] * intrinsics[[0, 1], [0, 1]] + intrinsics[:2, 2]
+    at = PinholeCamera.of(intrinsics, shape).project(ahead)
     low = at.min(0)[::-1] - WINDOW_EDGE
     high = at.max(0)[::-1] + WINDOW_EDGE
     part = spans(low, high, shape)
