@@ -369,7 +369,7 @@ def test_json_and_the_table_tell_the_pose(known, metric_scans, capsys):
     assert "From the frame of its scan into the object frame, metres (±" in table
     assert "Other poses that it may have, by their probability: carton 0.50" in table
     main([*asked[:4], "--start", "12"])
-    assert "Where it is: not known, for the scale" in capsys.readouterr().out
+    assert "Its pose is not known: the scale" in capsys.readouterr().out
 
 
 def test_the_outline_of_the_scan_is_that_of_what_was_seen(system, meshes, tmp_path):

@@ -265,7 +265,7 @@ def test_an_object_more_novel_than_the_rate_allows_has_no_answer(capsys):
     assert (novel.answer, novel.unknown, novel.novelty) == (None, True, 0.03)
     assert novel.most_like == "chair"
     assert novel.confidence == 0.0
-    told = "none of the 10 classes it knows (most like a chair): 3 % of known objects are as novel"
+    told = "none of the 10 known classes (most like a chair): 3 % of known objects are as novel"
     assert repr(novel).startswith(told)
     assert "\n" not in repr(novel)
     told = json.loads(episode_as_json(novel, "chair"))
@@ -307,7 +307,7 @@ def test_the_command_says_that_it_does_not_know(tmp_path, capsys):
     trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(tmp_path / "heap.off")
     main(["recognise", str(tmp_path / "heap.off"), "--start", "3", "--unknown", "0.05"])
     said = " ".join(capsys.readouterr().out.split())
-    assert "It is none of the 10 classes it knows (most like a " in said
+    assert "It is none of the 10 known classes (most like a " in said
     assert "of known objects are as novel" in said
     main(["recognise", str(tmp_path / "heap.off"), "--start", "3", "--unknown", "0"])
     assert "It is a " in capsys.readouterr().out
@@ -321,7 +321,7 @@ def test_an_object_of_a_size_that_its_class_never_has_is_none_of_it():
         result = nextview.load().recognise(seen, start=3)
         assert (result.answer is not None) == known
         assert result.confident == known
-    assert "radius of 60 m is that of no" in repr(result)
+    assert "has a radius of 60 m" in repr(result)
 
 
 def test_a_suspicious_object_gets_no_confident_answer_and_is_looked_at_longer():

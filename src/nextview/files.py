@@ -456,19 +456,19 @@ def checked_bytes(path: Path, sha256: str, what: str = "weights") -> bytes:
 def arrays_in(
     content: bytes, names: Sequence[str], where: str, optional: Sequence[str] = ()
 ) -> dict[str, np.ndarray]:
-    """The arrays of these names in the content of a safetensors file.
+    """Read the named arrays from the content of a safetensors file.
 
     Args:
-        content: What the file holds.
-        names: The arrays that have to be there; others are left out.
-        where: How the sentence of an error begins ("a.safetensors: not a memory").
-        optional: Further arrays, which are returned if they are there.
+        content: bytes of the file.
+        names: required arrays; other arrays are ignored.
+        where: beginning of an error message ("a.safetensors: not a memory").
+        optional: arrays that are returned if present.
 
     Returns:
-        The arrays by name, of any shape and type: whoever asks checks these.
+        The arrays by name. The caller checks their shapes and types.
 
     Raises:
-        ModelError: it is no such file, or an array is missing.
+        ModelError: the content is not a safetensors file, or an array is missing.
     """
     # here, as most of what imports this module reads no arrays
     from safetensors import SafetensorError

@@ -22,12 +22,12 @@ from nextview.recognition.model_card import find_card, read_card, write_card
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """What is judged.
+    """Predictions to evaluate, and statistics.
 
     Attributes:
         split: use only objects of this split; needed if the predictions contain several.
-        deduplicate: of copies of a mesh under one label, evaluate only the first; the published
-            numbers count all.
+        deduplicate: evaluate only the first of identical meshes under one label; the published
+            numbers include all of them.
         cards: cards of the models that made the predictions; their scores are written into them.
         samples: number of bootstrap samples.
         seed: seed of the bootstrap and of the orders of views.

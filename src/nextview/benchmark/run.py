@@ -30,7 +30,7 @@ with extras():
 
 @dataclass(frozen=True)
 class BenchmarkSettings:
-    """What is run.
+    """Policies, thresholds and statistics.
 
     Attributes:
         policies: names of policies, or MODULE:CLASS for your own; by default all that the

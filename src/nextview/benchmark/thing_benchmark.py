@@ -41,25 +41,25 @@ MEMORY = "memory"  # folder of what is taught, where no models are given
 
 @dataclass(frozen=True)
 class ThingSettings:
-    """What is run.
+    """Conditions, policies and statistics.
 
     Attributes:
         models: name or folder of the memory that knows the scans; by default they are taught first,
             into OUT/memory.
-        sensor: what the views are taken with: NAME or NAME:STRENGTH, see nextview render --help.
+        sensor: simulated depth camera, NAME or NAME:STRENGTH, see nextview render --help.
         occlusion: "none" shows things alone, "half" and "heavy" among boxes that leave half and a
             third of them visible.
-        draws: how often each thing is shown, each time turned and seen otherwise.
-        views: after how many views the policies are compared; the last number is taken in all.
-        policies: names, or MODULE:CLASS for your own; all by default. What is already there is not
-            done again, but for your own.
-        threshold: belief from which a thing is surely recognised.
+        draws: episodes per thing, each with another rotation and first view.
+        views: numbers of views after which the policies are compared; episodes have the largest.
+        policies: names, or MODULE:CLASS for your own; all by default. Only missing results are
+            computed; your own policies always run again.
+        threshold: belief from which an answer counts as confident.
         repeats: runs of the policy random in each episode.
-        unit: of the scans' files.
-        families: things whose names begin alike, up to the first _, are drawn together in the
-            bootstrap: look-alikes of one body.
-        samples: of the bootstrap.
-        seed: decides how things are turned, the boxes, first views, noise and random policies.
+        unit: unit of length of the scan files.
+        families: things whose names are equal up to the first _, such as variants of one scan, are
+            resampled together in the bootstrap.
+        samples: number of bootstrap samples.
+        seed: seed of rotations, boxes, first views, noise and random policies.
     """
 
     models: str | None = None
@@ -146,21 +146,21 @@ def benchmark_things(
     workers: int | None = None,
     track: TrackProgress = silently,
 ) -> ThingTables:
-    """Compare where to look next at things of known geometry: from scans to a table.
+    """Compare next-view policies on taught things, from scans to tables.
 
-    The scans are taught, unless --models names a memory that knows them, and maybe more. Then each
-    is shown at its true size through a sensor, and all policies go on from the same first view.
-    Each view is sensed once, and each set of views is verified once. Both are kept in OUT: a run
-    that was stopped goes on where it was, and one more policy is replayed in seconds.
+    The scans are taught first, unless --models names a memory that contains them. Each thing is
+    shown at its true size through a simulated sensor, and all policies continue from the same first
+    view. Each view is rendered once and each set of views is verified once. Both are stored in OUT:
+    an interrupted run resumes, and one more policy is replayed in seconds.
 
-    A policy of your own, MODULE:CLASS, is made with the viewpoints. With needs = ("outlook",) it is
-    given the leading hypotheses, things in poses, with the belief in each, and their surfaces; with
-    "joint" the belief in things and azimuths by the memory's features.
+    A policy of your own, MODULE:CLASS, is made with the viewpoints. With needs = ("outlook",) it
+    receives the leading hypotheses (things in poses), their beliefs and their surfaces; with
+    "joint", the belief by features in things and azimuths.
 
     Args:
         scans: folder of the scans.
-        out: folder of the results, which is made, or gone on with.
-        workers: processes; one for each core by default; 0 to work in this one.
+        out: folder of the results; an existing one is continued.
+        workers: number of processes; by default one for each core; 0 uses this process.
         track: follows the work.
 
     Raises:

@@ -106,7 +106,7 @@ class CapturedFrame:
 
         Raises:
             DatasetError: an image is damaged.
-            ObservationError: the images show nothing of use.
+            ObservationError: the depth image has no usable depth.
         """
         raw = self.depth.read()
         something = raw != NO_DEPTH if raw.dtype == np.uint16 else np.isfinite(raw)

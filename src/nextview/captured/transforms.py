@@ -154,16 +154,16 @@ class TransformTree:
         return any(not self._links[child].fixed for child in links)
 
     def pose(self, frame: str, world: str, time: float) -> Float:
-        """From a frame into another, (4, 4), at some time, seconds.
+        """Return the pose of one frame in another at a time, (4, 4).
 
         Args:
             frame: name of the frame whose pose is asked for.
-            world: name of the frame that it is given in.
+            world: name of the frame in which the pose is expressed.
             time: seconds, of the clock of the transforms.
 
         Raises:
-            NoTransformError: nothing joins them, or not at that time.
-            ObservationError: a quaternion is none of a rotation.
+            NoTransformError: the frames are not connected, or not at that time.
+            ObservationError: a quaternion does not have unit length.
         """
         root = self.root(frame)
         if self.root(world) != root:

@@ -44,7 +44,7 @@ def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[
     console.print(_answer_in_words(result, has_threshold))
     if result.novelty is not None and not result.unknown:
         console.print(
-            f"Of objects of known classes, {100 * result.novelty:.3g} % are at least as novel."
+            f"Novelty: of known objects, {100 * result.novelty:.3g} % look at least as unusual."
         )
     for line in _pose_in_words(result):
         console.print(line, soft_wrap=True)
@@ -111,7 +111,7 @@ def _pose_in_words(result: Recognition) -> list[str]:
     """Where the object is, or why that is not known, a line each."""
     if result.pose is None:
         return (
-            [f"Where it is: not known, for {printable(result.why_no_pose)}."]
+            [f"Its pose is not known: {printable(result.why_no_pose)}."]
             if result.why_no_pose
             else []
         )

@@ -26,14 +26,14 @@ def explore(
 ) -> None:
     """Explore objects in the browser: click the views to take, or let a policy walk.
 
-    Candidate views are coloured by what the policy values them at. Images, local maps and belief
-    follow at once. Two policies walk side by side, with clean renders or through a sensor with its
-    errors.
+    Candidate views are coloured by the value that the policy gives them. Images, local maps and
+    belief are updated at once. Two policies can run side by side, with clean renders or through a
+    simulated sensor.
 
     Args:
         path: mesh file, folder of meshes or of class folders, or view store; by default the sample
             objects.
-        looking: who looks; exploring goes on where an episode would end.
+        looking: models and policies; you can continue after the end of an episode.
         compare: second policy, which walks beside the first.
         sensor: simulated depth camera: kinect, stereo, setup, wrist or none, or NAME:STRENGTH.
         start: index of the first view; by default random.
@@ -42,7 +42,7 @@ def explore(
         seed: seed of the first view, the policies and the sensor errors.
         host: address to serve the page at; 0.0.0.0 opens it to every machine that reaches this one.
         port: port of the page; the next free one if it is taken.
-        browser: do not open the page in a browser.
+        browser: whether the page is opened in a browser.
     """
     with extras():
         import viser  # noqa: F401  # a missing extra is named before models are opened

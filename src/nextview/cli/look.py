@@ -26,22 +26,23 @@ from nextview.types import Float
 
 @dataclass(frozen=True)
 class LookOptions:
-    """What is looked for, and where.
+    """The known things, the frames and the region.
 
     Attributes:
-        models: bundled memory by name, or folders of your own; several together if there are
-            several.
+        models: name of a bundled memory, or folder of your own; several are used together.
         intrinsics: FX FY CX CY, pixels, or a file with them (the pinhole matrix, or what ROS,
-            librealsense or Open3D wrote), if not those of the folder.
-        depth_scale: metres that one step of the depth images stands for, if not as the files say.
-        depth_topic: of a ROS 2 bag with several topics of depth images.
-        world_frame: of a ROS 2 bag: the frame of tf that is the world, z up.
-        up: the axis of the world that points up, or a direction; by default as the layout says, or
-            the normal of the support plane.
-        region: upright box outside of which nothing is looked for: its low and its high corner,
-            metres (heights along --up).
-        frames: how many frames are looked at, evenly spread over the folder.
-        unknown: share of known things that may be called unknown (0.02); 0 always names a thing.
+            librealsense or Open3D wrote), instead of those of the folder.
+        depth_scale: metres per step of the depth images, such as 0.001 for millimetres; by default
+            as their files say.
+        depth_topic: for ROS 2 bags with several topics of depth images: the topic.
+        world_frame: for ROS 2 bags: tf frame of the world, z up; by default the root of the tree.
+        up: axis of the world that points up, or a direction; by default that of the layout, or the
+            normal of the support plane.
+        region: upright box to which the search is limited: its low and its high corner, metres
+            (heights along --up).
+        frames: number of frames to use, evenly spread over the recording.
+        unknown: p-value below which an object is called unknown; by default 0.02, so one known
+            thing in 50 is. 0 always names a thing.
     """
 
     models: str | tuple[str, ...] = "ycb"
@@ -57,7 +58,7 @@ class LookOptions:
 
 @dataclass(frozen=True)
 class LookOutput:
-    """What is made of it.
+    """Files and output.
 
     Attributes:
         figure: write a picture of the last frame and of the table from above to this file (PNG,

@@ -198,14 +198,14 @@ def draw_rooms(
 def room_tasks(
     dataset: Path, out: Path, rooms: int | None, seed: int, split: str | None
 ) -> list[RoomTask]:
-    """All rooms that are asked for, see ``draw_rooms``.
+    """Return a task for each room to draw, see ``draw_rooms``.
 
     Args:
         dataset: folder of meshes.
         out: folder of the rooms.
-        rooms: how many of them; None for one an object.
+        rooms: number of rooms; None for one around each object.
         seed: of all draws.
-        split: whose objects are shown; None for all.
+        split: split whose objects are shown; None for all.
     """
     if rooms is not None:
         whole(rooms, "the number of rooms", 1, MOST_SCENES)

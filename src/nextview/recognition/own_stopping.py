@@ -15,7 +15,7 @@ from nextview.types import Float, Floats, Mask
 
 @dataclass(frozen=True)
 class Believed:
-    """What is believed in some episodes, (...): all that a stopping rule may look at.
+    """Beliefs of episodes, (...): the input of a stopping rule.
 
     Attributes:
         belief: in each class, (..., classes).
@@ -45,7 +45,7 @@ class Believed:
 
     @property
     def margin(self) -> Float:
-        """By how much it leads, (...)."""
+        """Its lead over the class believed second most, (...)."""
         if self.belief.shape[-1] == 1:
             return self.highest
         top = np.sort(self.belief, -1)
@@ -53,7 +53,7 @@ class Believed:
 
     @property
     def entropy(self) -> Float:
-        """Of the belief, bits, (...)."""
+        """Entropy of the belief, bits, (...)."""
         return -np.asarray(
             (self.belief * np.log2(np.maximum(self.belief, 1e-300))).sum(-1), np.float64
         )

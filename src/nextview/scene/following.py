@@ -71,7 +71,7 @@ class Outline:
 def assign(
     segments: Sequence[Mask], tracks: Sequence[Track], top: TableTop
 ) -> tuple[dict[int, Mask], list[Mask]]:
-    """Tell whose pixels the segments of a frame are.
+    """Assign the segments of a frame to objects.
 
     Args:
         segments: of the frame, (H, W) bool each.
@@ -79,7 +79,8 @@ def assign(
         top: what the frame shows.
 
     Returns:
-        The pixels of each object that the frame shows, by its row; and the segments of no object.
+        The pixels of each object in the frame, by its row in ``tracks``; and the segments that
+        belong to no object.
     """
     outlines = [Outline.of(track, top.up) for track in tracks]
     own: dict[int, Mask] = {}

@@ -137,7 +137,7 @@ class Judge:
 
     @property
     def widest(self) -> float | None:
-        """Diameter of the largest thing that is known, metres; None where no size is known."""
+        """Diameter of the largest taught thing, metres; None if no sizes are known."""
         card = getattr(self.system.models.recogniser, "card", None)
         if card is None or card.size is None:
             return None

@@ -71,7 +71,7 @@ class Bench:
         return rendered.fit(mask)
 
     def share(self, tracks: Sequence[Track]) -> float:
-        """Share of the pixels of some objects that their scans explain."""
+        """Return the share of the objects' pixels that their scans explain."""
         fits = [self.fit(track) for track in tracks]
         return sum(one for one, _ in fits) / max(sum(every for _, every in fits), 1)
 
@@ -81,15 +81,15 @@ class Bench:
 
 
 def part(tracks: Sequence[Track], bench: Bench, before: Mapping[int, Track]) -> list[Track]:
-    """Join and cut the objects of one frame where scans explain more of it then.
+    """Merge and cut the objects of one frame where the scans then explain more of it.
 
     Args:
-        tracks: all objects that the frame shows, judged.
+        tracks: all objects that the frame shows, verified.
         bench: the frame.
         before: the objects as they were before this frame, by their numbers.
 
     Returns:
-        The objects, judged. Numbers of new ones are negative.
+        The objects, verified. New ones have negative numbers.
     """
     tracks = _trimmed(tracks, bench, before)
     tracks = _joined(tracks, bench)

@@ -81,7 +81,7 @@ class Scene:
     """All objects on a table, or a floor, as a depth camera sees them in one or more frames.
 
     >>> scene = nextview.Scene("ycb")                                           # doctest: +SKIP
-    >>> scene.update(nextview.Frame(depth, intrinsics, pose))                   # doctest: +SKIP
+    >>> scene.update(Frame(depth, intrinsics, pose))  # of nextview.sensing     # doctest: +SKIP
     >>> for thing in scene.objects:                                             # doctest: +SKIP
     ...     print(thing.name, thing.confidence, thing.pose)
 

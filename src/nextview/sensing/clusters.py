@@ -81,7 +81,7 @@ class Footprint:
 
     @cached_property
     def outlines(self) -> dict[int, Float]:
-        """The convex outline of each larger piece, (K, 3): lines a x + b y + c <= 0, cells."""
+        """Convex outline of each larger piece: K lines (a, b, c), a x + b y + c <= 0, cells."""
         found = {}
         many = np.bincount(self.piece, minlength=1)
         for piece in np.flatnonzero(many >= OUTLINED):

@@ -121,7 +121,7 @@ class Facets:
 
     @cached_property
     def points(self) -> Float:
-        """Where the rays meet the planes, camera frame, (N, 3) float64, metres."""
+        """Points where the rays meet the planes, camera frame, (N, 3) float64, metres."""
         return self.rays / np.einsum("ni,ni->n", self.planes, self.rays)[:, None]
 
     def some(self, which: slice | Mask | Index) -> "Facets":

@@ -114,10 +114,10 @@ class Recognition:
     def none_of_them(self) -> str:
         """The answer for an unknown object.
 
-        It reads ``none of the 10 classes it knows (most like a toilet)``.
+        It reads ``none of the 10 known classes (most like a toilet)``.
         """
         a = "an" if str(self.most_like)[:1].lower() in "aeiou" else "a"
-        return f"none of the {len(self.classes)} classes it knows (most like {a} {self.most_like})"
+        return f"none of the {len(self.classes)} known classes (most like {a} {self.most_like})"
 
     @property
     def why_unknown(self) -> str:
@@ -128,7 +128,7 @@ class Recognition:
                 " scans"
             )
         if self.most_like in self.impossible:
-            return f"a radius of {self.radius:.2g} m is that of no {self.most_like}"
+            return f"no {self.most_like} has a radius of {self.radius:.2g} m"
         return f"{100 * (self.novelty or 0):.2g} % of known objects are as novel"
 
     @property

@@ -269,28 +269,28 @@ def load(
     """Open models, and what belongs to them.
 
     Args:
-        models: the name of bundled models, or a folder with the card of a recogniser, and of maps
-            and policies of its own if there are any. Maps that it lacks are the bundled ones, which
-            know no classes. Or several of these: memories of things with their geometry, and at
-            most one network. A thing is named if its geometry explains what is seen; else a class.
+        models: the name of bundled models, or a folder with the card of a recogniser and, if you
+            like, cards of maps and policies. Missing maps are taken from the bundled models; they
+            do not depend on the classes. Or a list: memories with geometry, and at most one
+            network. Then a thing is named if its geometry explains the views, otherwise a class of
+            the network.
         policy: how the next view is chosen; "gain" by default, where one was learned for these
             classes, else "spread". Names are those of ``nextview.policies.registry``, of policy
             cards in the folder, or "MODULE:CLASS".
         threshold: stop when the belief in one class reaches this after one view, and less after
             several.
-        risk: instead, stop at the lowest threshold at which at most this share of those who stop
-            early is wrong.
+        risk: instead of ``threshold``, the largest share of wrong answers among the episodes that
+            stop early; the lowest threshold that guarantees it is used.
         max_views: stop after so many views.
         viewpoints: the candidates: "40", "12", "rings:0,30,60x12", "fibonacci:60", or directions or
             poses of your own, see ``viewsphere.viewpoints_of``.
         threads: of ONNX Runtime, 0 for one on each core.
-        unknown: answer None where an object is as novel as at most this share of the objects of
-            known classes: so often one of these is called unknown; or where no object of the class
-            has its size. 0 always names a class. By default 0.02, where the recogniser has a
-            novelty score.
-        stopping: a rule of your own: "MODULE:NAME" or a function, which is asked with what is
-            believed and the threshold, see ``recognition.own_stopping``; or a ``Stopping``, instead
-            of threshold, risk and views.
+        unknown: p-value below which the answer is None, so this share of the objects of known
+            classes is called unknown. Objects of a size that the class never has are unknown, too.
+            0 always names a class. By default 0.02 if the recogniser has a novelty score.
+        stopping: a rule of your own: "MODULE:NAME", or a function of a
+            ``recognition.own_stopping.Believed`` and the threshold; or a ``Stopping``, which
+            replaces threshold, risk and max_views.
         recogniser: one of your own instead of that of the models: an object or "MODULE:NAME", see
             ``recognition.own_recogniser``. It is pickled with the system.
 

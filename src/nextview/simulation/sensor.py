@@ -176,17 +176,17 @@ class Sensor:
     def measure(self, depth: Float32, rng: np.random.Generator) -> tuple[Float32, Index]:
         """Return what the sensor measures of a true depth image.
 
-        Errors of strength 0 change nothing, to the bit. Each error draws from a generator of its
-        own.
+        An error of strength 0 leaves the image unchanged bit for bit. Each error has its own random
+        generator.
 
         Args:
             depth: true depth, (height, width) float32, metres; 0 where there is nothing.
             rng: source of all random numbers.
 
         Returns:
-            Depth, (height, width) float32, 0 where none was measured. And whose surface each pixel
-            shows, its own or that of a neighbour: row * width + column, int64, or -1 for a flying
-            pixel.
+            Depth, (height, width) float32, 0 where none was measured; and the pixel whose surface
+            each pixel shows, itself or a neighbour, as row * width + column, int64, or -1 for a
+            flying pixel.
         """
         measured = depth.copy()
         sources = np.arange(depth.size).reshape(depth.shape)

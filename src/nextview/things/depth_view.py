@@ -184,7 +184,7 @@ class MetricImage:
         """Choose pixels on a grid over the outline of the thing and a margin around it.
 
         Args:
-            side: about so many rows, and so many columns; more if the thing is thin.
+            side: approximate number of rows and of columns; larger if the thing is thin.
         """
         mask = self.kind == THING
         rows, columns = _window(mask, side, WINDOW_MARGIN)

@@ -22,7 +22,7 @@ from nextview.things.taught import TaughtThings
 from nextview.things.verifier import Verified
 from nextview.types import Float, Floats, Index
 
-NO_SCALE = "the scale of what is seen is not known in metres"
+NO_SCALE = "the scale of the views is not known in metres"
 
 
 class VerifiedRecogniser(TaughtRecogniser):

@@ -32,15 +32,16 @@ AXIS_TOLERANCE = np.radians(20)  # axes within this angle are one
 def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
     """Find the axes and orders of a surface's symmetries.
 
-    Axes through the centroid of the surface, which every symmetry keeps in its place, are tried:
-    those of its file, its principal axes, and those of the smallest box around it. A symmetry of
-    any angle leaves out all but one of the axes across it, as they follow from each other.
+    The candidate axes pass through the centroid of the surface, which every symmetry leaves fixed.
+    They are the axes of the file, the principal axes and those of the smallest bounding box. If the
+    surface is symmetric by any angle about one axis, only one of the axes perpendicular to it is
+    returned, because the others follow.
 
     Args:
         surface: of a thing.
 
     Returns:
-        Its symmetries, those of any angle first, then by their order.
+        Its symmetries: first those of any angle, then the others by their order.
     """
     rng = np.random.default_rng(0)
     whole = surface.sample(SYMMETRY_POINTS, rng)

@@ -234,7 +234,7 @@ class Walk:
 def remembered_picture(
     recogniser: TaughtRecogniser, hypothesis: int, ring: int, azimuth: int
 ) -> NDArray[np.uint8]:
-    """Draw a taught thing in a resting pose as the memory holds it.
+    """Draw a taught thing in a resting pose.
 
     It is drawn from the memory's surface, or else from the mesh that was taught; if neither is
     there, the stored picture is returned.
