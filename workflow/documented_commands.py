@@ -416,7 +416,7 @@ import sys
 import numpy as np
 
 sys.path.insert(0, "examples")
-from arm_over_table import Arm
+from arm_and_object import Arm
 from simulated_sensor import INTRINSICS as intrinsics
 
 import nextview
