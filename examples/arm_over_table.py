@@ -25,13 +25,14 @@ import tyro
 
 import nextview
 from nextview.cli.exit_status import orderly_end
-from nextview.data.samples import SAMPLES, sample_mesh
+from nextview.data.samples import SAMPLE_MESHES, sample_mesh
 from nextview.errors import MissingExtraError, UsageError
 from nextview.geometry.mesh import Mesh, load_mesh
-from nextview.geometry.ray_caster import RayCaster, pixel_rays
+from nextview.geometry.pinhole import PinholeCamera
+from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.resting import resting_poses
 from nextview.geometry.viewsphere import look_at_origin, rotation_z
-from nextview.scene.objects import UNKNOWN, SceneObject
+from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Look
 from nextview.sensing.object_frame import Box
 from nextview.simulation.scene import footprint, separation
@@ -122,7 +123,7 @@ def draw_table(scans: Sequence[Path], count: int, seed: int) -> FullTable:
     high = split + rng.choice(len(meshes) - split, HIDDEN_THINGS, replace=False)
     rest = rng.choice(split, count - 1 - HIDDEN_THINGS, replace=False)
     meshes = [meshes[k] for k in [*high, *rest]]
-    meshes.append(toy(str(rng.choice(sorted(SAMPLES)))))
+    meshes.append(toy(str(rng.choice(sorted(SAMPLE_MESHES)))))
     rests = [resting_poses(mesh) for mesh in meshes]
     for row in range(HIDDEN_THINGS):
         rests[row] = highest(meshes[row], rests[row])
@@ -235,7 +236,7 @@ def toy(name: str) -> Mesh:
 def shares_shown(things: Sequence[PlacedThing], pose: np.ndarray) -> np.ndarray:
     """Share of its pixels that a camera at a pose, (4, 4), sees of each thing, (N,)."""
     sensor = SENSORS["wrist"]
-    rays = pixel_rays(sensor.intrinsics, sensor.shape)[::COARSE, ::COARSE].reshape(-1, 3)
+    rays = PinholeCamera.of(sensor.intrinsics, sensor.shape).rays[::COARSE, ::COARSE].reshape(-1, 3)
     rays = rays @ pose[:3, :3].T
     triangles = [(thing.placed, thing.faces) for thing in things]
     _, owner = RayCaster(triangles).cast(pose[:3, 3], rays)
@@ -263,14 +264,14 @@ class Verdict:
     @property
     def right(self) -> bool:
         """Whether it has the right name, or is a stranger and called unknown."""
-        if self.found.name == UNKNOWN:
+        if self.found.name == UNKNOWN_NAME:
             return self.true is not None and not self.known
         return self.true is not None and self.found.name == self.true.name
 
     @property
     def wrong(self) -> bool:
         """Whether it has a wrong name."""
-        return self.found.name != UNKNOWN and not self.right
+        return self.found.name != UNKNOWN_NAME and not self.right
 
     def line(self, lean: np.ndarray) -> str:
         """What is printed of it.
@@ -313,16 +314,22 @@ def summary(found: Sequence[Verdict], table: FullTable) -> list[str]:
     named = [one for row, one in right.items() if row < known]
     sure = sum(one.found.confident for one in named)
     said = [f"{len(named)} of {known} things named right, {sure} of them with confidence"]
-    stranger = "unknown, as it should be" if known in right else "not told as unknown"
-    said.append(f"the stranger, a {table.things[-1].name}: {stranger}")
-    said += [
-        f"wrong: {one.found.name}, truly {one.true.name if one.true else 'nothing'}"
-        for one in found
-        if one.wrong
+    if known in right:
+        said.append(f"the stranger, a {table.things[-1].name}, is told as unknown")
+    wrong = {one.row: one for one in found if one.wrong}
+    if wrong:
+        names = [
+            f"{one.found.name} ({one.true.name if one.true else 'nothing'})"
+            for one in wrong.values()
+        ]
+        said.append(f"wrong: {', '.join(names)}")
+    missed = [
+        thing.name
+        for row, thing in enumerate(table.things)
+        if row not in right and row not in wrong
     ]
-    missed = [thing.name for row, thing in enumerate(table.things[:-1]) if row not in right]
     if missed:
-        said.append(f"missed: {', '.join(missed)}")
+        said.append(f"not recognised: {', '.join(missed)}")
     return [line.replace("_", " ") for line in said]
 
 

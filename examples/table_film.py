@@ -17,8 +17,8 @@ from scipy import ndimage
 
 import nextview
 from nextview.geometry.viewsphere import look_at_origin
-from nextview.scene.figure import CELL, COLOURS, grey_picture, seen_from_above
-from nextview.scene.objects import UNKNOWN, SceneObject
+from nextview.scene.figure import FIGURE_CELL, OBJECT_COLOURS, grey_picture, seen_from_above
+from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.session.style import ACCENT, GREY, INK, PAPER
 from research.arm import Arm, seconds_of
 from research.film_stage import KEY, SKY, SUN, Array, Stage, font, rays_of, toned
@@ -27,12 +27,12 @@ SIZE = (600, 540)  # of the picture of the arm, pixels
 SIDE = 348  # width of what is shown beside it, pixels
 INSET = 12  # pixels
 FINER = 2  # rays for a pixel, along each side
-RATE = 10  # frames a second
-SLOWER = 2.0  # so many times slower than at the joints' velocity limits motions are shown
+RATE = 12  # frames a second
+SLOWER = 4.0  # so many times slower than at the joints' velocity limits motions are shown
 STILL = 1.4  # seconds that are shown after a look
 LAST = 4.0  # and at the end
-FOCAL = 1.55  # of the camera that films, widths of the picture
-LOOKED_AT = np.array([0.34, 0.02, 0.24])
+FOCAL = 1.45  # of the camera that films, widths of the picture
+LOOKED_AT = np.array([0.34, 0.02, 0.21])
 FILMED_FROM = np.radians([26.0, -47.0])
 AWAY = 2.05  # metres
 CLAY = np.array([0.60, 0.57, 0.53])
@@ -41,7 +41,9 @@ LAMP = 0.09  # radius of the lamp, a unit away
 SHADOW_SAMPLES = 5  # rays to the lamp from each point on which the arm may throw its shadow
 SKY_SAMPLES = 48
 PLAN = 0.31  # metres from its middle to the border of the view from above
-COLOURS_IN_GIF = 200
+COLOURS_IN_GIF = 255
+FRAMES_OF_PALETTE = 10  # from which the palette is made
+NO_RED = tuple(OBJECT_COLOURS[k] for k in (0, 2, 3, 4, 5, 7, 8))  # red is for what is wrong
 BESIDE = 24  # pixels beside what was found that are shown with it
 ABOVE = np.array([0, 0, 0.035])  # metres from the top of a thing to its name
 VIEW = 0.42  # metres to where the view of the camera on the wrist is drawn
@@ -103,7 +105,9 @@ class Film:
         """
         self._show(self._seconds, said)
         self.frames += [self.frames[-1]] * int(LAST * RATE)
-        palette = self.frames[-1].quantize(COLOURS_IN_GIF)
+        few = strip(self.frames[:: max(1, len(self.frames) // FRAMES_OF_PALETTE)])
+        coverage = Image.Quantize.MAXCOVERAGE  # small things keep their colours
+        palette = few.quantize(COLOURS_IN_GIF, method=coverage, kmeans=3)
         plain = Image.Dither.NONE
         frames = [frame.quantize(palette=palette, dither=plain) for frame in self.frames]
         frames[0].save(
@@ -151,10 +155,10 @@ class Film:
         self._labels = []
         for thing in scene.objects:
             row = owner[thing.number] + 1
-            if row == 0 or not (thing.confident or thing.name == UNKNOWN):
+            if row == 0 or not (thing.confident or thing.name == UNKNOWN_NAME):
                 continue
             colour = colour_of(thing, wrong)
-            if thing.name != UNKNOWN:
+            if thing.name != UNKNOWN_NAME:
                 self._albedo[row] = linear(colour)
             self._labels.append((self._tops[row], words(thing, wrong), colour))
 
@@ -165,12 +169,14 @@ class Film:
         draw = ImageDraw.Draw(picture, "RGBA")
         if looking:
             self._draw_view(draw)
-        for top, name, colour in sorted(self._labels, key=lambda label: label[0][1], reverse=True):
-            tag(draw, self._place(top + ABOVE), name, colour)
+        taken: list[Array] = []
+        placed = [(self._place(top + ABOVE), name, colour) for top, name, colour in self._labels]
+        for at, name, colour in sorted(placed, key=lambda label: -label[0][1]):
+            tag(draw, at, name, colour, taken)
         frame.paste(picture, (0, 0))
         if self._beside is not None:
             frame.paste(self._beside, (SIZE[0], 0))
-        draw = ImageDraw.Draw(frame)
+        draw = ImageDraw.Draw(frame, "RGBA")
         speed = f"{seconds:.1f} s of motion, shown {SLOWER:g} times slower"
         lines(draw, said or [self._title, speed])
         self.frames.append(frame)
@@ -226,12 +232,24 @@ class Film:
         draw.line([*flat, flat[0]], (*ImageColor.getrgb(ACCENT), 220), 2)
 
 
+def strip(frames: Sequence[Image.Image]) -> Image.Image:
+    """Frames side by side, half as large."""
+    small = [frame.reduce(2) for frame in frames]
+    whole = Image.new("RGB", (sum(frame.width for frame in small), small[0].height))
+    for k, frame in enumerate(small):
+        whole.paste(frame, (k * frame.width, 0))
+    return whole
+
+
 def lines(draw: ImageDraw.ImageDraw, said: Sequence[str]) -> None:
     """Write lines at the lower left, the first of them bold."""
+    wide = max(draw.textlength(line, font(14, True)) for line in said)
+    box = (6, SIZE[1] - 14 - 20 * len(said), 22 + wide, SIZE[1] - 6)
+    draw.rounded_rectangle(box, 8, (*ImageColor.getrgb(PAPER), 215))
     for k, line in enumerate(said):
         y = SIZE[1] - 14 - 20 * (len(said) - 1 - k)
         letters = font(14 if k == 0 else 13, k == 0)
-        draw.text((14, y), line, INK, letters, anchor="ls", stroke_width=3, stroke_fill=PAPER)
+        draw.text((14, y), line, INK, letters, anchor="ls")
 
 
 def beside(scene: nextview.Scene, middle: Array, wrong: set[int]) -> Image.Image:
@@ -249,7 +267,7 @@ def beside(scene: nextview.Scene, middle: Array, wrong: set[int]) -> Image.Image
     plan = plan_picture(scene, middle, wrong, (seen.width, side))
     panel.paste(plan, (INSET, top + 20))
 
-    named = [thing for thing in scene.objects if thing.name != UNKNOWN]
+    named = [thing for thing in scene.objects if thing.name != UNKNOWN_NAME]
     sure = sum(thing.confident for thing in named)
     unknown = len(scene.objects) - len(named)
     said = f"{sure} sure, {len(named) - sure} not sure, {unknown} unknown"
@@ -347,9 +365,9 @@ def rings(thing: SceneObject, upright: Array) -> list[Array]:
     corners, cells = seen_from_above(thing, upright)
     if cells is None:
         return [corners]
-    low = corners.min(0) - 2 * CELL
+    low = corners.min(0) - 2 * FIGURE_CELL
     smooth = ndimage.gaussian_filter(cells.astype(float), 0.8).T
-    x, y = (low[k] + CELL * np.arange(cells.shape[k]) for k in (0, 1))
+    x, y = (low[k] + FIGURE_CELL * np.arange(cells.shape[k]) for k in (0, 1))
     return contour_generator(x, y, smooth).lines(0.5)
 
 
@@ -370,15 +388,18 @@ def write(
     while any(abs(y - b) < 12 and abs(x - a) < half + other for a, b, other in taken) and y > 14:
         y -= 4
     taken.append((x, y, half))
-    colour = INK if thing.name == UNKNOWN else colour_of(thing, wrong)
+    colour = INK if thing.name == UNKNOWN_NAME else colour_of(thing, wrong)
     draw.text((x, y), text, colour, letters, anchor="ms", stroke_width=2, stroke_fill="white")
 
 
-def tag(draw: ImageDraw.ImageDraw, at: Array, text: str, colour: str) -> None:
-    """A name on a coloured ground."""
+def tag(draw: ImageDraw.ImageDraw, at: Array, text: str, colour: str, taken: list[Array]) -> None:
+    """Write a name on a coloured ground where no other is, and remember where."""
     letters = font(12, True)
     half = draw.textlength(text, letters) / 2 + 8
     x, y = at
+    while any(abs(y - b) < 21 and abs(x - a) < half + other for a, b, other in taken):
+        y -= 3
+    taken.append(np.array([x, y, half]))
     box = (x - half, y - 10, x + half, y + 10)
     draw.rounded_rectangle(box, 10, (*ImageColor.getrgb(colour), 235))
     draw.text((x, y), text, "white", letters, anchor="mm")
@@ -389,14 +410,14 @@ def words(thing: SceneObject, wrong: set[int]) -> str:
     name = thing.name.replace("_", " ")
     if thing.number in wrong:
         return f"{name} (wrong)"
-    return name if thing.confident or thing.name == UNKNOWN else f"{name}?"
+    return name if thing.confident or thing.name == UNKNOWN_NAME else f"{name}?"
 
 
 def colour_of(thing: SceneObject, wrong: set[int]) -> str:
     """The colour of an object: grey for an unknown one, red for a wrong name."""
     if thing.number in wrong:
         return ACCENT
-    return GREY if thing.name == UNKNOWN else COLOURS[(thing.number - 1) % len(COLOURS)]
+    return GREY if thing.name == UNKNOWN_NAME else NO_RED[(thing.number - 1) % len(NO_RED)]
 
 
 def linear(colour: str) -> Array:

@@ -60,6 +60,9 @@ LIMIT = 900  # seconds for one command
 
 NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"^nextview look ": "needs frames of a table: tests/test_scene.py makes some and runs it",
+    r"examples/arm_over_table": (
+        "needs the YCB scans; research/tests/test_arm_over_table.py has files of a few"
+    ),
     r"^python benchmarks/tables\.py": "needs scans of all things that the bundled memory knows",
     r"^make (test|lint|docs)": "a job of its own in CI",
     r"^make demo": "installs; .ci/base_installation runs nextview demo, twice",
@@ -112,7 +115,8 @@ NEEDS = {  # what a command or a Python block needs besides the base installatio
         "nextview[benchmark]"
     ),
     r"benchmarks/ablations\.py": "nextview[train]",
-    r"--record|viewers\.recording": "nextview[record]",
+    r"--record|viewers\.(scene_)?recording": "nextview[record]",
+    r"--explorer|viewers\.scene_page": "nextview[explore]",
     r"(?<![.:])\b(volumetric|coverage)\b": "research",  # by their short names
     r"research\.train_agent": "research[rl]",
     r"research\.arm|examples/panda": "research[arm]",

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from scipy.spatial import cKDTree
 
 pytest.importorskip("mujoco", reason="the extra 'arm' of research is not installed")
 
 from conftest import ROOT
 
 from nextview.errors import UsageError
+from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.sensor import SENSORS
 from nextview.things.memory import open_memory
 from research.arm import Arm
@@ -71,18 +73,27 @@ def test_three_things_are_hidden_and_nothing_overlaps(example, table):
 
 
 def test_it_takes_itself_out_of_the_picture(example, table):
-    arm = Arm(
-        [(one.placed, one.faces) for one in table.things],
-        np.random.default_rng(0),
-        sensor=SENSORS["wrist"],
+    """By points on its links, which stand in the picture as it looks back at its base."""
+    things = [(one.placed, one.faces) for one in table.things]
+    arm = Arm(things, np.random.default_rng(0), sensor=SENSORS["wrist"].scaled(0))
+    pose = look_at_origin(np.radians(70), np.radians(20), 0.5)
+    pose[:3, 3] += [0.3, 0, 0.1]
+    arm.joints = arm.solve(pose)
+    links = cKDTree(
+        np.concatenate([trimesh.Trimesh(*each).sample(5000) for each, _ in arm.things()[9:]])
     )
-    arm.joints = arm.solve(example.first_pose())
-    own = arm.look()
-    without = arm.look(itself=False)
-    nearest = (own.depth > 0) & (own.depth < 0.15)  # the hand; the things are farther away
-    assert np.count_nonzero(nearest) > 500
-    assert not ((without.depth > 0) & (without.depth < 0.15)).any()
-    assert np.count_nonzero(without.depth) > 0.7 * np.count_nonzero(own.depth)
+
+    def on_links(frame):
+        rows, columns = np.nonzero(frame.depth)
+        away, _ = links.query(frame.positions(rows, columns))
+        return np.count_nonzero(away < 0.005), len(rows)
+
+    with_links, every = on_links(arm.look())
+    without, rest = on_links(arm.look(itself=False))
+    assert with_links > 1000
+    # where the base stands on the table
+    assert without < 0.01 * with_links
+    assert rest > every - 1.5 * with_links
 
 
 def test_what_it_says_is_what_stands_there(example, scans, tmp_path, capsys):

@@ -19,7 +19,7 @@ from nextview.errors import SessionError, UsageError
 from nextview.files import new_file
 from nextview.recognition.poses import place_in_words
 from nextview.scene.figure import grey_picture
-from nextview.scene.objects import UNKNOWN, SceneObject
+from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Scene
 from nextview.session.style import ACCENT, FAINT, GROUND, INK, PAPER, rgb
 from nextview.types import Float
@@ -30,12 +30,12 @@ with extras():
 
     from nextview.viewers.page import serve
 
-MOST_CANDIDATES = 4  # things of which the belief is shown for an object
+PAGE_CANDIDATES = 4  # things of which the belief is shown for an object
 LEAST_BELIEF = 0.005  # of what is shown
-PICTURE_WIDTH = 200  # pixels of a frame's picture in its camera
-FRUSTUM = 0.045  # metres, size of a camera that is drawn
+FRUSTUM_PIXELS = 200  # pixels of a frame's picture in its camera
+PAGE_FRUSTUM = 0.045  # metres, size of a camera that is drawn
 AROUND = 0.08  # metres of the table around all that stands on it
-THICK = 0.01  # metres, of the table that is drawn
+PAGE_TABLE_THICKNESS = 0.01  # metres, of the table that is drawn
 STEEP = 0.8  # height over level distance from which the page looks at first
 FAR = 2.0  # radii of the scene from which it does
 ASIDE = np.radians(50.0)  # from the last camera
@@ -109,7 +109,7 @@ def scene_card(scene: Scene, title: str) -> str:
     count = len(scene.frames)
     frames = f"{count} frame{'s' * (count > 1)}"
     sure = sum(thing.confident for thing in objects)
-    unknown = sum(thing.name == UNKNOWN for thing in objects)
+    unknown = sum(thing.name == UNKNOWN_NAME for thing in objects)
     said = f"{frames}: {sure} sure, {len(objects) - sure - unknown} not sure, {unknown} unknown"
     if not objects:
         said = f"{frames}: nothing stands on the plane"
@@ -123,7 +123,7 @@ def _object_card(thing: SceneObject) -> str:
     sure = "confident" if thing.confident else "not confident"
     off = thing.pose_uncertainty
     where = f"at {place_in_words(thing.place)}"
-    if thing.name == UNKNOWN:
+    if thing.name == UNKNOWN_NAME:
         sides = " x ".join(f"{100 * side:.0f}" for side in thing.size)
         sure = f"{sides} cm"
     elif off is not None:
@@ -131,7 +131,7 @@ def _object_card(thing: SceneObject) -> str:
     if thing.touches:
         where += f", touches {', '.join(str(number) for number in thing.touches)}"
 
-    beliefs = sorted(thing.result.beliefs.items(), key=lambda pair: -pair[1])[:MOST_CANDIDATES]
+    beliefs = sorted(thing.result.beliefs.items(), key=lambda pair: -pair[1])[:PAGE_CANDIDATES]
     rows = "".join(
         f'<tr><td>{escape(name.replace("_", " "))}</td><td><div class="bar">'
         f'<b style="width:{100 * belief:.1f}%;background:{colour}"></b></div></td>'
@@ -209,11 +209,11 @@ def _draw_table(server: viser.ViserServer, scene: Scene, middle: Float, radius: 
     server.scene.add_cylinder(
         "/table",
         radius,
-        THICK,
+        PAGE_TABLE_THICKNESS,
         rgb("#efe4d3"),
         radial_segments=96,
         wxyz=turn.as_quat(scalar_first=True),
-        position=tuple(foot - THICK * normal),
+        position=tuple(foot - PAGE_TABLE_THICKNESS * normal),
     )
 
 
@@ -229,11 +229,11 @@ def _draw_object(server: viser.ViserServer, scene: Scene, thing: SceneObject) ->
             vertices,
             faces,
             color=colour,
-            opacity=HULL if thing.name == UNKNOWN else None if thing.confident else UNSURE,
+            opacity=HULL if thing.name == UNKNOWN_NAME else None if thing.confident else UNSURE,
             flat_shading=False,
             side="double",
         )
-    if thing.name == UNKNOWN:
+    if thing.name == UNKNOWN_NAME:
         points = points_of(scene, thing)
         server.scene.add_point_cloud(f"{name}/seen", points, rgb(INK), point_size=0.0012)
     top = thing.place + np.array([0.0, 0.0, thing.size[2] / 2 + 0.02])
@@ -245,13 +245,13 @@ def _draw_frame(server: viser.ViserServer, scene: Scene, number: int, pose: Floa
     frame = scene.frames[number]
     height, width = frame.shape
     picture = Image.fromarray((255 * grey_picture(frame)).astype(np.uint8))
-    small = picture.resize((PICTURE_WIDTH, round(PICTURE_WIDTH * height / width)))
+    small = picture.resize((FRUSTUM_PIXELS, round(FRUSTUM_PIXELS * height / width)))
     last = number == len(scene.frames) - 1
     server.scene.add_camera_frustum(
         f"/cameras/{number + 1}",
         fov=2 * float(np.arctan(height / 2 / frame.intrinsics[1, 1])),
         aspect=width / height,
-        scale=FRUSTUM,
+        scale=PAGE_FRUSTUM,
         color=rgb(ACCENT if last else INK),
         image=np.repeat(np.asarray(small)[..., None], 3, -1),
         wxyz=Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True),

@@ -9,7 +9,7 @@ import numpy as np
 
 from nextview.checks import extras
 from nextview.errors import UsageError
-from nextview.scene.objects import UNKNOWN, SceneObject
+from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Scene
 from nextview.session.style import ACCENT, GREY, INK, rgb
 from nextview.viewers.scene_shapes import colour_of, named, placed_shape, seen_points
@@ -18,9 +18,9 @@ with extras():
     import rerun as rr
     import rerun.blueprint as rrb
 
-TIMELINE = "frame"
+FRAME_TIMELINE = "frame"
 LABEL_ABOVE = 0.02  # metres above an object at which its name stands
-FRUSTUM = 0.08  # metres, of a camera that is drawn
+RECORDED_FRUSTUM = 0.08  # metres, of a camera that is drawn
 
 
 class SceneRecorder:
@@ -65,7 +65,7 @@ class SceneRecorder:
         if not self._open:
             return
         for number in range(self._frames, len(scene.frames)):
-            self._stream.set_time(TIMELINE, sequence=number + 1)
+            self._stream.set_time(FRAME_TIMELINE, sequence=number + 1)
             self._log_frame(scene, number)
         if len(scene.frames) == self._frames:
             return
@@ -96,7 +96,7 @@ class SceneRecorder:
             image_from_camera=frame.intrinsics,
             resolution=(width, height),
             camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=FRUSTUM,
+            image_plane_distance=RECORDED_FRUSTUM,
         )
         for name in (f"world/cameras/{number + 1}", "world/camera"):
             self._stream.log(name, place, pinhole)
@@ -124,7 +124,7 @@ class SceneRecorder:
         top = thing.place + np.array([0, 0, thing.size[2] / 2 + LABEL_ABOVE])
         label = rr.Points3D([top], labels=[named(thing)], colors=rgb(colour_of(thing)), radii=0.002)
         self._stream.log(f"{name}/name", label)
-        if thing.name != UNKNOWN:
+        if thing.name != UNKNOWN_NAME:
             entity = rr.escape_entity_path_part(f"{thing.number} {thing.name}")
             self._stream.log(f"belief/{entity}", rr.Scalars(thing.confidence))
 
@@ -161,6 +161,6 @@ def scene_blueprint() -> rrb.Blueprint:
     right = rrb.Vertical(depth, belief, log, row_shares=[3, 3, 2])
     return rrb.Blueprint(
         rrb.Horizontal(table, right, column_shares=[3, 2]),
-        rrb.TimePanel(timeline=TIMELINE),
+        rrb.TimePanel(timeline=FRAME_TIMELINE),
         collapse_panels=True,
     )

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from nextview.geometry.ray_caster import Triangles
-from nextview.scene.figure import COLOURS
-from nextview.scene.objects import UNKNOWN, SceneObject
+from nextview.scene.figure import OBJECT_COLOURS
+from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Scene
 from nextview.session.style import GREY
 
@@ -66,10 +66,14 @@ def points_of(scene: Scene, thing: SceneObject) -> NDArray[np.float32]:
 
 def colour_of(thing: SceneObject) -> str:
     """The colour of an object, the same in all frames: grey for an unknown one."""
-    return GREY if thing.name == UNKNOWN else COLOURS[(thing.number - 1) % len(COLOURS)]
+    return (
+        GREY
+        if thing.name == UNKNOWN_NAME
+        else OBJECT_COLOURS[(thing.number - 1) % len(OBJECT_COLOURS)]
+    )
 
 
 def named(thing: SceneObject) -> str:
     """The name of an object, with a question mark where it is not sure."""
-    doubt = "" if thing.confident or thing.name == UNKNOWN else "?"
+    doubt = "" if thing.confident or thing.name == UNKNOWN_NAME else "?"
     return thing.name.replace("_", " ") + doubt
