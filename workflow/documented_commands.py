@@ -87,7 +87,9 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"research\.(film|real_things|touching_things|growth|point_pairs)|(verified|many)_things": (
         "needs the YCB scans, and minutes"
     ),
-    r"benchmark-things SCANS OUT": "needs the YCB scans, and minutes",
+    r"look_alikes|benchmark-things (YCB|HALF_SCANS)|joined_things": (
+        "needs the YCB scans, and minutes"
+    ),
     r"peers/monty\.py|peers\.beside_monty": "needs an environment of its own, and an hour",
     r"research\.(train_grid|thing_features)": "trains for hours",
     r"research\.simulated_arm": "takes an hour; research/tests/test_arm.py has episodes of it",
