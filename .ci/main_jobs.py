@@ -95,7 +95,7 @@ def look_at_samples() -> None:
 
 def sessions_with_frames() -> None:
     """Depth frames of a camera on an arm and before a turntable, and a captured folder."""
-    for example, name in (("arm_over_table", "chair"), ("turntable", "monitor")):
+    for example, name in (("arm_and_object", "chair"), ("turntable", "monitor")):
         command = [sys.executable, f"examples/{example}.py", f"samples/{name}.off"]
         done = subprocess.run(command, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr

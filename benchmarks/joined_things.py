@@ -48,8 +48,12 @@ def read_runs(runs: list[Path]) -> tuple[pd.DataFrame, pd.DataFrame]:
 def tested(row: pd.Series, times: float, unit: str) -> str:
     """A difference to random with its interval and corrected p, in words."""
     low, high = (times * row[end] for end in ("low", "high"))
-    p = "" if np.isnan(row["p_holm"]) else f", p {max(row['p_holm'], 0.0001):.2g}"
-    return f"{times * row['difference']:+.1f}{unit} ({low:+.1f} to {high:+.1f}){p}"
+    return f"{times * row['difference']:+.1f}{unit} ({low:+.1f} to {high:+.1f}){corrected(row)}"
+
+
+def corrected(row: pd.Series) -> str:
+    """The corrected p of a test, in words; nothing for a ceiling."""
+    return "" if np.isnan(row["p_holm"]) else f", p {max(row['p_holm'], 0.0001):.2g}"
 
 
 def row_of(values: pd.DataFrame, tests: pd.DataFrame, reference: float) -> list[str]:
@@ -71,7 +75,8 @@ def row_of(values: pd.DataFrame, tests: pd.DataFrame, reference: float) -> list[
     has_tests = ("accuracy", 2) in apart.index
     cells.append(tested(apart.loc["accuracy", 2], 100, "") if has_tests else "")
     cells.append(f"{until:.2f}")
-    cells.append(f"{of_all:.0f} %, {after_first:.0f} %" if has_tests else "")
+    fewer = f"{of_all:.0f} %, {after_first:.0f} %"
+    cells.append(fewer + corrected(apart.loc[SURE, 0]) if has_tests else "")
     cells.append(f"{found['wrong, of the sure', 0]:.3f}")
     pose = [found[f"pose error, {name}", POSE_AFTER] for name in ("median", "95 %")]
     cells.append(", ".join(f"{error:.1f}" for error in pose))

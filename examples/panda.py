@@ -28,7 +28,7 @@ NEEDED = ("research", "mujoco", "mink", "gymnasium_robotics")
 def recognise(
     arm: Arm, looked=lambda session: None, threshold: float = 0.97
 ) -> nextview.Recognition:
-    """What a user writes; ``arm.run`` is the loop of ``arm_over_table.py``."""
+    """What a user writes; ``arm.run`` is the loop of ``arm_and_object.py``."""
     session = nextview.load(threshold=threshold).session(
         object=ObservedObject(life_size=False), distance=0.4
     )
@@ -49,9 +49,10 @@ def main(
             )
     from panda_film import Film
 
-    from research.arm import Arm, first_joints
+    from research.arm import Arm, first_joints, put_down
 
-    arm = Arm(nextview.load_mesh(mesh), np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    arm = Arm([put_down(nextview.load_mesh(mesh), rng)], rng)
     start = first_joints(arm, np.radians(35), np.radians(azimuth), 0.4)
     if start is None:
         raise SystemExit("the arm cannot look from there")

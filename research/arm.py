@@ -1,10 +1,11 @@
-"""A simulated arm, a Franka Panda, with a depth camera on its wrist, beside an object on a table.
+"""A simulated arm, a Franka Panda, with a depth camera on its wrist, over what stands on a table.
 
 MuJoCo tells where the links are and what they touch, mink solves the inverse kinematics, and the
 depth is cast by Embree: MuJoCo's own renderer needs OpenGL, which not every machine has. The arm's
 model is the one in ``gymnasium-robotics``, which comes from https://github.com/vikashplus/franka.
 
->>> arm = Arm(nextview.load_mesh("chair.off"), np.random.default_rng(0))        # doctest: +SKIP
+>>> rng = np.random.default_rng(0)                                              # doctest: +SKIP
+>>> arm = Arm([put_down(nextview.load_mesh("chair.off"), rng)], rng)            # doctest: +SKIP
 >>> arm.run(nextview.load().session(object=ObservedObject(life_size=False), distance=0.4))  # doctest: +SKIP
 """
 
@@ -18,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from nextview.errors import ObservationError
 from nextview.geometry.mesh import Mesh
@@ -72,7 +75,9 @@ STRAIGHT = np.radians(0.5)
 LONGEST = 0.9
 """Metres from the shoulder beyond which no wrist comes: nothing is searched there."""
 CLEARANCE = 0.01
-"""Metres that the arm keeps from the table and from the object."""
+"""Metres that the arm keeps from the table and from the things on it."""
+AROUND_LINKS = 6
+"""Pixels beside the arm's own links that are taken out of a picture with them."""
 FINE = 0.05
 """Radians between the places of a motion that are looked at for collisions."""
 CAMERA = np.array([0.055, 0.0, 0.147])
@@ -102,10 +107,28 @@ def _assets() -> Path:
     return Path(spec.origin).parent / "envs/assets/kitchen_franka/franka_assets"
 
 
-def _model(vertices: Float, faces: NDArray[np.int32]) -> Any:
-    """The arm with its camera, the table and the object.
+def put_down(mesh: Mesh, rng: np.random.Generator, radius: float = 0.1) -> Triangles:
+    """Put a mesh on the table near ``OBJECT``, turned at random.
 
-    MuJoCo takes the object's convex hull for collisions.
+    Args:
+        mesh: the object.
+        rng: draws where it stands and how it is turned.
+        radius: of the object, metres.
+
+    Returns:
+        Vertices, (V, 3), metres, and faces, (F, 3).
+    """
+    cos = np.cos(turn := rng.uniform(0, 2 * np.pi))
+    sin = np.sin(turn)
+    vertices = radius * mesh.vertices @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+    vertices += [*(OBJECT + rng.uniform(-0.05, 0.05, 2)), -vertices[:, 2].min()]
+    return vertices, mesh.faces
+
+
+def _model(things: Sequence[Triangles]) -> Any:
+    """The arm with its camera, the table and the things on it.
+
+    MuJoCo takes the convex hulls of the things for collisions.
     """
     with extras():
         import mujoco
@@ -139,14 +162,16 @@ def _model(vertices: Float, faces: NDArray[np.int32]) -> Any:
             mass=0.05,
         )
     shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # of meshes that enclose no volume, too
-    spec.add_mesh(name="object", uservert=vertices.ravel(), userface=faces.ravel(), inertia=shell)
-    spec.worldbody.add_geom(
-        name="object",
-        type=mujoco.mjtGeom.mjGEOM_MESH,
-        meshname="object",
-        margin=CLEARANCE,
-        rgba=[0.25, 0.5, 0.75, 1],
-    )
+    for k, (vertices, faces) in enumerate(things):
+        name = f"thing{k}"
+        spec.add_mesh(name=name, uservert=vertices.ravel(), userface=faces.ravel(), inertia=shell)
+        spec.worldbody.add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=name,
+            margin=CLEARANCE,
+            rgba=[0.25, 0.5, 0.75, 1],
+        )
     return spec.compile()
 
 
@@ -154,9 +179,8 @@ class Arm:
     """A Panda at the origin, z up, on a table at z = 0; metres and radians. It moves, and looks.
 
     Args:
-        mesh: the object.
-        rng: where near ``OBJECT`` the object stands and how it is turned, and the sensor's errors.
-        radius: of the object, metres.
+        things: what stands on the table, vertices (V, 3), metres, and faces (F, 3) of each.
+        rng: draws the errors of the sensor and of its setup.
         joints: where the arm is at first, (7,).
         sensor: the camera on the wrist.
 
@@ -166,13 +190,15 @@ class Arm:
             its way.
         seconds: how long it has moved.
         refused: poses to which it found no way.
+        lean: of the table and all on it in the arm's world, (4, 4): the error of its vertical.
+        standing: how many things stand on the table.
+        owner: thing that each pixel of the last frame truly shows, -1 for none, (H, W).
     """
 
     def __init__(
         self,
-        mesh: Mesh,
+        things: Sequence[Triangles],
         rng: np.random.Generator,
-        radius: float = 0.1,
         joints: Float = HOME,
         sensor: Sensor = SENSORS["stereo"],
     ) -> None:
@@ -180,10 +206,6 @@ class Arm:
             import mink
             import mujoco
 
-        cos = np.cos(turn := rng.uniform(0, 2 * np.pi))
-        sin = np.sin(turn)
-        vertices = radius * mesh.vertices @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
-        vertices += [*(OBJECT + rng.uniform(-0.05, 0.05, 2)), -vertices[:, 2].min()]
         self.sensor = sensor
         self.joints = np.asarray(joints, float)
         self._rng = rng
@@ -192,7 +214,12 @@ class Arm:
         self.refused = 0
         self._mujoco = mujoco
         self._mink = mink
-        self.model = _model(vertices, mesh.faces)
+        self.standing = len(things)
+        self.owner = np.full(sensor.shape, -1)
+        tilt = [*rng.spawn(1)[0].normal(0, sensor.tilt, 2), 0]
+        self.lean = np.eye(4)
+        self.lean[:3, :3] = Rotation.from_rotvec(tilt, degrees=True).as_matrix()
+        self.model = _model(things)
         self.data = mujoco.MjData(self.model)
         self._site = self.model.site("camera").id
         # Turning the camera about its line of sight shows nothing new: that much the arm is free to
@@ -316,18 +343,39 @@ class Arm:
         self.joints = way[-1]
         return True
 
-    def look(self) -> Frame:
-        """What the camera on the wrist gives."""
-        pose, (height, width), k = self.pose, self.sensor.shape, self.sensor.intrinsics
-        rays = PinholeCamera.of(k, (height, width)).rays.reshape(-1, 3) @ pose[:3, :3].T
-        depth, _ = RayCaster([triangles for triangles, _ in self.things()]).cast(pose[:3, 3], rays)
+    def look(self, itself: bool = True) -> Frame:
+        """What the camera on the wrist gives, with the errors of the sensor and of its setup.
+
+        Args:
+            itself: whether the arm's own links are left in the picture, or taken out of it, as
+                robots do who know where their links are.
+        """
+        rng = self._rng.spawn(1)[0]
+        pose = self.pose
+        true = pose.copy()
+        turn = Rotation.from_rotvec(rng.normal(0, self.sensor.turned, 3), degrees=True)
+        true[:3, :3] = pose[:3, :3] @ turn.as_matrix()
+        true[:3, 3] += rng.normal(0, self.sensor.moved, 3)
+
+        (height, width), k = self.sensor.shape, self.sensor.intrinsics
+        seen = [triangles for triangles, _ in self.things()]
+        for row in range(1 + self.standing):
+            seen[row] = seen[row][0] @ self.lean[:3, :3].T, seen[row][1]
+        rays = PinholeCamera.of(k, (height, width)).rays.reshape(-1, 3) @ true[:3, :3].T
+        depth, owner = RayCaster(seen).cast(true[:3, 3], rays)
         depth = np.where(depth < self.sensor.farthest, depth, 0).astype(np.float32)
-        measured, _ = self.sensor.measure(depth.reshape(height, width), self._rng)
+        measured, source = self.sensor.measure(depth.reshape(height, width), self._rng)
+        # the table comes first, and the links come last
+        if not itself:
+            links = (owner > self.standing)[np.maximum(source, 0)] & (source >= 0)
+            measured[ndimage.binary_dilation(links, iterations=AROUND_LINKS)] = 0
+        owner = np.where((owner > 0) & (owner <= self.standing), owner - 1, -1)
+        self.owner = np.where(source >= 0, owner[np.maximum(source, 0)], -1)
         return Frame(measured, k, pose, pixel_centre=0.5)
 
     def things(self) -> list[tuple[Triangles, Float]]:
         """All that can be seen, with the arm as it is: vertices (N, 3), metres, faces (F, 3),
-        and colour (3,).
+        and colour (3,). The table comes first, then the things on it, then the arm.
         """
         self._place(self.joints)
         model = self.model

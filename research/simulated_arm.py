@@ -28,7 +28,7 @@ from nextview.data.folders import list_dataset
 from nextview.geometry.viewsphere import Viewpoints
 from nextview.policies.base import EpisodeState, travel_from
 from nextview.sensing import ObservedObject
-from research.arm import Arm, first_joints
+from research.arm import Arm, first_joints, put_down
 
 DISTANCE = 0.4
 """Of the camera from the object, metres."""
@@ -88,7 +88,7 @@ def systems(models: str) -> dict[str, nextview.System]:
 def begin(mesh: nextview.Mesh, settings: Settings, which: tuple[int, int]) -> Arm:
     """The arm at a first view of an object: a direction that is drawn until one can be reached."""
     rng = np.random.default_rng([settings.seed, *which])
-    arm = Arm(mesh, rng, settings.radius)
+    arm = Arm([put_down(mesh, rng, settings.radius)], rng)
     joints = None
     while joints is None:
         joints = first_joints(

@@ -132,7 +132,7 @@ def _recognise(sample, options, how):
 def _arm(sample):
     sys.path.insert(0, str(ROOT / "examples"))
     try:
-        example = importlib.import_module("arm_over_table")
+        example = importlib.import_module("arm_and_object")
     finally:
         sys.path.remove(str(ROOT / "examples"))
     return example.recognise(

@@ -40,16 +40,16 @@ def test_a_page_does_what_it_says(page):
     assert failed == 0
 
 
-@pytest.mark.parametrize("name", ["arm_over_table", "turntable"])
+@pytest.mark.parametrize("name", ["arm_and_object", "turntable"])
 def test_an_example_names_what_it_sees(name, monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "examples"))
     example = importlib.import_module(name)
-    kind = example.Arm if name == "arm_over_table" else example.Turntable
+    kind = example.Arm if name == "arm_and_object" else example.Turntable
     robot = kind(nextview.load_mesh(SAMPLE_FILES / "table.off"), np.random.default_rng(1))
     result = example.recognise(robot)
     assert result.answer == "table"
     assert result.confident
-    if name == "arm_over_table":
+    if name == "arm_and_object":
         assert robot.pose[2, 3] > example.CLEARANCE - 0.02
     else:
         assert not any(view.warnings for view in result.views)

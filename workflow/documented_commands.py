@@ -60,6 +60,9 @@ LIMIT = 900  # seconds for one command
 
 NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"^nextview look ": "needs frames of a table: tests/test_scene.py makes some and runs it",
+    r"examples/arm_over_table": (
+        "needs the YCB scans; research/tests/test_arm_over_table.py has files of a few"
+    ),
     r"^python benchmarks/tables\.py": "needs scans of all things that the bundled memory knows",
     r"^make (test|lint|docs)": "a job of its own in CI",
     r"^make demo": "installs; .ci/base_installation runs nextview demo, twice",
@@ -84,7 +87,9 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"research\.(film|real_things|touching_things|growth|point_pairs)|(verified|many)_things": (
         "needs the YCB scans, and minutes"
     ),
-    r"benchmark-things SCANS OUT": "needs the YCB scans, and minutes",
+    r"look_alikes|benchmark-things (YCB|HALF_SCANS)|joined_things": (
+        "needs the YCB scans, and minutes"
+    ),
     r"peers/monty\.py|peers\.beside_monty": "needs an environment of its own, and an hour",
     r"research\.(train_grid|thing_features)": "trains for hours",
     r"research\.simulated_arm": "takes an hour; research/tests/test_arm.py has episodes of it",
@@ -112,7 +117,8 @@ NEEDS = {  # what a command or a Python block needs besides the base installatio
         "nextview[benchmark]"
     ),
     r"benchmarks/ablations\.py": "nextview[train]",
-    r"--record|viewers\.recording": "nextview[record]",
+    r"--record|viewers\.(scene_)?recording": "nextview[record]",
+    r"--explorer|viewers\.scene_page": "nextview[explore]",
     r"(?<![.:])\b(volumetric|coverage)\b": "research",  # by their short names
     r"research\.train_agent": "research[rl]",
     r"research\.arm|examples/panda": "research[arm]",
@@ -416,7 +422,7 @@ import sys
 import numpy as np
 
 sys.path.insert(0, "examples")
-from arm_over_table import Arm
+from arm_and_object import Arm
 from simulated_sensor import INTRINSICS as intrinsics
 
 import nextview

@@ -23,6 +23,7 @@ from research.arm import (
     STRAIGHT,
     Arm,
     along,
+    put_down,
     seconds_of,
 )
 
@@ -56,7 +57,8 @@ def link_7(joints):
 
 @pytest.fixture(scope="module")
 def arm():
-    return Arm(sample_mesh("chair"), np.random.default_rng(1))
+    rng = np.random.default_rng(1)
+    return Arm([put_down(sample_mesh("chair"), rng)], rng)
 
 
 @pytest.fixture

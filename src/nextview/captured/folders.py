@@ -145,7 +145,7 @@ def _layout_of(path: Path) -> str:
         raise DatasetError(
             f"{path}: is neither a ROS 2 bag (.mcap, .db3) nor a depth image (.png)"
             if path.exists()
-            else f"{path}: there is no such folder"
+            else f"{path}: there is no such file or folder"
         )
 
     found = _layouts_in(path)

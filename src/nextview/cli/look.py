@@ -1,6 +1,8 @@
 """``nextview look``: which of the known things are where in captured frames of a table."""
 
 import json
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from rich.table import Table
 from nextview.captured.camera import UP
 from nextview.captured.check import check_capture
 from nextview.captured.folders import Capture, read_capture
+from nextview.checks import extras
 from nextview.cli.common_options import Three, check_file
 from nextview.cli.episode_table import plain
 from nextview.cli.progress import Terminal, console, track
@@ -63,11 +66,15 @@ class LookOutput:
     Attributes:
         figure: write a picture of the last frame and of the table from above to this file (PNG,
             PDF or SVG).
+        explorer: write a page to this file (.html) that shows all in 3D, in place on the table.
+        record: write a recording for the Rerun viewer to this file (.rrd).
         json: print JSON instead of a table.
-        overwrite: replace the picture if it exists.
+        overwrite: replace files that exist.
     """
 
     figure: Path | None = None
+    explorer: Path | None = None
+    record: Path | None = None
     json: bool = False
     overwrite: bool = False
 
@@ -88,6 +95,11 @@ def look(
             with the intrinsics of the camera), a ROS 2 bag, or one depth image (.png).
     """
     check_file(output.figure, output.overwrite)
+    check_file(output.explorer, output.overwrite, (".html",))
+    check_file(output.record, output.overwrite, (".rrd",))
+    if output.explorer is not None:
+        with extras():
+            import viser  # noqa: F401  # a missing extra is named before the frames are looked at
     if looking.frames < 1:
         raise UsageError(f"at least one frame is looked at, not {looking.frames}")
     read = read_capture(
@@ -103,21 +115,17 @@ def look(
     system = load(models, unknown=looking.unknown)
     scene = Scene(system, *_where(capture, looking))
 
-    looks: dict[str, Look] = {}
-    few = np.unique(np.linspace(0, len(capture.frames) - 1, looking.frames).round().astype(int))
+    with ExitStack() as recorded:
+        recorder = None
+        if output.record is not None:
+            from nextview.viewers.scene_recording import SceneRecorder
 
-    def each() -> Any:
-        for done, row in enumerate(few, 1):
-            captured = capture.frames[row]
-            try:
-                looks[captured.name] = scene.update(captured.read(masked=False))
-            except ObservationError as error:
-                left_out[captured.name] = str(error)
-            yield done
-
-    track(each(), len(few), "frames")
-    if not scene.frames:
-        raise ObservationError(f"{path}: no frame can be used: {next(iter(left_out.values()))}")
+            part = recorded.enter_context(new_file(output.record, output.overwrite))
+            recorder = SceneRecorder(part)
+            recorded.callback(recorder.close)
+        looks = _look_at_frames(scene, capture, looking.frames, left_out, recorder)
+        if not scene.frames:
+            raise ObservationError(f"{path}: no frame can be used: {next(iter(left_out.values()))}")
 
     if output.json:
         print(json.dumps(plain(scene_as_json(scene, looks, left_out)), indent=1))
@@ -133,6 +141,47 @@ def look(
     if output.figure is not None:
         with new_file(output.figure, output.overwrite) as part:
             scene.plot(part, path.name)
+    if output.explorer is not None:
+        from nextview.viewers.scene_page import write_scene_page
+
+        write_scene_page(scene, output.explorer, path.name, output.overwrite)
+
+
+def _look_at_frames(
+    scene: Scene,
+    capture: Capture,
+    most: int,
+    left_out: dict[str, str],
+    recorder: Callable[[Scene], None] | None,
+) -> dict[str, Look]:
+    """Take frames into a scene.
+
+    Args:
+        scene: takes them in.
+        capture: has them.
+        most: how many are looked at, evenly spread over the capture.
+        left_out: why frames were not read, by their names; it is added to.
+        recorder: is called after each frame.
+
+    Returns:
+        What each frame changed, by its name.
+    """
+    looks: dict[str, Look] = {}
+    few = np.unique(np.linspace(0, len(capture.frames) - 1, most).round().astype(int))
+
+    def each() -> Any:
+        for done, row in enumerate(few, 1):
+            captured = capture.frames[row]
+            try:
+                looks[captured.name] = scene.update(captured.read(masked=False))
+            except ObservationError as error:
+                left_out[captured.name] = str(error)
+            if recorder is not None:
+                recorder(scene)
+            yield done
+
+    track(each(), len(few), "frames")
+    return looks
 
 
 def _where(capture: Capture, looking: LookOptions) -> tuple[Float | None, Box | None]:

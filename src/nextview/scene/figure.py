@@ -130,7 +130,7 @@ def _draw_frame(
     part: tuple[slice, slice],
 ) -> None:
     """The frame with outlines, names, and axes of the poses."""
-    axes.imshow(_picture(frame), cmap="gray", vmin=0, vmax=1, interpolation="bilinear")
+    axes.imshow(grey_picture(frame), cmap="gray", vmin=0, vmax=1, interpolation="bilinear")
     axes.set_xlim(part[1].start - 0.5, part[1].stop - 0.5)
     axes.set_ylim(part[0].stop - 0.5, part[0].start - 0.5)
     axes.axis("off")
@@ -165,7 +165,7 @@ def _draw_frame(
         _name(axes, thing, x, y, colours, "bottom")
 
 
-def _picture(frame: Frame) -> Floats:
+def grey_picture(frame: Frame) -> Floats:
     """A grey picture of what a frame shows, (H, W), 0 to 1."""
     if frame.image is not None:
         # pale, so that outlines and names can be read on it
@@ -239,7 +239,7 @@ def _draw_from_above(
     front = upright_axes(up, behind)
     upright = np.stack([front[1], -front[0], front[2]])
 
-    outlines = [_from_above(thing, upright) for thing in objects]
+    outlines = [seen_from_above(thing, upright) for thing in objects]
     ends = [corners for corners, _ in outlines]
     everything = np.concatenate([*ends, np.zeros((0, 2))])
     if not len(everything):
@@ -270,7 +270,7 @@ def _draw_from_above(
     _scale_bar(axes, low, side)
 
 
-def _from_above(thing: SceneObject, upright: Float) -> tuple[Float, Mask | None]:
+def seen_from_above(thing: SceneObject, upright: Float) -> tuple[Float, Mask | None]:
     """Corners of an object seen from above, (K, 2), metres; and, of a scan, the cells that it
     covers.
 

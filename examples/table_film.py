@@ -1,0 +1,432 @@
+"""A film of an arm over a full table, by ray casting: no graphics card and no OpenGL is needed.
+
+On the left the arm and the things, which get their colours once they are known; on the right what
+the camera on its wrist sees, with what was found in it, and from above what is known by now.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from contourpy import contour_generator
+from panda_film import evenly
+from PIL import Image, ImageColor, ImageDraw
+from scipy import ndimage
+
+import nextview
+from nextview.geometry.viewsphere import look_at_origin
+from nextview.scene.figure import FIGURE_CELL, OBJECT_COLOURS, grey_picture, seen_from_above
+from nextview.scene.objects import UNKNOWN_NAME, SceneObject
+from nextview.session.style import ACCENT, GREY, INK, PAPER
+from research.arm import Arm, seconds_of
+from research.film_stage import KEY, SKY, SUN, Array, Stage, font, rays_of, toned
+
+SIZE = (600, 540)  # of the picture of the arm, pixels
+SIDE = 348  # width of what is shown beside it, pixels
+INSET = 12  # pixels
+FINER = 2  # rays for a pixel, along each side
+RATE = 12  # frames a second
+SLOWER = 4.0  # so many times slower than at the joints' velocity limits motions are shown
+STILL = 1.4  # seconds that are shown after a look
+LAST = 4.0  # and at the end
+FOCAL = 1.45  # of the camera that films, widths of the picture
+LOOKED_AT = np.array([0.34, 0.02, 0.21])
+FILMED_FROM = np.radians([26.0, -47.0])
+AWAY = 2.05  # metres
+CLAY = np.array([0.60, 0.57, 0.53])
+TABLE = np.array([0.66, 0.58, 0.47])
+LAMP = 0.09  # radius of the lamp, a unit away
+SHADOW_SAMPLES = 5  # rays to the lamp from each point on which the arm may throw its shadow
+SKY_SAMPLES = 48
+PLAN = 0.31  # metres from its middle to the border of the view from above
+COLOURS_IN_GIF = 255
+FRAMES_OF_PALETTE = 10  # from which the palette is made
+NO_RED = tuple(OBJECT_COLOURS[k] for k in (0, 2, 3, 4, 5, 7, 8))  # red is for what is wrong
+BESIDE = 24  # pixels beside what was found that are shown with it
+ABOVE = np.array([0, 0, 0.035])  # metres from the top of a thing to its name
+VIEW = 0.42  # metres to where the view of the camera on the wrist is drawn
+FRAME = "#d5dbe1"
+SHARP = 2000  # triangles of a thing up to which its edges are sharp
+
+
+class Film:
+    """Frames of an arm over a table.
+
+    Args:
+        arm: over the table.
+        middle: of what stands on the table, (3,), metres.
+        title: of the film.
+        path: GIF that is written.
+    """
+
+    def __init__(self, arm: Arm, middle: Array, title: str, path: Path) -> None:
+        self.arm = arm
+        self.path = path
+        self.frames: list[Image.Image] = []
+        self._middle = middle
+        self._title = title
+        self._filmed = 0
+        self._seconds = 0.0
+        self._beside: Image.Image | None = None
+        self._labels: list[tuple[Array, str, str]] = []
+        self._pose = look_at_origin(*FILMED_FROM, AWAY)
+        self._pose[:3, 3] += LOOKED_AT
+        self._light_table()
+
+    def looked(self, scene: nextview.Scene, owner: dict[int, int], wrong: set[int]) -> None:
+        """Film the way to the last look, and what is known after it.
+
+        Args:
+            scene: with the look taken in.
+            owner: row of the thing that each object truly is, by its number.
+            wrong: numbers of objects that are named wrongly.
+        """
+        here = self.arm.joints
+        for way in self.arm.motions[self._filmed :]:
+            total = seconds_of(way)
+            for joints, done in evenly(way, int(np.ceil(total * SLOWER * RATE))):
+                self.arm.joints = joints
+                self._show(self._seconds + done * total)
+            self._seconds += total
+        self.arm.joints, self._filmed = here, len(self.arm.motions)
+
+        self._colour(scene, owner, wrong)
+        self._beside = beside(scene, self._middle, wrong)
+        self._show(self._seconds, looking=True)
+        self.frames += [self.frames[-1]] * int(STILL * RATE)
+
+    def save(self, said: Sequence[str]) -> None:
+        """Write the film.
+
+        Args:
+            said: lines at its end.
+        """
+        self._show(self._seconds, said)
+        self.frames += [self.frames[-1]] * int(LAST * RATE)
+        few = strip(self.frames[:: max(1, len(self.frames) // FRAMES_OF_PALETTE)])
+        coverage = Image.Quantize.MAXCOVERAGE  # small things keep their colours
+        palette = few.quantize(COLOURS_IN_GIF, method=coverage, kmeans=3)
+        plain = Image.Dither.NONE
+        frames = [frame.quantize(palette=palette, dither=plain) for frame in self.frames]
+        frames[0].save(
+            self.path,
+            save_all=True,
+            append_images=frames[1:],
+            duration=1000 // RATE,
+            loop=0,
+            optimize=True,
+        )
+
+    # The table under the lamp
+
+    def _light_table(self) -> None:
+        """Cast the table and the things on it once: where light falls and what each pixel shows."""
+        things = [triangles for triangles, _ in self.arm.things()[: 1 + self.arm.standing]]
+        stage = Stage([(*apart(*one), (float(k), 0, 0)) for k, one in enumerate(things)])
+        rays = self._rays()
+        hit, points, normals, rows = stage.hits(self._pose[:3, 3], rays)
+        sky, lamp = stage.lit(
+            points, normals, np.ones_like(points), np.random.default_rng(0), SKY_SAMPLES
+        )
+        # the same places of the lamp for all pixels and all frames: shadows without grain
+        ball = np.random.default_rng(0).normal(size=(SHADOW_SAMPLES, 3))
+        self._lamps = KEY + LAMP * ball / np.linalg.norm(ball, axis=1, keepdims=True)
+        self._hit = hit
+        self._points = points
+        self._away = np.full(len(rays), np.inf)
+        self._away[hit] = np.linalg.norm(points - self._pose[:3, 3], axis=1)
+        self._rows = rows[:, 0].astype(int)
+        self._sky, self._lamp = sky, lamp
+        self._albedo = np.tile(CLAY, (len(things), 1))
+        self._albedo[0] = TABLE
+        self._tops = [
+            0.5 * (v.min(0) + v.max(0)) * [1, 1, 0] + [0, 0, v[:, 2].max()] for v, _ in things
+        ]
+
+    def _rays(self) -> Array:
+        """Rays of the camera that films, row by row."""
+        return rays_of(self._pose, FINER * FOCAL * SIZE[0], FINER * SIZE[0], FINER * SIZE[1])
+
+    def _colour(self, scene: nextview.Scene, owner: dict[int, int], wrong: set[int]) -> None:
+        """Give the things that are known their colours and names."""
+        self._albedo[1:] = CLAY
+        self._labels = []
+        for thing in scene.objects:
+            row = owner[thing.number] + 1
+            if row == 0 or not (thing.confident or thing.name == UNKNOWN_NAME):
+                continue
+            colour = colour_of(thing, wrong)
+            if thing.name != UNKNOWN_NAME:
+                self._albedo[row] = linear(colour)
+            self._labels.append((self._tops[row], words(thing, wrong), colour))
+
+    def _show(self, seconds: float, said: Sequence[str] = (), looking: bool = False) -> None:
+        """Add a frame: the arm as it is now, and lines on it."""
+        frame = Image.new("RGB", (SIZE[0] + SIDE, SIZE[1]), PAPER)
+        picture = self._filmed_now()
+        draw = ImageDraw.Draw(picture, "RGBA")
+        if looking:
+            self._draw_view(draw)
+        taken: list[Array] = []
+        placed = [(self._place(top + ABOVE), name, colour) for top, name, colour in self._labels]
+        for at, name, colour in sorted(placed, key=lambda label: -label[0][1]):
+            tag(draw, at, name, colour, taken)
+        frame.paste(picture, (0, 0))
+        if self._beside is not None:
+            frame.paste(self._beside, (SIZE[0], 0))
+        draw = ImageDraw.Draw(frame, "RGBA")
+        speed = f"{seconds:.1f} s of motion, shown {SLOWER:g} times slower"
+        lines(draw, said or [self._title, speed])
+        self.frames.append(frame)
+
+    def _filmed_now(self) -> Image.Image:
+        """The arm over the table, lit."""
+        links = self.arm.things()[1 + self.arm.standing :]
+        stage = Stage([(vertices, faces, colour) for (vertices, faces), colour in links])
+        eye = self._pose[:3, 3]
+        shadow = stage.blocked(self._points + 1e-3 * KEY, self._lamps[:, None]).mean(0)
+        lamp = self._lamp * (1 - shadow)[:, None]
+        light = np.tile(1.9 * SKY, (len(self._hit), 1))
+        light[self._hit] = self._albedo[self._rows] * (self._sky + lamp)
+
+        corners = np.concatenate([vertices for (vertices, _), _ in links])
+        low, high = (
+            np.clip(f(self._place(corners), axis=0) * FINER + d, 0, np.array(SIZE) * FINER).astype(
+                int
+            )
+            for f, d in ((np.min, -2), (np.max, 2))
+        )
+        part = np.zeros((SIZE[1] * FINER, SIZE[0] * FINER), bool)
+        part[low[1] : high[1], low[0] : high[0]] = True
+        within = np.flatnonzero(part)
+        hit, points, normals, colours = stage.hits(eye, self._rays()[within])
+        nearer = np.linalg.norm(points - eye, axis=1) < self._away[within[hit]]
+        blocked = stage.blocked(points + 1e-3 * normals, self._lamps[:, None]).mean(0)
+        facing = np.maximum(normals @ KEY / np.linalg.norm(KEY), 0) * (1 - blocked)
+        sky = SKY * (0.6 + 0.3 * normals[:, 2:])
+        light[within[hit][nearer]] = (colours * (sky + SUN * facing[:, None]))[nearer]
+
+        pixels = toned(light).reshape(SIZE[1] * FINER, SIZE[0] * FINER, 3)
+        return Image.fromarray(pixels).resize(SIZE, Image.Resampling.BOX)
+
+    def _place(self, points: Array) -> Array:
+        """Pixels, (..., 2), of points, (..., 3), world."""
+        inside = (points - self._pose[:3, 3]) @ self._pose[:3, :3]
+        return inside[..., :2] / inside[..., 2:] * FOCAL * SIZE[0] + np.array(SIZE) / 2
+
+    def _draw_view(self, draw: ImageDraw.ImageDraw) -> None:
+        """What the camera on the wrist has in view, down to the table."""
+        pose = self.arm.pose
+        k = self.arm.sensor.intrinsics
+        height, width = self.arm.sensor.shape
+        corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - k[:2, 2]
+        rays = np.column_stack([corners / k[[0, 1], [0, 1]], np.ones(4)]) @ pose[:3, :3].T
+        ends = pose[:3, 3] + VIEW * rays
+        eye = tuple(self._place(pose[:3, 3]))
+        flat = [tuple(one) for one in self._place(ends)]
+        for one, other in zip(flat, [*flat[1:], flat[0]], strict=True):
+            draw.polygon([eye, one, other], (*ImageColor.getrgb(ACCENT), 20))
+            draw.line([eye, one], (*ImageColor.getrgb(ACCENT), 150), 1)
+        draw.line([*flat, flat[0]], (*ImageColor.getrgb(ACCENT), 220), 2)
+
+
+def strip(frames: Sequence[Image.Image]) -> Image.Image:
+    """Frames side by side, half as large."""
+    small = [frame.reduce(2) for frame in frames]
+    whole = Image.new("RGB", (sum(frame.width for frame in small), small[0].height))
+    for k, frame in enumerate(small):
+        whole.paste(frame, (k * frame.width, 0))
+    return whole
+
+
+def lines(draw: ImageDraw.ImageDraw, said: Sequence[str]) -> None:
+    """Write lines at the lower left, the first of them bold."""
+    wide = max(draw.textlength(line, font(14, True)) for line in said)
+    box = (6, SIZE[1] - 14 - 20 * len(said), 22 + wide, SIZE[1] - 6)
+    draw.rounded_rectangle(box, 8, (*ImageColor.getrgb(PAPER), 215))
+    for k, line in enumerate(said):
+        y = SIZE[1] - 14 - 20 * (len(said) - 1 - k)
+        letters = font(14 if k == 0 else 13, k == 0)
+        draw.text((14, y), line, INK, letters, anchor="ls")
+
+
+def beside(scene: nextview.Scene, middle: Array, wrong: set[int]) -> Image.Image:
+    """What the camera saw last with what was found in it, and all from above."""
+    panel = Image.new("RGB", (SIDE, SIZE[1]), PAPER)
+    draw = ImageDraw.Draw(panel)
+    number = len(scene.frames)
+    draw.text((INSET, 12), f"look {number}: what its camera sees", INK, font(13, True))
+    seen = wrist_picture(scene, wrong)
+    panel.paste(seen, (INSET, 32))
+
+    top = 32 + seen.height + 14
+    draw.text((INSET, top), "what it knows, from above", INK, font(13, True))
+    side = SIZE[1] - top - 20 - 34
+    plan = plan_picture(scene, middle, wrong, (seen.width, side))
+    panel.paste(plan, (INSET, top + 20))
+
+    named = [thing for thing in scene.objects if thing.name != UNKNOWN_NAME]
+    sure = sum(thing.confident for thing in named)
+    unknown = len(scene.objects) - len(named)
+    said = f"{sure} sure, {len(named) - sure} not sure, {unknown} unknown"
+    draw.text((INSET, SIZE[1] - 26), said, INK, font(14, True))
+    return panel
+
+
+def wrist_picture(scene: nextview.Scene, wrong: set[int]) -> Image.Image:
+    """The last frame with outlines and names, as wide as the panel."""
+    frame = scene.frames[-1]
+    number = len(scene.frames) - 1
+    grey = np.asarray(255 * grey_picture(frame))
+    picture = np.repeat(grey[..., None], 3, -1)
+    names = []
+    for thing in scene.objects:
+        mask = thing.pixels.get(number)
+        if mask is None:
+            continue
+        colour = np.array(ImageColor.getrgb(colour_of(thing, wrong)))
+        whole = ndimage.binary_fill_holes(ndimage.binary_closing(mask, iterations=3))
+        rim = ndimage.binary_dilation(whole, iterations=2) & ~ndimage.binary_erosion(
+            whole, iterations=2
+        )
+        picture[whole] = 0.65 * picture[whole] + 0.35 * colour
+        picture[rim] = colour
+        rows, columns = np.nonzero(mask)
+        names.append((thing, columns.mean(), rows.min()))
+    width = SIDE - 2 * INSET
+    left, top, right, bottom = part_of_frame(scene)
+    share = width / (right - left)
+    cut = Image.fromarray(picture.clip(0, 255).astype(np.uint8)).crop((left, top, right, bottom))
+    small = cut.resize((width, round(share * (bottom - top))), Image.Resampling.LANCZOS)
+    draw = ImageDraw.Draw(small)
+    taken: list[tuple[float, float, float]] = []
+    for thing, x, y in sorted(names, key=lambda each: -each[2]):
+        write(draw, thing, (share * (x - left), share * (y - top) - 6), wrong, taken, small.size)
+    return small
+
+
+def part_of_frame(scene: nextview.Scene) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom of the part of the last frame that holds what was found."""
+    height, width = scene.frames[-1].shape
+    masks = [thing.pixels.get(len(scene.frames) - 1) for thing in scene.objects]
+    shown = [mask for mask in masks if mask is not None]
+    if not shown:
+        return 0, 0, width, height
+    rows, columns = np.nonzero(np.any(shown, axis=0))
+    low = np.array([columns.min(), rows.min()]) - BESIDE
+    high = np.array([columns.max(), rows.max()]) + BESIDE
+    share = min(1.0, max((high - low) / [width, height]))
+    size = np.round(share * np.array([width, height])).astype(int)
+    corner = np.clip((low + high - size) // 2, 0, [width, height] - size)
+    return (*corner.tolist(), *(corner + size).tolist())
+
+
+def plan_picture(
+    scene: nextview.Scene, middle: Array, wrong: set[int], size: tuple[int, int]
+) -> Image.Image:
+    """All from above as the camera that films sees it: away from it is up."""
+    ahead = -np.array([np.cos(FILMED_FROM[1]), np.sin(FILMED_FROM[1]), 0.0])
+    upright = np.array([[ahead[1], -ahead[0], 0.0], ahead, [0.0, 0.0, 1.0]])
+    width, height = size
+    scale = FINER * height / (2 * PLAN)
+
+    def flat(points: Array) -> Array:
+        at = (points - (upright @ middle)[:2]) * scale
+        return at * [1, -1] + FINER * np.array(size) / 2
+
+    picture = Image.new("RGB", (FINER * width, FINER * height), "white")
+    draw = ImageDraw.Draw(picture, "RGBA")
+    for thing in scene.objects:
+        colour = ImageColor.getrgb(colour_of(thing, wrong))
+        for ring in rings(thing, upright):
+            corners = [tuple(one) for one in flat(ring)]
+            draw.polygon(corners, (*colour, 70))
+            draw.line([*corners, corners[0]], (*colour, 255), 2 * FINER)
+    places = np.array([frame.camera_to_world[:3, 3] for frame in scene.frames]) @ upright.T
+    dots = [tuple(np.clip(one, 8, FINER * np.array(size) - 8)) for one in flat(places[:, :2])]
+    draw.line(dots, (*ImageColor.getrgb(INK), 110), FINER)
+    for k, (x, y) in enumerate(dots):
+        r = (3 if k < len(dots) - 1 else 5) * FINER
+        draw.ellipse((x - r, y - r, x + r, y + r), ACCENT if k == len(dots) - 1 else INK)
+    picture = picture.resize(size, Image.Resampling.LANCZOS)
+    draw = ImageDraw.Draw(picture)
+    taken: list[tuple[float, float, float]] = []
+    for thing in scene.objects:
+        at = flat((upright @ thing.place)[:2]) / FINER
+        write(draw, thing, (at[0], at[1] + 5), wrong, taken, size)
+    draw.rectangle((0, 0, width - 1, height - 1), outline=FRAME)
+    return picture
+
+
+def rings(thing: SceneObject, upright: Array) -> list[Array]:
+    """Outlines of an object seen from above, (K, 2) each, metres."""
+    corners, cells = seen_from_above(thing, upright)
+    if cells is None:
+        return [corners]
+    low = corners.min(0) - 2 * FIGURE_CELL
+    smooth = ndimage.gaussian_filter(cells.astype(float), 0.8).T
+    x, y = (low[k] + FIGURE_CELL * np.arange(cells.shape[k]) for k in (0, 1))
+    return contour_generator(x, y, smooth).lines(0.5)
+
+
+def write(
+    draw: ImageDraw.ImageDraw,
+    thing: SceneObject,
+    at: tuple[float, float],
+    wrong: set[int],
+    taken: list[tuple[float, float, float]],
+    size: tuple[int, int],
+) -> None:
+    """Write a name where no other is, and remember where."""
+    text = words(thing, wrong)
+    letters = font(11, thing.confident)
+    half = draw.textlength(text, letters) / 2 + 2
+    x = float(np.clip(at[0], half, size[0] - half))
+    y = float(np.clip(at[1], 14, size[1] - 4))
+    while any(abs(y - b) < 12 and abs(x - a) < half + other for a, b, other in taken) and y > 14:
+        y -= 4
+    taken.append((x, y, half))
+    colour = INK if thing.name == UNKNOWN_NAME else colour_of(thing, wrong)
+    draw.text((x, y), text, colour, letters, anchor="ms", stroke_width=2, stroke_fill="white")
+
+
+def tag(draw: ImageDraw.ImageDraw, at: Array, text: str, colour: str, taken: list[Array]) -> None:
+    """Write a name on a coloured ground where no other is, and remember where."""
+    letters = font(12, True)
+    half = draw.textlength(text, letters) / 2 + 8
+    x, y = at
+    while any(abs(y - b) < 21 and abs(x - a) < half + other for a, b, other in taken):
+        y -= 3
+    taken.append(np.array([x, y, half]))
+    box = (x - half, y - 10, x + half, y + 10)
+    draw.rounded_rectangle(box, 10, (*ImageColor.getrgb(colour), 235))
+    draw.text((x, y), text, "white", letters, anchor="mm")
+
+
+def words(thing: SceneObject, wrong: set[int]) -> str:
+    """The name of an object, and what is to be said of it."""
+    name = thing.name.replace("_", " ")
+    if thing.number in wrong:
+        return f"{name} (wrong)"
+    return name if thing.confident or thing.name == UNKNOWN_NAME else f"{name}?"
+
+
+def colour_of(thing: SceneObject, wrong: set[int]) -> str:
+    """The colour of an object: grey for an unknown one, red for a wrong name."""
+    if thing.number in wrong:
+        return ACCENT
+    return GREY if thing.name == UNKNOWN_NAME else NO_RED[(thing.number - 1) % len(NO_RED)]
+
+
+def linear(colour: str) -> Array:
+    """A colour as the light that it sends back, (3,)."""
+    return (np.array(ImageColor.getrgb(colour)) / 255) ** 2.2
+
+
+def apart(vertices: Array, faces: Array) -> tuple[Array, Array]:
+    """The same triangles without shared corners where they are few: edges stay sharp."""
+    if len(faces) > SHARP:
+        return vertices, faces
+    return vertices[faces].reshape(-1, 3), np.arange(3 * len(faces), dtype=np.int32).reshape(-1, 3)

@@ -1,0 +1,261 @@
+"""A scene as a page for the browser: all in place on the table in 3D, and belief for each object.
+
+The page is one file. It needs no server, and can be sent to somebody.
+"""
+
+from __future__ import annotations
+
+from contextlib import redirect_stdout
+from html import escape
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from nextview.checks import extras
+from nextview.errors import SessionError, UsageError
+from nextview.files import new_file
+from nextview.recognition.poses import place_in_words
+from nextview.scene.figure import grey_picture
+from nextview.scene.objects import UNKNOWN_NAME, SceneObject
+from nextview.scene.scene import Scene
+from nextview.session.style import ACCENT, FAINT, GROUND, INK, PAPER, rgb
+from nextview.types import Float
+from nextview.viewers.scene_shapes import colour_of, named, placed_shape, points_of
+
+with extras():
+    import viser
+
+    from nextview.viewers.page import serve
+
+PAGE_CANDIDATES = 4  # things of which the belief is shown for an object
+LEAST_BELIEF = 0.005  # of what is shown
+FRUSTUM_PIXELS = 200  # pixels of a frame's picture in its camera
+PAGE_FRUSTUM = 0.045  # metres, size of a camera that is drawn
+AROUND = 0.08  # metres of the table around all that stands on it
+PAGE_TABLE_THICKNESS = 0.01  # metres, of the table that is drawn
+STEEP = 0.8  # height over level distance from which the page looks at first
+FAR = 2.0  # radii of the scene from which it does
+ASIDE = np.radians(50.0)  # from the last camera
+UNSURE = 0.6  # opacity of what is not confident
+HULL = 0.35  # and of the hull of an unknown object
+PANEL = f"""<style>
+.nv {{ position: fixed; z-index: 9; top: 0; right: 0; bottom: 0; width: 330px; overflow-y: auto;
+  box-sizing: border-box; padding: 14px 16px; background: {PAPER}; color: {INK};
+  border-left: 1px solid {FAINT}; font: 13px/1.35 "Helvetica Neue", Arial, sans-serif }}
+.nv h1 {{ font-size: 18px; margin: 0 0 2px }}
+.nv p {{ color: #5b6672; margin: 0 0 12px }}
+.nv section {{ border-top: 1px solid {FAINT}; padding: 8px 0 }}
+.nv h2 {{ font-size: 14px; margin: 0 0 2px }}
+.nv h2 i {{ display: inline-block; width: 11px; height: 11px; border-radius: 3px;
+  margin-right: 7px }}
+.nv h2 small {{ font-weight: normal; color: #5b6672 }}
+.nv small {{ color: #5b6672; overflow-wrap: anywhere }}
+.nv table {{ border-spacing: 0 2px; width: 100%; font-size: 12px }}
+.nv td:first-child {{ width: 130px; overflow-wrap: anywhere }}
+.nv td:last-child {{ width: 44px; text-align: right; font-variant-numeric: tabular-nums }}
+.nv .bar {{ height: 9px; background: #eef1f4 }}
+.nv .bar b {{ display: block; height: 9px }}
+#root {{ right: 330px !important; width: calc(100% - 330px) !important }}
+@media (max-width: 700px) {{
+  .nv {{ top: 55%; width: 100%; border: 0; border-top: 1px solid {FAINT} }}
+  #root {{ right: 0 !important; width: 100% !important; height: 55% !important }}
+}}
+</style>"""
+
+
+def write_scene_page(
+    scene: Scene, path: str | Path, title: str = "On the table", overwrite: bool = False
+) -> None:
+    """Write what a scene knows as a page: the scans in place, cameras, beliefs.
+
+    Args:
+        scene: with one frame at least.
+        path: of the page, .html.
+        title: of what was looked at.
+        overwrite: whether a page that exists is replaced.
+
+    Raises:
+        SessionError: no frame was taken in yet.
+        UsageError: the file is of another name.
+        ResultsError: the page exists, or cannot be written.
+    """
+    if not scene.frames:
+        raise SessionError("there is nothing to show before the first frame: update with one")
+    if Path(path).suffix != ".html":
+        raise UsageError(f"{path}: a page is called .html")
+    with redirect_stdout(StringIO()):  # viser would tell of a server that nobody is to open
+        server = serve("127.0.0.1", 0)
+        try:
+            draw_scene_in_3d(server, scene)
+            page = server.scene.as_html()
+        finally:
+            server.stop()
+    before, end, after = page.rpartition("</body>")
+    with new_file(Path(path), overwrite) as part:
+        part.write_text(f"{before}{scene_card(scene, title)}{end}{after}", encoding="utf-8")
+
+
+def scene_card(scene: Scene, title: str) -> str:
+    """What is known of each object, as HTML.
+
+    Args:
+        scene: with one frame at least.
+        title: of what was looked at.
+    """
+    objects = scene.objects
+    count = len(scene.frames)
+    frames = f"{count} frame{'s' * (count > 1)}"
+    sure = sum(thing.confident for thing in objects)
+    unknown = sum(thing.name == UNKNOWN_NAME for thing in objects)
+    said = f"{frames}: {sure} sure, {len(objects) - sure - unknown} not sure, {unknown} unknown"
+    if not objects:
+        said = f"{frames}: nothing stands on the plane"
+    parts = "".join(_object_card(thing) for thing in objects)
+    return f'{PANEL}<div class="nv"><h1>{escape(title)}</h1><p>{said}</p>{parts}</div>'
+
+
+def _object_card(thing: SceneObject) -> str:
+    """What is known of an object, as HTML."""
+    colour = colour_of(thing)
+    sure = "confident" if thing.confident else "not confident"
+    off = thing.pose_uncertainty
+    where = f"at {place_in_words(thing.place)}"
+    if thing.name == UNKNOWN_NAME:
+        sides = " x ".join(f"{100 * side:.0f}" for side in thing.size)
+        sure = f"{sides} cm"
+    elif off is not None:
+        where += f", ± {off.millimetres:.1f} mm, {off.degrees:.1f}°"
+    if thing.touches:
+        where += f", touches {', '.join(str(number) for number in thing.touches)}"
+
+    beliefs = sorted(thing.result.beliefs.items(), key=lambda pair: -pair[1])[:PAGE_CANDIDATES]
+    rows = "".join(
+        f'<tr><td>{escape(name.replace("_", " "))}</td><td><div class="bar">'
+        f'<b style="width:{100 * belief:.1f}%;background:{colour}"></b></div></td>'
+        f"<td>{belief:.1%}</td></tr>"
+        for name, belief in beliefs
+        if belief >= LEAST_BELIEF
+    )
+    warnings = "".join(
+        f"<br>{escape(text)}" for text in sorted({w.message for w in thing.warnings})
+    )
+    name = escape(thing.name.replace("_", " "))
+    return (
+        f'<section><h2><i style="background:{colour}"></i>{thing.number} {name}'
+        f" <small>{sure}</small></h2><table>{rows}</table>"
+        f"<small>{where}{warnings}</small></section>"
+    )
+
+
+def draw_scene_in_3d(server: viser.ViserServer, scene: Scene) -> None:
+    """Draw the table, the scans in place, what the frames show, and where the cameras stood.
+
+    Args:
+        server: of the page.
+        scene: with one frame at least.
+    """
+    top = scene.tops[0]
+    objects = scene.objects
+    corners = [thing.seen_points for thing in objects]
+    cameras = [frame.camera_to_world for frame in scene.frames]
+    everything = np.concatenate(corners) if corners else np.stack([c[:3, 3] for c in cameras])
+    middle = (everything.min(0) + everything.max(0)) / 2
+    radius = float(np.linalg.norm(everything - middle, axis=1).max()) + AROUND
+
+    three = server.scene
+    three.set_up_direction(tuple(float(one) for one in top.up))
+    three.configure_environment_map(None)
+    three.configure_default_lights(False)
+    three.add_light_hemisphere(
+        "/sky", sky_color=rgb(PAPER), ground_color=rgb(GROUND), intensity=3.0
+    )
+    lamp = middle + radius * (3 * top.up + np.array([-1.0, -1.5, 0.0]))
+    three.add_light_directional("/lamp", color=(255, 255, 255), intensity=1.6, position=tuple(lamp))
+
+    _draw_table(server, scene, middle, radius)
+    for thing in objects:
+        _draw_object(server, scene, thing)
+    for number, frame in enumerate(scene.frames):
+        _draw_frame(server, scene, number, frame.camera_to_world)
+    way = np.stack([pose[:3, 3] for pose in cameras])
+    if len(way) > 1:
+        segments = np.stack([way[:-1], way[1:]], 1)
+        three.add_line_segments("/cameras/way", segments, rgb(INK), thickness=0.002)
+    _look_at_it(server, scene, middle, radius)
+
+
+def _look_at_it(server: viser.ViserServer, scene: Scene, middle: Float, radius: float) -> None:
+    """Look at it first from beside the last camera, farther away and above."""
+    up = scene.tops[0].up
+    back = scene.frames[-1].camera_to_world[:3, 3] - middle
+    back = back - (back @ up) * up
+    length = float(np.linalg.norm(back))
+    level = back / length if length > 1e-6 else np.roll(up, 1)
+    level = Rotation.from_rotvec(ASIDE * up).apply(level)
+    away = FAR * radius * (level + STEEP * up) / np.hypot(1, STEEP)
+    server.initial_camera.position = tuple(middle + away)
+    server.initial_camera.look_at = tuple(middle)
+
+
+def _draw_table(server: viser.ViserServer, scene: Scene, middle: Float, radius: float) -> None:
+    """The plane on which all stands, as a disc."""
+    top = scene.tops[0]
+    normal = top.plane.normal
+    foot = middle - float(top.plane.height(middle[None])[0]) * normal
+    turn, _ = Rotation.align_vectors(normal[None], np.array([[0.0, 0.0, 1.0]]))
+    server.scene.add_cylinder(
+        "/table",
+        radius,
+        PAGE_TABLE_THICKNESS,
+        rgb("#efe4d3"),
+        radial_segments=96,
+        wxyz=turn.as_quat(scalar_first=True),
+        position=tuple(foot - PAGE_TABLE_THICKNESS * normal),
+    )
+
+
+def _draw_object(server: viser.ViserServer, scene: Scene, thing: SceneObject) -> None:
+    """A scan where it was found, or the hull of what was seen of an unknown object; its name."""
+    colour = rgb(colour_of(thing))
+    name = f"/objects/{thing.number}"
+    shape = placed_shape(thing)
+    if shape is not None:
+        vertices, faces = shape
+        server.scene.add_mesh_simple(
+            name,
+            vertices,
+            faces,
+            color=colour,
+            opacity=HULL if thing.name == UNKNOWN_NAME else None if thing.confident else UNSURE,
+            flat_shading=False,
+            side="double",
+        )
+    if thing.name == UNKNOWN_NAME:
+        points = points_of(scene, thing)
+        server.scene.add_point_cloud(f"{name}/seen", points, rgb(INK), point_size=0.0012)
+    top = thing.place + np.array([0.0, 0.0, thing.size[2] / 2 + 0.02])
+    server.scene.add_label(f"{name}/name", named(thing), position=tuple(top))
+
+
+def _draw_frame(server: viser.ViserServer, scene: Scene, number: int, pose: Float) -> None:
+    """A camera where it stood, with its picture."""
+    frame = scene.frames[number]
+    height, width = frame.shape
+    picture = Image.fromarray((255 * grey_picture(frame)).astype(np.uint8))
+    small = picture.resize((FRUSTUM_PIXELS, round(FRUSTUM_PIXELS * height / width)))
+    last = number == len(scene.frames) - 1
+    server.scene.add_camera_frustum(
+        f"/cameras/{number + 1}",
+        fov=2 * float(np.arctan(height / 2 / frame.intrinsics[1, 1])),
+        aspect=width / height,
+        scale=PAGE_FRUSTUM,
+        color=rgb(ACCENT if last else INK),
+        image=np.repeat(np.asarray(small)[..., None], 3, -1),
+        wxyz=Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True),
+        position=tuple(pose[:3, 3]),
+        line_width=1.5,
+    )
+    server.scene.add_label(f"/cameras/{number + 1}/number", str(number + 1))

@@ -1,0 +1,166 @@
+"""Recordings of a scene for the Rerun viewer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from uuid import uuid4
+
+import numpy as np
+
+from nextview.checks import extras
+from nextview.errors import UsageError
+from nextview.scene.objects import UNKNOWN_NAME, SceneObject
+from nextview.scene.scene import Scene
+from nextview.session.style import ACCENT, GREY, INK, rgb
+from nextview.viewers.scene_shapes import colour_of, named, placed_shape, seen_points
+
+with extras():
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+FRAME_TIMELINE = "frame"
+LABEL_ABOVE = 0.02  # metres above an object at which its name stands
+RECORDED_FRUSTUM = 0.08  # metres, of a camera that is drawn
+
+
+class SceneRecorder:
+    """Records a scene; call it with the scene after each frame.
+
+    On the timeline ``frame`` the file holds, in the world and in metres:
+
+    - ``world/camera``: pose, pinhole and depth of the last frame; ``world/cameras/K`` of frame K,
+      and ``world/way`` between them.
+    - ``world/seen/K``: the points above the table that frame K shows.
+    - ``world/objects/N``: the scan of object N where it was found, or the hull of what was seen of
+      an unknown one, and ``world/objects/N/name``. Cleared once the object is gone.
+    - ``world/next``: where to look next.
+    - ``belief/N NAME``: the belief in each name that an object had, over the frames.
+    - ``log``: each frame in words.
+
+    The file can be read at any time; it is complete after ``close``. Where the frames were taken
+    in before the first call, the objects are those of the last one.
+
+    Args:
+        path: of the file, .rrd.
+
+    Raises:
+        UsageError: its name does not end in .rrd, or it cannot be written.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        if Path(path).suffix != ".rrd":
+            raise UsageError(f"{path}: a recording for Rerun is called .rrd")
+        self._stream = rr.RecordingStream("nextview", recording_id=uuid4())
+        try:
+            self._stream.save(path, default_blueprint=scene_blueprint())
+        except (OSError, RuntimeError, ValueError) as error:
+            raise UsageError(f"{path}: cannot be written ({error})") from None
+        self._stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._frames = 0
+        self._shown: set[int] = set()
+        self._open = True
+
+    def __call__(self, scene: Scene) -> None:
+        """Write what is new in a scene."""
+        if not self._open:
+            return
+        for number in range(self._frames, len(scene.frames)):
+            self._stream.set_time(FRAME_TIMELINE, sequence=number + 1)
+            self._log_frame(scene, number)
+        if len(scene.frames) == self._frames:
+            return
+        self._frames = len(scene.frames)
+        objects = scene.objects
+        for thing in objects:
+            self._log_object(thing)
+        for number in self._shown - {thing.number for thing in objects}:
+            self._stream.log(f"world/objects/{number}", rr.Clear(recursive=True))
+        self._shown = {thing.number for thing in objects}
+        self._log_next(scene)
+        self._log_text(scene)
+        self._stream.flush()
+
+    def close(self) -> None:
+        """Complete the file; nothing more is written."""
+        if self._open:
+            self._stream.disconnect()
+        self._open = False
+
+    def _log_frame(self, scene: Scene, number: int) -> None:
+        """A camera where it stood, its depth, the points that it saw, and the way so far."""
+        frame = scene.frames[number]
+        pose = frame.camera_to_world
+        height, width = frame.shape
+        place = rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3])
+        pinhole = rr.Pinhole(
+            image_from_camera=frame.intrinsics,
+            resolution=(width, height),
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=RECORDED_FRUSTUM,
+        )
+        for name in (f"world/cameras/{number + 1}", "world/camera"):
+            self._stream.log(name, place, pinhole)
+        self._stream.log("world/camera/depth", rr.DepthImage(frame.depth, meter=1.0))
+
+        points = seen_points(scene, number)
+        cloud = rr.Points3D(points, colors=rgb(GREY), radii=0.0008)
+        self._stream.log(f"world/seen/{number + 1}", cloud)
+        way = np.stack([each.camera_to_world[:3, 3] for each in scene.frames[: number + 1]])
+        self._stream.log("world/way", rr.LineStrips3D([way], colors=rgb(INK), radii=0.001))
+
+    def _log_object(self, thing: SceneObject) -> None:
+        """An object where it was found, its name, and the belief in it."""
+        name = f"world/objects/{thing.number}"
+        shape = placed_shape(thing)
+        if shape is None:
+            self._stream.log(name, rr.Clear(recursive=False))
+        else:
+            vertices, faces = shape
+            colours = np.tile([*rgb(colour_of(thing)), 255], (len(vertices), 1)).astype(np.uint8)
+            mesh = rr.Mesh3D(
+                vertex_positions=vertices, triangle_indices=faces, vertex_colors=colours
+            )
+            self._stream.log(name, mesh)
+        top = thing.place + np.array([0, 0, thing.size[2] / 2 + LABEL_ABOVE])
+        label = rr.Points3D([top], labels=[named(thing)], colors=rgb(colour_of(thing)), radii=0.002)
+        self._stream.log(f"{name}/name", label)
+        if thing.name != UNKNOWN_NAME:
+            entity = rr.escape_entity_path_part(f"{thing.number} {thing.name}")
+            self._stream.log(f"belief/{entity}", rr.Scalars(thing.confidence))
+
+    def _log_next(self, scene: Scene) -> None:
+        """Where to look next; nowhere once all is sure."""
+        target = None if scene.done else scene.target
+        places = np.zeros((0, 3)) if target is None else target[None, :3, 3]
+        self._stream.log("world/next", rr.Points3D(places, colors=rgb(ACCENT), radii=0.012))
+
+    def _log_text(self, scene: Scene) -> None:
+        """What is known after the last frame, in words."""
+        for thing in scene.objects:
+            self._stream.log("log", rr.TextLog(repr(thing), level=rr.TextLogLevel.INFO))
+
+
+def record_scene(scene: Scene, path: str | Path) -> None:
+    """Write a scene, as it is, as a recording for the Rerun viewer.
+
+    Args:
+        scene: with one frame at least.
+        path: of the file, .rrd; one of that name is replaced.
+    """
+    recorder = SceneRecorder(path)
+    recorder(scene)
+    recorder.close()
+
+
+def scene_blueprint() -> rrb.Blueprint:
+    """How the viewer arranges a recording at first."""
+    table = rrb.Spatial3DView(origin="world", name="table")
+    depth = rrb.Spatial2DView(origin="world/camera", name="last frame")
+    belief = rrb.TimeSeriesView(origin="belief", name="belief over the frames")
+    log = rrb.TextLogView(origin="log")
+    right = rrb.Vertical(depth, belief, log, row_shares=[3, 3, 2])
+    return rrb.Blueprint(
+        rrb.Horizontal(table, right, column_shares=[3, 2]),
+        rrb.TimePanel(timeline=FRAME_TIMELINE),
+        collapse_panels=True,
+    )
