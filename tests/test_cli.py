@@ -184,6 +184,31 @@ def test_ctrl_c_ends_other_commands_in_one_line(monkeypatch, capsys):
     assert ended(capsys, "list", "models") == (130, "nextview: stopped; nothing was written\n")
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
+@pytest.mark.parametrize(
+    ("where", "words", "status", "said"),
+    [
+        (">/dev/full", "list models", 1, "standard output cannot be written (No space left on"),
+        (">&-", "list models", 0, ""),
+        (">&-", "recognise none.off", 2, "none.off: no such file"),
+        ("2>&-", "recognise none.off", 2, ""),
+        ("2>/dev/full", "recognise none.off", 2, ""),
+    ],
+)
+def test_where_an_output_is_full_or_closed_the_status_still_tells(where, words, status, said):
+    line = ["bash", "-c", f'"$@" {where}', "bash", *COMMAND, *words.split()]
+    done = subprocess.run(line, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, said in done.stderr) == (status, "", True)
+    assert done.stderr.count("\n") == (said != "")
+
+
+@pytest.mark.parametrize("columns", ["1", "1000000000", "-3", "wide"])
+def test_help_in_any_width(columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", columns)
+    status, said = ended(capsys, "recognise", "--help")
+    assert (status, said) == (0, "")
+
+
 def test_a_bug_keeps_its_traceback(monkeypatch):
     monkeypatch.setattr("nextview.cli.listing.bundled_cards", lambda: {}["bug"])
     with pytest.raises(KeyError):

@@ -1,5 +1,6 @@
 """How a command ends: a user's error in one sentence, a bug with its traceback."""
 
+import errno
 import io
 import os
 import sys
@@ -7,7 +8,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.util import find_spec
-from typing import Any
+from typing import NoReturn, TextIO
 
 from nextview.checks import EXTRAS, missing_extra, needs_package
 from nextview.errors import NextviewError
@@ -25,9 +26,16 @@ def printable(text: str) -> str:
 
 
 @contextmanager
-def orderly_end(after_ctrl_c: str) -> Iterator[None]:
-    """End with status 2 after an error of the user's or a missing extra, with 130 after Ctrl-C."""
-    _print_anything()
+def orderly_end(after_stop: str) -> Iterator[None]:
+    """Turn what a command raises into one sentence and an exit status.
+
+    The status is 1 if the output cannot be written, 2 after an error of the user's or if an extra
+    is missing, and 130 after Ctrl-C or SIGTERM. A bug keeps its traceback.
+
+    Args:
+        after_stop: what the user can do after Ctrl-C.
+    """
+    _prepare_outputs()
     try:
         yield
         sys.stdout.flush()
@@ -37,33 +45,48 @@ def orderly_end(after_ctrl_c: str) -> Iterator[None]:
             raise
         _end(sentence, 2)
     except BrokenPipeError:  # who read the output has gone, as head does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        _discard(sys.stdout)
         sys.exit(1)
     except OSError as error:
-        if error.filename is None:
+        if error.filename is not None:
+            _end(f"{error.filename}: {error.strerror}", 2)
+        if error.errno != errno.ENOSPC:
             raise
-        _end(f"{error.filename}: {error.strerror}", 2)
+        _discard(sys.stdout)
+        _end(f"standard output cannot be written ({error.strerror})", 1)
     except (KeyboardInterrupt, SystemExit) as ended:
-        if not isinstance(
-            ended.__context__ if isinstance(ended, SystemExit) else ended, KeyboardInterrupt
-        ):
+        stop = ended.__context__ if isinstance(ended, SystemExit) else ended
+        if not isinstance(stop, KeyboardInterrupt):
             raise  # an exit; Lightning makes one of a KeyboardInterrupt
         warnings.simplefilter("ignore")
         # reads that zarr has begun complain of being left
         sys.unraisablehook = lambda unraisable: None
-        _end(f"stopped; {after_ctrl_c}", 130)
+        _end(f"stopped; {after_stop}", 130)
 
 
-def _print_anything() -> None:
-    """Print characters that the encoding of an output lacks as codes."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
+def _prepare_outputs() -> None:
+    """Print characters that an encoding lacks as codes, and nothing where an output is closed."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115  # open until the process ends
+        elif isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
 
 
-def _end(sentence: str, status: int) -> Any:
-    print(f"nextview: {printable(sentence)}", file=sys.stderr)
+def _end(sentence: str, status: int) -> NoReturn:
+    try:
+        print(f"nextview: {printable(sentence)}", file=sys.stderr)
+    except OSError:  # standard error is full: the status still tells
+        _discard(sys.stderr)
     sys.exit(status)
+
+
+def _discard(stream: TextIO) -> None:
+    """Send the rest of an output nowhere, also what Python flushes when the process ends."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
 
 
 def require(

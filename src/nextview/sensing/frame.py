@@ -75,7 +75,8 @@ class Frame:
         intrinsics = _check_intrinsics(self.intrinsics, depth.shape)
         if not isinstance(pixel_centre, int | float) or not abs(pixel_centre) <= 1:
             raise ObservationError(
-                f"the first pixel's centre has the coordinate 0 or 0.5, not {pixel_centre!r}"
+                f"the first pixel's centre has the coordinate 0 or 0.5, not"
+                f" {one_line(repr(pixel_centre))}"
             )
 
         intrinsics[:2, 2] += 0.5 - pixel_centre
