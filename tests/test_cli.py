@@ -311,6 +311,15 @@ def test_a_shell_completes_the_whole_command(shell, capsys):
     assert "--held-out" in script
 
 
+@pytest.fixture(scope="module")
+def completions_for_bash(tmp_path_factory):
+    pytest.importorskip("torch")
+    path = tmp_path_factory.mktemp("bash") / "nextview.sh"
+    code = "from nextview.cli.main import main; main(['completion', 'bash'])"
+    path.write_text(run_python(code).stdout)
+    return path
+
+
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
 @pytest.mark.parametrize(
     ("words", "offered"),
@@ -320,12 +329,9 @@ def test_a_shell_completes_the_whole_command(shell, capsys):
         ("train recogniser --lay", {"--layers"}),
     ],
 )
-def test_bash_completes_commands_and_options(words, offered, tmp_path):
-    pytest.importorskip("torch")
-    script = run_python("from nextview.cli.main import main; main(['completion', 'bash'])").stdout
-    (tmp_path / "nextview.sh").write_text(script)
+def test_bash_completes_commands_and_options(words, offered, completions_for_bash):
     ask = (
-        f"source {tmp_path}/nextview.sh; f=$(complete -p nextview | sed 's/.*-F \\([^"
+        f"source {completions_for_bash}; f=$(complete -p nextview | sed 's/.*-F \\([^"
         f" ]*\\).*/\\1/'); COMP_WORDS=(nextview {words}); COMP_CWORD=$((${{#COMP_WORDS[@]}}-1));"
         " $f; echo ${COMPREPLY[@]}"
     )
