@@ -1,12 +1,14 @@
 """Parts of a scene: pixels that nobody claims, objects that are one, the ground, what hides."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import nextview
 from nextview.geometry.mesh import make_mesh
+from nextview.scene.floating import floating
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import TableGround
 from nextview.scene.parting import Bench, merged, new_track, taken_over
@@ -161,3 +163,27 @@ def test_what_stands_behind_another_thing_is_not_seen(system, meshes):
     before_the_can = np.append(can[:2] - 0.5 * away, 0.08)
     assert ground.share_visible(before_the_can, tracks["tomato_soup_can"]) == 1
     assert ground.share_visible(behind_the_box, tracks["tomato_soup_can"]) < 0.5
+
+
+def test_a_thing_floats_unless_it_stands_on_the_plane_or_on_another_object(system, meshes):
+    camera = camera_over([meshes["mug"]])
+    top = TableTop.of(camera.frame(view(20)), UP)
+    whole = max(top.segments(), key=np.count_nonzero)
+    judged = judged_by(system)
+    mug = judged([new_track(whole, Bench(top, 0, judged))])[0]
+    assert mug.result.answer == "mug"
+    assert floating([mug], top.plane) == [False]
+
+    lower = replace(top.plane, offset=top.plane.offset + 0.05)
+    assert floating([mug], lower) == [True]
+    assert replace(mug, result=replace(mug.result, confident=True)).confident
+    assert not replace(mug, floats=True, result=replace(mug.result, confident=True)).confident
+
+    scan = mug.posed.vertices @ mug.posed.pose[:3, :3].T + mug.posed.pose[:3, 3]
+    middle = scan.mean(0) * (1, 1, 0)
+    square = np.array([[-1, -1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]]) * 0.2
+    corners = np.concatenate([square, square - (0, 0, 0.05)])
+    for place, floats in ((middle, False), (middle + np.array([0.5, 0, 0]), True)):
+        hull = SimpleNamespace(hull=corners + place)
+        box = SimpleNamespace(posed=None, thing=SimpleNamespace(sightings=[hull]))
+        assert floating([mug, box], lower) == [floats, False]

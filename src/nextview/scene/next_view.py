@@ -181,7 +181,7 @@ def is_sure(track: Track) -> bool:
     result = track.result
     if result is None:
         return False
-    if result.confident:
+    if track.confident:
         return True
     return bool(result.unknown and len(track.frames) >= ENOUGH_VIEWS)
 

@@ -15,6 +15,10 @@ from nextview.session.result import Recognition
 from nextview.types import Float, Mask
 
 UNKNOWN_NAME = "unknown"
+FLOATING = ViewWarning(
+    "floating",
+    "the scan, where it was found, floats above the plane: the name is likely to be wrong",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +37,8 @@ class SceneObject:
         seen_points: corners of the hull of what each frame shows of it, (N, 3), metres.
         touches: numbers of the objects that it touches in the picture and in depth.
         result: all that is known of it.
+        floats: whether its scan, where it was found, stands neither on the plane nor on another
+            object. Then the name is not confident.
     """
 
     number: int
@@ -45,6 +51,7 @@ class SceneObject:
     seen_points: Float = field(repr=False)
     touches: tuple[int, ...]
     result: Recognition = field(repr=False)
+    floats: bool = False
 
     @classmethod
     def of(cls, track: Track, touching: Collection[tuple[int, int]]) -> SceneObject:
@@ -66,13 +73,14 @@ class SceneObject:
             number=track.number,
             name=result.answer or UNKNOWN_NAME,
             confidence=result.confidence,
-            confident=result.confident,
+            confident=track.confident,
             place=frame.centre if result.place is None else result.place,
             size=np.ptp(seen @ frame.axes.T, axis=0),
             pixels=track.pixels,
             seen_points=seen,
             touches=tuple(others),
             result=result,
+            floats=track.floats,
         )
 
     @property
@@ -101,7 +109,8 @@ class SceneObject:
     @property
     def warnings(self) -> tuple[ViewWarning, ...]:
         """What is likely to be wrong with it; usually nothing."""
-        return tuple(warning for view in self.result.views for warning in view.warnings)
+        of_views = tuple(warning for view in self.result.views for warning in view.warnings)
+        return (*of_views, FLOATING) if self.floats else of_views
 
     def __repr__(self) -> str:
         """One line: ``3: mug, belief 0.998, confident, at [0.412, -0.103, 0.050] m``."""

@@ -300,10 +300,8 @@ def _groups(tracks: Sequence[Track], bench: Bench) -> list[tuple[int, ...]]:
         first, second = masks[one], masks[other]
         if first is None or second is None or (good[one] and good[other]):
             continue
-        # what is explained well is joined only with what its own scan explains, too
-        beside = not (good[one] or good[other])
         linked[one, other] = linked[other, one] = (
-            (beside and bench.top.touching(first, second, NEAR_GAP, NEAR_STEP))
+            bench.top.touching(first, second, NEAR_GAP, NEAR_STEP)
             or _shares(tracks[one], second, bench)
             or _shares(tracks[other], first, bench)
         )

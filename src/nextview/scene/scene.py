@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from nextview.checks import number, one_line
 from nextview.errors import ObservationError, SessionError
+from nextview.scene.floating import floating
 from nextview.scene.following import SegmentAgreement, agreement, assign, contradicted
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import (
@@ -289,7 +290,10 @@ class Scene:
                     appeared.append(track.number)
             joined += [(ended, track.number) for ended in track.absorbed]
             kept.append(replace(track, absorbed=()))
-        self._tracks = kept
+        in_the_air = floating(kept, top.plane)
+        self._tracks = [
+            replace(track, floats=floats) for track, floats in zip(kept, in_the_air, strict=True)
+        ]
 
         gone = tuple(track.number for track in lost if track.number not in moved)
         changed = {*gone, *moved, *(ended for ended, _ in joined)}

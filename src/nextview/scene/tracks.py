@@ -44,6 +44,7 @@ class Track:
         again: frames that show it where it was known to be, with its pixels in each: they were not
             taken in as sightings.
         absorbed: numbers of objects whose pixels all became its own since the last frame.
+        floats: whether its scan stands neither on the plane nor on another object.
     """
 
     number: int
@@ -53,6 +54,12 @@ class Track:
     tries: int = 0
     again: tuple[tuple[int, Mask], ...] = ()
     absorbed: tuple[int, ...] = ()
+    floats: bool = False
+
+    @property
+    def confident(self) -> bool:
+        """Whether its name may be acted on."""
+        return self.result is not None and self.result.confident and not self.floats
 
     @property
     def posed(self) -> PoseCandidate | None:
