@@ -16,7 +16,7 @@ from scipy.stats import kstest
 
 import nextview
 from nextview import ModelError, SimulatedCamera, Stopping
-from nextview.cli.episode_table import episode_as_json, print_episode
+from nextview.cli.episode_table import print_episode
 from nextview.cli.main import main
 from nextview.data.samples import sample_mesh
 from nextview.files import sha256_of
@@ -31,6 +31,7 @@ from nextview.recognition.novelty import (
     read_novelty,
 )
 from nextview.sensing import Frame, ObservedObject
+from nextview.session.result_json import episode_as_json
 from nextview.training.unknown import quantiles
 
 

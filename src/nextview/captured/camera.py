@@ -1,14 +1,17 @@
 """A camera that has been everywhere already: the nearest captured view answers a request."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from nextview.captured.check import check_capture, refuse_many
+from nextview.captured.folders import read_box
 from nextview.captured.frames import Capture, CapturedFrame
-from nextview.errors import DatasetError, NoViewLeftError, ObservationError
+from nextview.errors import DatasetError, NoViewLeftError, ObservationError, UsageError
 from nextview.geometry.viewsphere import angle_between
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box, ObjectFrame, upright_axes
@@ -220,3 +223,44 @@ def _cost(frame: CapturedFrame, asked: Float, found: ObjectFrame) -> float:
     column, row, depth = _projected(frame, found.centre)
     inside = depth > 0 and 0 <= column < frame.size[0] and 0 <= row < frame.size[1]
     return _degrees_off(frame, asked, found) + (0 if inside else 180)
+
+
+def camera_of(
+    capture: Capture,
+    up: str | ArrayLike | None = None,
+    point: ArrayLike | None = None,
+    box: Path | Sequence[float] | None = None,
+    denoise: bool = True,
+    life_size: bool = True,
+) -> CapturedCamera:
+    """Create the camera of a capture from what a user says of the object.
+
+    Args:
+        capture: the captured views.
+        up: "y", "z", or a direction in the world, (3,); by default by the layout, or the normal of
+            the support plane.
+        point: near the object, world, metres, (3,).
+        box: upright box that just contains the object: its low and its high corner along ``up``,
+            metres, (6,), or a JSON file with low, high and axes.
+        denoise: as for ``ObservedObject``.
+        life_size: as for ``ObservedObject``.
+
+    Returns:
+        The camera.
+
+    Raises:
+        UsageError: a box is given by its corners, and the vertical is not known.
+    """
+    vertical = UP[up] if isinstance(up, str) else up
+    around = None
+    if isinstance(box, Path):
+        around = read_box(box)
+    elif box is not None:
+        upwards = capture.up if vertical is None else vertical
+        if upwards is None:
+            raise UsageError(
+                f"{capture.folder}: a box is upright, and in this layout nothing tells where up is:"
+                " give --up"
+            )
+        around = Box(np.array(box[:3]), np.array(box[3:]), upright_axes(upwards))
+    return CapturedCamera(capture, vertical, point, around, denoise, life_size)

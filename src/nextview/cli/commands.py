@@ -36,7 +36,7 @@ COMMANDS = {  # by name, in the order in which they are listed
         f"{CLI}.recognise:recognise", "recognise the object of a mesh or of captured frames"
     ),
     "look": Command(f"{CLI}.look:look", "say which known things stand where on a table"),
-    "demo": Command(f"{CLI}.recognise:demo", "recognise a sample object, and draw the episode"),
+    "demo": Command(f"{CLI}.demo:demo", "recognise a sample object, and draw the episode"),
     "learn": Command(
         f"{TEACHING}.learn:learn_things",
         "teach it your objects from scans or depth frames",
@@ -47,7 +47,7 @@ COMMANDS = {  # by name, in the order in which they are listed
         f"{CLI}.explore:explore", "choose views in the browser, and watch the belief"
     ),
     "capture": Command(
-        f"{CLI}.scenes:capture", "write depth images of a mesh, in the layout of BOP"
+        f"{CLI}.capture:capture", "write depth images of a mesh, in the layout of BOP"
     ),
     "completion": Command(
         f"{CLI}.completion:completion", "print completions for bash, zsh or fish"

@@ -4,8 +4,6 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from nextview.cli.progress import console
 from nextview.errors import UsageError
 from nextview.files import check_new
@@ -15,8 +13,22 @@ from nextview.session.session import FrameCamera
 from nextview.session.system import is_frames, simulated
 
 Unit = Literal["mm", "cm", "inch", "foot", "m"]
+NamedSplit = Literal["train", "test", "val"]
 Three = tuple[float, float, float]
 FIGURE_ENDINGS = (".png", ".pdf", ".svg")
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Processes and machines.
+
+    Attributes:
+        workers: number of processes; by default one for each core.
+        scheduler: address of a dask.distributed scheduler to use instead, as tcp://HOST:8786.
+    """
+
+    workers: int | None = None
+    scheduler: str | None = None
 
 
 @dataclass(frozen=True)
@@ -130,9 +142,8 @@ class ObjectOptions:
         return simulated(mesh, self.sensor, seed)
 
     def _captured(self, folder: Path) -> FrameCamera:
-        from nextview.captured.camera import UP, CapturedCamera
-        from nextview.captured.folders import read_box, read_capture
-        from nextview.sensing.object_frame import Box, upright_axes
+        from nextview.captured.camera import camera_of
+        from nextview.captured.folders import read_capture
 
         capture = read_capture(
             folder,
@@ -143,17 +154,7 @@ class ObjectOptions:
             self.world_frame,
         )
         console.print(f"{capture!r}")
-        up = UP[self.up] if isinstance(self.up, str) else self.up
-        box = read_box(self.box) if isinstance(self.box, Path) else None
-        if isinstance(self.box, tuple):
-            upwards = up or capture.up
-            if upwards is None:
-                raise UsageError(
-                    f"{folder}: a box is upright, and in this layout nothing tells where up is:"
-                    " give --up"
-                )
-            box = Box(np.array(self.box[:3]), np.array(self.box[3:]), upright_axes(upwards))
-        return CapturedCamera(capture, up, self.point, box, not self.raw, not self.by_shape)
+        return camera_of(capture, self.up, self.point, self.box, not self.raw, not self.by_shape)
 
 
 def check_file(path: Path | None, overwrite: bool, kinds: tuple[str, ...] = FIGURE_ENDINGS) -> None:

@@ -1,8 +1,6 @@
-"""An episode as a table, and as JSON."""
+"""An episode as a table."""
 
-import json
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from rich import box
@@ -13,7 +11,6 @@ from rich.text import Text
 from nextview.checks import number_of
 from nextview.cli.exit_status import printable
 from nextview.cli.progress import Terminal
-from nextview.session.pose_json import pose_as_json
 from nextview.session.result import Recognition
 
 SHOWN_POSES = 5  # beside the likeliest
@@ -130,72 +127,3 @@ def _pose_in_words(result: Recognition) -> list[str]:
         more = ", ..." if len(others) > SHOWN_POSES else ""
         lines.append(f"Other poses that it may have, by their probability: {alike}{more}.")
     return lines
-
-
-def episode_as_json(
-    result: Recognition, name: str, frames: Sequence[str] = (), indent: int | None = 1
-) -> str:
-    """Return all that the table shows, with complete beliefs and maps, as a JSON object.
-
-    Args:
-        result: of the episode.
-        name: of the object.
-        frames: names of the captured frames that were taken; empty for other cameras.
-        indent: of the text, in spaces; None for one line.
-
-    Returns:
-        The text.
-    """
-    views = []
-    for step, view in enumerate(result.views, 1):
-        best = None
-        if view.azimuth_bins is not None and view.observation.seen:
-            bins = view.azimuth_bins[view.belief.argmax()]
-            best = {"degrees": 360 * int(bins.argmax()) / len(bins), "belief": bins.max()}
-
-        one: dict[str, Any] = {
-            "view": view.index,
-            "elevation": view.angles[0],
-            "azimuth": view.angles[1],
-        }
-        one |= {"degrees_off": view.degrees_off} | ({"frame": frames[step - 1]} if frames else {})
-        one |= {
-            "seen": view.observation.seen,
-            "alone": dict(zip(result.classes, view.alone, strict=True)),
-        }
-        one |= {
-            "belief": dict(zip(result.classes, view.belief, strict=True)),
-            "azimuth_bin": best,
-            "maps": view.maps,
-        }
-        one |= {"values": view.values, "threshold": float(result.stopping.threshold_at(step))}
-        one |= {
-            "next_view": view.next_view,
-            "travel_cells": view.travel,
-            "travel_radians": view.arc,
-        }
-        views.append(one | {"warnings": [warning.message for warning in view.warnings]})
-
-    parts = ("answer", "confidence", "beliefs", "most_like", "unknown", "novelty", "radius")
-    whole = {"name": name} | {part: getattr(result, part) for part in parts}
-    whole |= pose_as_json(result)
-    whole |= {
-        "unit": None if result.radius is None else "m",
-        "threshold_reached": result.confident,
-        "views": views,
-    }
-    whole["warnings"] = sorted(warning.name for warning in result.warnings)
-    return json.dumps(plain(whole), indent=indent)
-
-
-def plain(value: Any) -> Any:
-    """As JSON has it: six digits, and null for what is no number."""
-    if isinstance(value, Mapping):
-        return {key: plain(each) for key, each in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [plain(each) for each in value]
-    if isinstance(value, float):
-        return round(value, 6) if np.isfinite(value) else None
-    return value

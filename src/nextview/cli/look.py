@@ -16,13 +16,13 @@ from nextview.captured.check import check_capture
 from nextview.captured.folders import Capture, read_capture
 from nextview.checks import extras
 from nextview.cli.common_options import Three, check_file
-from nextview.cli.episode_table import plain
 from nextview.cli.progress import Terminal, console, track
 from nextview.errors import ObservationError, UsageError
 from nextview.files import new_file
 from nextview.scene.report import REPORT_COLUMNS, doubts_of, row_of, scene_as_json
 from nextview.scene.scene import Look, Scene
 from nextview.sensing.object_frame import Box, upright_axes
+from nextview.session.result_json import plain
 from nextview.session.system import load
 from nextview.types import Float
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from nextview.cli.common_options import NamedSplit, Workers
 from nextview.cli.progress import console, follow
-from nextview.cli.stores import NamedSplit, Workers
 from nextview.data import predicting
 from nextview.data.predictions import Predictions
 from nextview.errors import ModelError, UsageError

@@ -54,6 +54,33 @@ def follow(steps: Iterator[tuple[int, int]], what: str) -> tuple[int, int]:
     return before, total
 
 
+def track_all(
+    done: Iterable[tuple[str, str | None]], total: int, what: str, before: int = 0
+) -> list[str]:
+    """Follow a job that yields what is done and why it failed, and print the reasons.
+
+    Args:
+        done: name of each item and None, or why it failed.
+        total: number of items.
+        what: name of the work.
+        before: number of items that were done before.
+
+    Returns:
+        The reasons.
+    """
+    failed: list[str] = []
+
+    def counts() -> Iterator[int]:
+        for n, (_, reason) in enumerate(done, before + 1):
+            failed.extend([reason] if reason else [])
+            yield n
+
+    track(counts(), total, what)
+    for reason in failed:
+        console.print(reason, style="yellow", soft_wrap=True)
+    return failed
+
+
 def say_done(where: Path, done: str, before: int, total: int) -> None:
     """Print what a run of a resumable stage did.
 

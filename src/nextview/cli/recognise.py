@@ -1,19 +1,18 @@
-"""``nextview recognise`` and ``demo``: look at one object until it is clear what it is."""
+"""``nextview recognise``: look at one object until it is clear what it is."""
 
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from nextview.cli.common_options import EpisodeOptions, ObjectOptions, check_file
-from nextview.cli.episode_table import episode_as_json, print_episode
+from nextview.cli.episode_table import print_episode
 from nextview.cli.progress import console
 from nextview.errors import NextviewError, ObservationError, UsageError
 from nextview.files import new_file
+from nextview.session.result_json import episode_as_json
 from nextview.session.session import Session
-from nextview.session.system import load, simulated
-
-DEMO_PICTURE = Path("nextview_demo.png")
+from nextview.session.system import load
 
 
 @dataclass(frozen=True)
@@ -85,33 +84,6 @@ def recognise(
 
     if failed:
         raise UsageError(f"{len(failed)} of {1 + len(more)} were left out, see above")
-
-
-def demo(
-    shape: Literal["table", "chair", "monitor"] = "table",
-    start: int = 33,
-    figure: Path | None = None,
-    overwrite: bool = False,
-) -> None:
-    """Recognise a sample object that ships with nextview, and draw the episode.
-
-    Args:
-        shape: the sample object.
-        start: index of the first view, 0 to 39.
-        figure: file of the picture; by default nextview_demo.png, which is replaced.
-        overwrite: replace an existing picture of another name.
-    """
-    from nextview.data.samples import sample_mesh
-
-    output = Output(figure, overwrite=overwrite)
-    if figure is None:  # the name is the demo's own: a second demo draws over the first
-        output = Output(DEMO_PICTURE, overwrite=True)
-    check_file(output.figure, output.overwrite)
-    system = load()
-    camera = simulated(sample_mesh(shape))
-    session = system.session_with(camera, start)
-    show(session, camera, f"the sample {shape}", system.policy_name, output)
-    console.print(f"the episode is drawn in {output.figure}")
 
 
 def show(

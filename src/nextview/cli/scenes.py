@@ -1,16 +1,12 @@
-"""``nextview scenes`` draws cluttered scenes; ``capture`` writes depth images of a mesh."""
+"""``nextview scenes``: draw cluttered scenes, or rooms."""
 
 from pathlib import Path
 from typing import Literal
 
-from nextview.cli.common_options import Unit
-from nextview.cli.progress import console, track
-from nextview.cli.stores import NamedSplit, Workers, track_all
+from nextview.cli.common_options import NamedSplit, Unit, Workers
+from nextview.cli.progress import console, track_all
 from nextview.data import room_drawing, scene_drawing
 from nextview.errors import DatasetError, UsageError
-from nextview.files import check_new
-from nextview.geometry.mesh import MAX_FACES, load_mesh
-from nextview.geometry.viewsphere import ViewSphere
 
 ClutterLevel = Literal["light", "medium", "heavy"]
 
@@ -89,45 +85,3 @@ def _draw_rooms(
     if len(failed) == total:
         raise DatasetError(f"{out}: none of the {total} rooms can be drawn; see the reasons above")
     console.print(f"{out}: {total - len(failed)} rooms; next: frames of them, docs/scenes.md#rooms")
-
-
-def capture(
-    mesh: Path,
-    out: Path,
-    /,
-    viewpoints: Literal["40", "12"] = "40",
-    table: bool = False,
-    radius: float | None = None,
-    up: Literal["y", "z"] | None = None,
-    unit: Unit | None = None,
-    max_faces: int = MAX_FACES,
-    largest_part: bool = False,
-    overwrite: bool = False,
-) -> None:
-    """Write depth images, poses and intrinsics of a mesh, for ``nextview recognise FOLDER``.
-
-    Args:
-        mesh: OFF, OBJ, PLY, STL or GLB file of one upright object.
-        out: folder to write, in the layout of the BOP challenge.
-        viewpoints: viewpoints of the images.
-        table: put the object on a table, which is visible too; without one, masks are written.
-        radius: object radius, metres, if the unit of the file is not known.
-        up: up axis of the file; by default z, and y for GLB.
-        unit: unit of length of the file.
-        max_faces: largest number of triangles; the file may have 60 bytes for each of these.
-        largest_part: keep only the largest connected part of the mesh.
-        overwrite: replace an earlier capture.
-    """
-    from nextview.captured.writing import write_capture
-
-    check_new(out, overwrite, folder=True)
-    loaded = load_mesh(mesh, up, unit, max_faces, largest_part)
-    metres = loaded.metres if radius is None else radius
-    if metres is None:
-        raise UsageError(
-            f"{mesh}: how large is it? Give the file's --unit or the object's --radius in metres"
-        )
-    sphere = ViewSphere.named(viewpoints)
-    frames = write_capture(loaded, out, sphere, metres, table, not table, overwrite)
-    track(frames, len(sphere), f"capturing {mesh.name}")
-    console.print(f"{out}: {len(sphere)} views; look at them with: nextview recognise {out}")

@@ -1,11 +1,11 @@
 """``nextview render``, ``check`` and ``measure``: view stores."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from nextview.cli.progress import console, follow, say_done, track
+from nextview.cli.common_options import NamedSplit, Workers
+from nextview.cli.progress import console, follow, say_done, track_all
 from nextview.data import measures as view_measures
 from nextview.data import rendering
 from nextview.data import store as view_store
@@ -14,21 +14,6 @@ from nextview.data.store import ViewStore
 from nextview.errors import DatasetError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.model_card import RECOGNISER, find_card
-
-NamedSplit = Literal["train", "test", "val"]
-
-
-@dataclass(frozen=True)
-class Workers:
-    """Processes and machines.
-
-    Attributes:
-        workers: number of processes; by default one for each core.
-        scheduler: address of a dask.distributed scheduler to use instead, as tcp://HOST:8786.
-    """
-
-    workers: int | None = None
-    scheduler: str | None = None
 
 
 def render(
@@ -157,30 +142,3 @@ def measure(
     )
     before, total = follow(steps, f"measuring {store.name}")
     say_done(store, "measured", before, total)
-
-
-def track_all(
-    done: Iterable[tuple[str, str | None]], total: int, what: str, before: int = 0
-) -> list[str]:
-    """Follow a job that yields what is done and why it failed, and print the reasons.
-
-    Args:
-        done: name of each item and None, or why it failed.
-        total: number of items.
-        what: name of the work.
-        before: number of items that were done before.
-
-    Returns:
-        The reasons.
-    """
-    failed: list[str] = []
-
-    def counts() -> Iterator[int]:
-        for n, (_, reason) in enumerate(done, before + 1):
-            failed.extend([reason] if reason else [])
-            yield n
-
-    track(counts(), total, what)
-    for reason in failed:
-        console.print(reason, style="yellow", soft_wrap=True)
-    return failed

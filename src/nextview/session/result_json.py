@@ -1,0 +1,84 @@
+"""The result of an episode as JSON."""
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from nextview.session.pose_json import pose_as_json
+from nextview.session.result import Recognition
+from nextview.session.view import View
+
+
+def episode_as_json(
+    result: Recognition, name: str, frames: Sequence[str] = (), indent: int | None = 1
+) -> str:
+    """Return all that the table shows, with complete beliefs and maps, as a JSON object.
+
+    Args:
+        result: of the episode.
+        name: of the object.
+        frames: names of the captured frames that were taken; empty for other cameras.
+        indent: of the text, in spaces; None for one line.
+
+    Returns:
+        The text.
+    """
+    views = []
+    for step, view in enumerate(result.views, 1):
+        one = _view_as_json(result, view)
+        one["threshold"] = float(result.stopping.threshold_at(step))
+        if frames:
+            one["frame"] = frames[step - 1]
+        views.append(one)
+
+    parts = ("answer", "confidence", "beliefs", "most_like", "unknown", "novelty", "radius")
+    whole = {"name": name} | {part: getattr(result, part) for part in parts}
+    whole |= pose_as_json(result)
+    whole |= {
+        "unit": None if result.radius is None else "m",
+        "threshold_reached": result.confident,
+        "views": views,
+    }
+    whole["warnings"] = sorted(warning.name for warning in result.warnings)
+    return json.dumps(plain(whole), indent=indent)
+
+
+def _view_as_json(result: Recognition, view: View) -> dict[str, Any]:
+    """One view: what was seen, what is believed, and where to look next."""
+    azimuth = None
+    if view.azimuth_bins is not None and view.observation.seen:
+        bins = view.azimuth_bins[view.belief.argmax()]
+        azimuth = {"degrees": 360 * int(bins.argmax()) / len(bins), "belief": bins.max()}
+
+    elevation, around = view.angles
+    return {
+        "view": view.index,
+        "elevation": elevation,
+        "azimuth": around,
+        "degrees_off": view.degrees_off,
+        "seen": view.observation.seen,
+        "alone": dict(zip(result.classes, view.alone, strict=True)),
+        "belief": dict(zip(result.classes, view.belief, strict=True)),
+        "azimuth_bin": azimuth,
+        "maps": view.maps,
+        "values": view.values,
+        "next_view": view.next_view,
+        "travel_cells": view.travel,
+        "travel_radians": view.arc,
+        "warnings": [warning.message for warning in view.warnings],
+    }
+
+
+def plain(value: Any) -> Any:
+    """As JSON has it: six digits, and null for what is no number."""
+    if isinstance(value, Mapping):
+        return {key: plain(each) for key, each in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [plain(each) for each in value]
+    if isinstance(value, float):
+        return round(value, 6) if np.isfinite(value) else None
+    return value
