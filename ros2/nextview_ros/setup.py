@@ -4,7 +4,7 @@ from setuptools import setup
 
 setup(
     name="nextview_ros",
-    version="0.3.0",
+    version="0.4.0",
     packages=["nextview_ros"],
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/nextview_ros"]),

@@ -38,7 +38,7 @@ from nextview.session.session import Session
 from nextview.session.system import System, load, recognise
 from nextview.session.view import View
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"
 
 __all__ = [
     "Camera",
