@@ -1,4 +1,4 @@
-"""Parts of a scene: pixels that nobody claims, objects that are one, the ground, what hides."""
+"""Parts of a scene: objects that are one, the ground, what hides, what floats."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -57,25 +57,6 @@ def judged_by(system):
         return [replace(track, result=one) for track, one in zip(tracks, results, strict=True)]
 
     return judged
-
-
-def test_pixels_that_nobody_claims_say_nothing_against_a_thing(system, meshes):
-    camera = camera_over([meshes["mug"]])
-    frame = camera.frame(view(20))
-    top = TableTop.of(frame, UP)
-    whole = max(top.segments(), key=np.count_nonzero)
-    columns = np.flatnonzero(whole.any(0))
-    half = whole.copy()
-    half[:, int(np.quantile(columns, 0.55)) :] = False  # the rest became nobody's
-
-    judged = judged_by(system)
-    alone = judged([new_track(half, Bench(top, 0, judged))])[0]
-    open_top = top.with_things([half])
-    opened = judged([new_track(half, Bench(open_top, 0, judged))])[0]
-    assert np.array_equal(open_top.around(half).depth > 0, (frame.depth > 0) & ~open_top.open)
-    assert open_top.open.sum() >= (whole & ~half).sum()
-    assert opened.result.answer == "mug"
-    assert alone.result.answer != "mug"  # what was seen there is not behind the mug, but of it
 
 
 def two_sides(system, camera, degrees=(20, 140)) -> tuple[list[list[Track]], list[Bench]]:

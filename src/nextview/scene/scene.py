@@ -231,7 +231,6 @@ class Scene:
         """Take in a frame that fits."""
         number = len(self._tops)
         segments = top.segments()
-        top = top.with_things(segments)
         bench = Bench(top, number, self._judged)
         there = [
             track for track, one in zip(self._tracks, found, strict=True) if not one.contradicts

@@ -136,7 +136,7 @@ class Track:
         Raises:
             ObservationError: too little is seen of the object.
         """
-        sighting = self.thing.sighting_of(top.around(mask), mask, top.plane, top.noise)
+        sighting = self.thing.sighting_of(top.frame, mask, top.plane, top.noise)
         kept = [
             (frame, one)
             for frame, one in zip(self.frames, self.thing.sightings, strict=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
@@ -45,7 +45,6 @@ class TableTop:
         above: pixels above the plane, before all walls and inside the region, (H, W) bool.
         free: pixels before all walls, (H, W) bool; None where there is no wall.
         height: of each pixel over the plane, (H, W) float32, metres.
-        open: pixels above the plane that are of no thing for now, (H, W) bool; None: of none.
     """
 
     frame: Frame
@@ -55,7 +54,6 @@ class TableTop:
     above: Mask
     free: Mask | None
     height: Float32
-    open: Mask | None = None
 
     @classmethod
     def of(
@@ -138,26 +136,6 @@ class TableTop:
             if self.is_thing(mask):
                 found.append(mask)
         return sorted(found, key=lambda mask: -np.count_nonzero(mask))
-
-    def with_things(self, masks: Sequence[Mask]) -> TableTop:
-        """The same where things are known; what is above the plane beside them is open.
-
-        Args:
-            masks: the pixels of each thing, (H, W) bool each.
-        """
-        taken = np.any(masks, axis=0) if len(masks) else np.zeros_like(self.above)
-        return replace(self, open=self.above & ~taken)
-
-    def around(self, mask: Mask) -> Frame:
-        """The frame as it tells of a thing: open pixels beside it say nothing, for or against it.
-
-        Args:
-            mask: the pixels of the thing, (H, W) bool.
-        """
-        if self.open is None:
-            return self.frame
-        depth = np.where(self.open & ~mask, np.float32(0), self.frame.depth)
-        return self.frame.with_depth(depth)
 
     def is_thing(self, mask: Mask) -> bool:
         """Whether some pixels, (H, W) bool, are enough, and high enough, to be a thing."""
