@@ -41,14 +41,11 @@ class Film:
         """The way that the arm has come, and a still of what it believes now."""
         if self.path is None:
             return
-        here = self.arm.joints
-        for way in self.arm.motions[self.filmed :]:
-            total = seconds_of(way)
-            for joints, done in evenly(way, int(np.ceil(total * SLOWER * RATE))):
-                self.arm.joints = joints
-                self.show(self.seconds + done * total)
-            self.seconds += total
-        self.arm.joints, self.filmed = here, len(self.arm.motions)
+        ways = self.arm.motions[self.filmed :]
+        for seconds in on_the_way(self.arm, ways, SLOWER * RATE):
+            self.show(self.seconds + seconds)
+        self.seconds += sum(seconds_of(way) for way in ways)
+        self.filmed = len(self.arm.motions)
         self.beside = beside(session)
         self.show(self.seconds)
         self.frames += [self.frames[-1]] * RATE
@@ -77,6 +74,28 @@ class Film:
             loop=0,
             optimize=True,
         )
+
+
+def on_the_way(arm, ways, rate):
+    """Put an arm where it was on its ways, frame after frame, and in the end where it is.
+
+    Args:
+        arm: that has come these ways.
+        ways: joints along each, one after the other.
+        rate: frames a second of motion.
+
+    Yields:
+        The seconds of motion until each frame.
+    """
+    here = arm.joints
+    passed = 0.0
+    for way in ways:
+        total = seconds_of(way)
+        for joints, done in evenly(way, int(np.ceil(total * rate))):
+            arm.joints = joints
+            yield passed + done * total
+        passed += total
+    arm.joints = here
 
 
 def evenly(way, n):

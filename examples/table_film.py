@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from contourpy import contour_generator
-from panda_film import evenly
+from panda_film import on_the_way
 from PIL import Image, ImageColor, ImageDraw
 from scipy import ndimage
 
@@ -83,14 +83,11 @@ class Film:
             owner: row of the thing that each object truly is, by its number.
             wrong: numbers of objects that are named wrongly.
         """
-        here = self.arm.joints
-        for way in self.arm.motions[self._filmed :]:
-            total = seconds_of(way)
-            for joints, done in evenly(way, int(np.ceil(total * SLOWER * RATE))):
-                self.arm.joints = joints
-                self._show(self._seconds + done * total)
-            self._seconds += total
-        self.arm.joints, self._filmed = here, len(self.arm.motions)
+        ways = self.arm.motions[self._filmed :]
+        for seconds in on_the_way(self.arm, ways, SLOWER * RATE):
+            self._show(self._seconds + seconds)
+        self._seconds += sum(seconds_of(way) for way in ways)
+        self._filmed = len(self.arm.motions)
 
         self._colour(scene, owner, wrong)
         self._beside = beside(scene, self._middle, wrong)

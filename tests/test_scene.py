@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from PIL import Image
 from scipy.spatial import cKDTree
+from small_tables import camera_over, meshes_of, view, without
 
 import nextview
 from nextview.cli.main import main
@@ -15,12 +16,9 @@ from nextview.errors import ObservationError
 from nextview.geometry.mesh import make_mesh
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box
-from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
-from nextview.things.memory import open_memory
+from nextview.simulation.tables import SimulatedTable, TableCamera
 
 NAMES = ("cracker_box", "mug", "banana", "tomato_soup_can")
-CENTRE = np.array([0, 0, 0.03])
 
 
 @pytest.fixture(scope="module")
@@ -30,31 +28,11 @@ def system():
 
 @pytest.fixture(scope="module")
 def meshes():
-    card, memory = open_memory("ycb")
-    names = [thing.name for thing in card.memory.things]
-
-    def mesh(name):
-        surface = memory.surfaces.surface(names.index(name), name)
-        return make_mesh(surface.vertices.astype(float), surface.faces, name, "m")
-
-    return {name: mesh(name) for name in NAMES}
-
-
-def camera_over(meshes, seed=5, sensor="stereo", gap=0.08) -> TableCamera:
-    rng = np.random.default_rng(seed)
-    return TableCamera(SimulatedTable.draw(meshes, rng, gap), SENSORS[sensor], rng)
-
-
-def view(degrees, elevation=50.0, distance=0.65) -> np.ndarray:
-    return poses_around(np.radians([degrees]), np.radians(elevation), distance, CENTRE)[0]
+    return meshes_of(NAMES)
 
 
 def by_name(scene) -> dict:
     return {thing.name: thing for thing in scene.objects}
-
-
-def without(table: SimulatedTable, name: str) -> SimulatedTable:
-    return SimulatedTable(tuple(thing for thing in table.things if thing.name != name))
 
 
 def test_all_things_are_found_named_and_placed_in_one_frame(system, meshes):

@@ -5,22 +5,18 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from small_tables import camera_over, meshes_of, view
 
 import nextview
-from nextview.geometry.mesh import make_mesh
 from nextview.scene.floating import floating
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import TableGround
 from nextview.scene.parting import Bench, merged, new_track, taken_over
 from nextview.scene.tracks import Track
 from nextview.sensing.tabletop import TableTop
-from nextview.simulation.sensor import SENSORS
-from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
-from nextview.things.memory import open_memory
 
 NAMES = ("cracker_box", "mug", "tomato_soup_can")
 UP = np.array([0, 0, 1.0])
-CENTRE = np.array([0, 0, 0.03])
 
 
 @pytest.fixture(scope="module")
@@ -30,23 +26,7 @@ def system():
 
 @pytest.fixture(scope="module")
 def meshes():
-    card, memory = open_memory("ycb")
-    names = [thing.name for thing in card.memory.things]
-
-    def mesh(name):
-        surface = memory.surfaces.surface(names.index(name), name)
-        return make_mesh(surface.vertices.astype(float), surface.faces, name, "m")
-
-    return {name: mesh(name) for name in NAMES}
-
-
-def camera_over(meshes, seed=5) -> TableCamera:
-    rng = np.random.default_rng(seed)
-    return TableCamera(SimulatedTable.draw(meshes, rng, 0.08), SENSORS["stereo"], rng)
-
-
-def view(degrees, elevation=50.0, distance=0.65) -> np.ndarray:
-    return poses_around(np.radians([degrees]), np.radians(elevation), distance, CENTRE)[0]
+    return meshes_of(NAMES)
 
 
 def judged_by(system):

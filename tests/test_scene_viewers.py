@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from test_scene import camera_over, view, without
+from small_tables import camera_over, meshes_of, view, without
 
 pytest.importorskip("rerun", reason="the extra 'record' is not installed")
 pytest.importorskip("viser", reason="the extra 'explore' is not installed")
@@ -12,8 +12,6 @@ from rerun.chunk import RrdReader
 
 import nextview
 from nextview.errors import ResultsError, SessionError, UsageError
-from nextview.geometry.mesh import make_mesh
-from nextview.things.memory import open_memory
 from nextview.viewers.page import serve
 from nextview.viewers.scene_page import draw_scene_in_3d, write_scene_page
 from nextview.viewers.scene_recording import SceneRecorder, record_scene
@@ -24,13 +22,7 @@ NAMES = ("cracker_box", "mug", "banana")
 @pytest.fixture(scope="module")
 def camera():
     """Over three known things."""
-    card, memory = open_memory("ycb")
-    names = [thing.name for thing in card.memory.things]
-    meshes = []
-    for name in NAMES:
-        surface = memory.surfaces.surface(names.index(name), name)
-        meshes.append(make_mesh(surface.vertices.astype(float), surface.faces, name, "m"))
-    return camera_over(meshes)
+    return camera_over(list(meshes_of(NAMES).values()))
 
 
 @pytest.fixture(scope="module")

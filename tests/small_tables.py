@@ -1,0 +1,42 @@
+"""Simulated tables with a few things of the bundled memory, and views of them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from nextview.geometry.mesh import Mesh, make_mesh
+from nextview.simulation.sensor import SENSORS
+from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
+from nextview.things.memory import open_memory
+
+CENTRE = np.array([0, 0, 0.03])
+
+
+def meshes_of(names: Sequence[str]) -> dict[str, Mesh]:
+    """Surfaces of the bundled memory, by name."""
+    card, memory = open_memory("ycb")
+    known = [thing.name for thing in card.memory.things]
+
+    def mesh(name):
+        surface = memory.surfaces.surface(known.index(name), name)
+        return make_mesh(surface.vertices.astype(float), surface.faces, name, "m")
+
+    return {name: mesh(name) for name in names}
+
+
+def camera_over(
+    meshes: Sequence[Mesh], seed: int = 5, sensor: str = "stereo", gap: float = 0.08
+) -> TableCamera:
+    """A camera over a table on which some things are put down at random."""
+    rng = np.random.default_rng(seed)
+    return TableCamera(SimulatedTable.draw(meshes, rng, gap), SENSORS[sensor], rng)
+
+
+def view(degrees: float, elevation: float = 50.0, distance: float = 0.65) -> np.ndarray:
+    """The pose of a camera that looks at the table's centre, (4, 4)."""
+    return poses_around(np.radians([degrees]), np.radians(elevation), distance, CENTRE)[0]
+
+
+def without(table: SimulatedTable, name: str) -> SimulatedTable:
+    """The same table after a thing was taken away."""
+    return SimulatedTable(tuple(thing for thing in table.things if thing.name != name))
