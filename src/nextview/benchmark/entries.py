@@ -31,7 +31,14 @@ from nextview.types import Index
 
 @dataclass(frozen=True)
 class EpisodeSpecs:
-    """The E episodes of every entry: the same objects from the same first views."""
+    """The E episodes of every entry: the same objects from the same first views.
+
+    Attributes:
+        predictions: of all objects from every view.
+        objects: object of each episode, (E,).
+        starts: first view of each, (E,).
+        scenes: what hides the objects; None for clear views.
+    """
 
     predictions: Predictions
     objects: Index

@@ -160,7 +160,17 @@ def rows(values: Any, n: int, below: int, what: str) -> Index:
 
 @dataclass(frozen=True)
 class EnvironmentTask:
-    """N objects, what is seen of them, and the rules."""
+    """N objects, what is seen of them, and the rules.
+
+    Attributes:
+        labels: true class of each object, (N,).
+        classes: names of the classes.
+        sphere: of the views.
+        calibration: from summed evidence to the belief.
+        observe: from objects, (A,), and views, (A,), to the evidence of each view.
+        rules: of an episode.
+        balanced: whether each class is drawn as often as every other one.
+    """
 
     labels: Index
     classes: tuple[str, ...]
@@ -276,7 +286,13 @@ def replayed(
 
 @dataclass
 class Asked:
-    """The policy of a cohort: goes to the free view nearest to the action."""
+    """The policy of a cohort: goes to the free view nearest to the action.
+
+    Attributes:
+        sphere: of the views.
+        views: that are asked for, one an episode.
+        needs: what it asks of the state of an episode, see ``Policy.needs``.
+    """
 
     sphere: ViewSphere
     views: Index
@@ -299,11 +315,16 @@ class Asked:
 
 @dataclass(frozen=True)
 class Seen:
-    """Observations, (A, D) float32, change of the objective and price, (A,), of A episodes.
+    """What A episodes show after their actions.
 
-    ``info`` has for each: "object", "view", "n_views", "travel" (cells so far), "answer", its
-    "confidence", "prediction_target" and "action_mask", the actions that lead to a view not taken
-    yet, (A, V) int8.
+    Attributes:
+        observation: (A, D) float32.
+        change: of the objective, (A,).
+        price: of the view and of the way to it, (A,).
+        ended: whether each episode is over, (A,) bool.
+        info: for each episode "object", "view", "n_views", "travel" (cells so far), "answer",
+            its "confidence", "prediction_target" and "action_mask", the actions that lead to
+            a view not taken yet, (A, V) int8.
     """
 
     observation: Float32

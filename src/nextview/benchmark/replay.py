@@ -32,7 +32,13 @@ class Trajectories:
     """Where E episodes went, up to K views, and what was believed after each.
 
     Attributes:
+        views: in order, (E, K).
+        answers: class that is most likely after each view, (E, K).
+        confidences: belief in it, (E, K).
+        travel: grid cells until each view, (E, K).
+        arc: radians until each view, (E, K).
         seen: views so far that showed anything.
+        fixed: whether all episodes take the same moves whatever is seen.
         beliefs: in all classes, (E, K, classes), for rules that look at more than one.
     """
 
@@ -222,7 +228,20 @@ def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcome:
 
 @dataclass(frozen=True)
 class Grid:
-    """Every entry under every threshold from the same first views, and the results."""
+    """Every entry under every threshold from the same first views, and the results.
+
+    Attributes:
+        specs: the episodes.
+        runs: episodes of each object.
+        thresholds: of the belief, at which an episode stops.
+        max_views: at most so many views are taken.
+        seed: of the first views and of the policies.
+        threshold_decay: by which the threshold falls from view to view; None: as it is by
+            default.
+        rule: that stops episodes instead of a threshold; None: a threshold does.
+        paths: of each entry, by its name.
+        failures: why an entry has no results, by its name.
+    """
 
     specs: EpisodeSpecs
     runs: int

@@ -68,7 +68,14 @@ class BenchmarkSettings:
 
 @dataclass(frozen=True)
 class Results:
-    """A folder of results: how it was run, from which predictions, and the tables."""
+    """A folder of results: how it was run, from which predictions, and the tables.
+
+    Attributes:
+        folder: that holds them.
+        settings: with which they were made.
+        predictions: that were replayed.
+        tables: the results.
+    """
 
     folder: Path
     settings: dict[str, Any]

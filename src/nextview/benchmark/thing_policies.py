@@ -36,7 +36,12 @@ SETTLED_BELIEF = 0.97  # in the truth, after which foresight looks for nothing b
 
 @dataclass(frozen=True)
 class RingSteps:
-    """Goes round the ring of the first view by equal steps, whatever is believed."""
+    """Goes round the ring of the first view by equal steps, whatever is believed.
+
+    Attributes:
+        sphere: of the views.
+        needs: what it asks of the state of an episode, see ``Policy.needs``.
+    """
 
     sphere: ViewSphere
     needs: tuple[str, ...] = ()
@@ -66,6 +71,7 @@ class FairCeiling:
 
     Attributes:
         episode: whose truth it knows.
+        needs: what it asks of the state of an episode, see ``Policy.needs``.
     """
 
     episode: ThingEpisode
@@ -107,6 +113,7 @@ class Foresight:
 
     Attributes:
         episode: whose views it knows.
+        needs: what it asks of the state of an episode, see ``Policy.needs``.
     """
 
     episode: ThingEpisode

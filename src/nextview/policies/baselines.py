@@ -28,6 +28,7 @@ class Baseline:
 
     Attributes:
         sphere: a ``ViewSphere``; for ``RandomAll`` any ``Viewpoints``.
+        needs: what it asks of the state of an episode, see ``Policy.needs``.
     """
 
     sphere: Any
@@ -114,7 +115,13 @@ class Unidirectional(Baseline):
 
 @dataclass(frozen=True)
 class Spread:
-    """The unvisited view farthest from all visited ones; ties are drawn."""
+    """The unvisited view farthest from all visited ones; ties are drawn.
+
+    Attributes:
+        sphere: the candidates, anywhere.
+        scope: where it may go.
+        needs: what it asks of the state of an episode, see ``Policy.needs``.
+    """
 
     sphere: Viewpoints
     scope: Scope = "global"
@@ -143,6 +150,11 @@ class MostVisible:
     """The free view with the highest expected visible share, less weighted travel.
 
     Ties are drawn.
+
+    Attributes:
+        sphere: the candidates, anywhere.
+        travel_weight: of a grid cell of travel, shares of the object.
+        needs: what it asks of the state of an episode, see ``Policy.needs``.
     """
 
     sphere: Viewpoints
@@ -177,6 +189,7 @@ class ViewList:
 
     Attributes:
         views: of each episode in order, (E, k); the first of them are the first views.
+        needs: what it asks of the state of an episode, see ``Policy.needs``.
     """
 
     views: Index

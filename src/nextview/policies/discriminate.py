@@ -47,10 +47,11 @@ class Discriminate:
 
     Attributes:
         viewpoints: the candidates, anywhere.
-        views: remembered views of each hypothesis, (H, rings, azimuths, F), unit vectors; zero
-            where nothing is known.
+        views: remembered views of each hypothesis, (H, rings, azimuths, F), unit vectors;
+            zero where nothing is known.
         classes: class of each hypothesis, (H,).
         travel_weight: of a grid cell of travel.
+        needs: what it asks of the state of an episode, see ``Policy.needs``.
     """
 
     viewpoints: Viewpoints

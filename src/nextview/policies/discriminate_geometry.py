@@ -27,6 +27,7 @@ class DiscriminateGeometry:
         viewpoints: the candidates, anywhere.
         goal: what is to be told: which "thing" it is, or its "pose" too.
         travel_weight: of a grid cell of travel, nats.
+        needs: what it asks of the state of an episode, see ``Policy.needs``.
     """
 
     viewpoints: Viewpoints

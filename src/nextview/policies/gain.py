@@ -209,11 +209,14 @@ class Gain:
     decide by ``features`` alone.
 
     Attributes:
+        sphere: of the views.
         classes: how many, C.
-        score: from features, (B, D) float32, to the value of each cell, (B, V): the mean over some
-            networks and over the object and its mirror image; each row by itself, to the last bit.
+        score: from features, (B, D) float32, to the value of each cell, (B, V): the mean over
+            some networks and over the object and its mirror image; each row by itself, to the
+            last bit.
         inputs: of which the features are made.
-        travel_weight: of a grid cell, in the unit of the values: log-belief for the bundled one.
+        travel_weight: of a grid cell, in the unit of the values: log-belief for the bundled
+            one.
         scope: where it may go.
         frame: in which cells are counted.
     """
@@ -292,6 +295,10 @@ class VisibleGain:
     The learned gain of a view tells only how much better it is than others. So a clear view is
     taken to bring, on the average, all that the belief still lacks: its entropy. Where everything
     shows it goes where the gain policy goes.
+
+    Attributes:
+        gain: the policy that values clear views.
+        travel_weight: of a grid cell of travel, in the unit of its values.
     """
 
     gain: Gain

@@ -35,7 +35,10 @@ class FixedSequence:
     A cell is relative to the view before.
 
     Attributes:
+        sphere: of the views.
         moves: cells, (rings, K).
+        scope: where it may go.
+        needs: what it asks of the state of an episode, see ``Policy.needs``.
     """
 
     sphere: ViewSphere
@@ -89,7 +92,14 @@ class FixedSequence:
 
 @dataclass(frozen=True)
 class FixedRing:
-    """Straight to one ring, then round it by the same number of azimuth steps each time."""
+    """Straight to one ring, then round it by the same number of azimuth steps each time.
+
+    Attributes:
+        sphere: of the views.
+        ring: that it goes to.
+        steps: of azimuth from view to view.
+        needs: what it asks of the state of an episode, see ``Policy.needs``.
+    """
 
     sphere: ViewSphere
     ring: int
@@ -125,7 +135,10 @@ class ClassTable:
     """The unvisited cell with the highest value for the believed class and current ring.
 
     Attributes:
+        sphere: of the views.
         values: by believed class, current ring and cell, (classes, rings, V).
+        scope: where it may go.
+        needs: what it asks of the state of an episode, see ``Policy.needs``.
     """
 
     sphere: ViewSphere

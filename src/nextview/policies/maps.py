@@ -47,8 +47,10 @@ class MapPeak:
     """The highest unvisited peak of a predicted map, or its deepest valley.
 
     Attributes:
+        sphere: of the views.
         map_name: in the evidence, (B, rings, 3).
-        valley_classes: those who are *believed* to be of one of these go to the lowest valley.
+        valley_classes: those who are *believed* to be of one of these go to the lowest
+            valley.
     """
 
     sphere: ViewSphere
@@ -103,6 +105,7 @@ class SpherePeak:
     from each view, on the network's grid.
 
     Attributes:
+        sphere: of the views.
         map_name: in the evidence, (B, rings, azimuths), columns once round from the view.
     """
 

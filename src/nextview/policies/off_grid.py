@@ -45,6 +45,11 @@ class OffGrid:
     around each view; a view counts only where all of them do, and where none counts the nearest
     free one is taken. Any other policy chooses among the cells that have a free view, and goes to
     the view nearest to the cell.
+
+    Attributes:
+        policy: that decides on the grid.
+        grid: that it was made for.
+        sphere: the candidates, anywhere.
     """
 
     policy: Policy

@@ -16,7 +16,10 @@ class OracleValley:
     """The map's peak, or its valley if the *true* class asks for it (section 4.2.3).
 
     Attributes:
+        sphere: of the views.
         labels: of each episode, (E,).
+        valley_classes: those of one of these go to the lowest valley.
+        map_name: in the evidence.
     """
 
     sphere: ViewSphere
@@ -54,7 +57,10 @@ class OracleMeasure:
     depth-entropy that of Parisotto et al.
 
     Attributes:
+        sphere: of the views.
         values: of each view in each episode, (E, V).
+        peaks: whether only peaks of the values count.
+        needs: what it asks of the state of an episode, see ``Policy.needs``.
     """
 
     sphere: ViewSphere
@@ -89,9 +95,14 @@ class OracleGain:
     """The view after which the belief in the true class is highest: one step ahead.
 
     Attributes:
+        sphere: of the views.
         log_evidence: of every view of every object, so that it adds up, (N, V, D).
+        classes: how many.
         labels: (N,).
         objects: of each episode, (E,).
+        scope: where it may go.
+        calibration: from summed evidence to the belief.
+        needs: what it asks of the state of an episode, see ``Policy.needs``.
     """
 
     sphere: ViewSphere
