@@ -271,9 +271,11 @@ def plugin_errors(error: Callable[[str], NextviewError]) -> Iterator[None]:
     except BaseException as raised:
         if os.environ.get(TRACEBACK):
             traceback.print_exception(raised)
+
         message = one_line(str(raised), 300)
         text = type(raised).__name__
         text += f": {message}" if message else ""
+
         frames = [
             f
             for f in traceback.extract_tb(raised.__traceback__)

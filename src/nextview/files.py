@@ -50,6 +50,7 @@ def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None
     """
     if path.is_symlink():
         raise ResultsError(f"{path}: is a link; give what it points to")
+
     if path.exists():
         kind = "pipe or a device"
         if path.is_dir():
@@ -60,6 +61,7 @@ def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None
             raise ResultsError(f"{path}: is a {kind}; give another name")
         if not overwrite and not (folder and not any(path.iterdir())):
             raise ResultsError(f"{path}: exists; give another name, or --overwrite to replace it")
+
     above = next(p for p in path.absolute().parents if p.exists())
     if not above.is_dir():
         raise ResultsError(f"{path}: cannot be written ({above} is not a folder)")

@@ -270,6 +270,7 @@ def _jobs(
 ) -> list[_Job]:
     """All episodes of a run."""
     setting = Setting(settings.sensor, settings.occlusion, settings.seed)
+
     return [
         _Job(
             models=models,

@@ -64,6 +64,7 @@ def run(episode: ThingEpisode, policy: Policy, count: int, rng: np.random.Genera
     made: dict[str, list[Any]] = {
         name: [] for name in ("right", "confidence", "decision", "verification", "pose_error")
     }
+
     while True:
         found, seconds = episode.verified(views)
         made["right"].append(int(found.belief.argmax()) == episode.thing)
@@ -72,6 +73,7 @@ def run(episode: ThingEpisode, policy: Policy, count: int, rng: np.random.Genera
         made["pose_error"].append(episode.pose_error(views))
         if len(views) == count:
             return ThingRun(views=views, **made)
+
         begun = time.process_time()
         state = episode.state(views, policy.needs)  # what is foreseen counts as its time
         view = int(policy.next_views(state, rng)[0])

@@ -305,10 +305,12 @@ def keep(
             if overwrite:
                 store.remove(name)
             store.add(name)
+
         held = np.all([store.held(name) for name in names], axis=0)
         items = np.flatnonzero(wanted & ~held).tolist()
         total = int(wanted.sum())
         work = partial(_keep_object, store.path, function)
+
         try:
             yield from counted(
                 work, items, total, lambda i: f"{path}: {store.names[i]}", workers, scheduler

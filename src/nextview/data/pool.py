@@ -3,7 +3,6 @@
 import io
 import multiprocessing
 import os
-import pickle
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -12,6 +11,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import spawn
 from multiprocessing.context import SpawnContext, SpawnProcess
+from multiprocessing.reduction import ForkingPickler
 from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
@@ -147,8 +147,8 @@ def _in_pool(
         pool.shutdown(cancel_futures=True)
 
 
-class _NamedModules(pickle.Pickler):
-    """Pickles, and remembers the modules of the functions and classes that it names."""
+class _NamedModules(ForkingPickler):
+    """Passes work on as a pool does, and remembers the modules of what it names."""
 
     def __init__(self) -> None:
         super().__init__(io.BytesIO())
@@ -164,7 +164,7 @@ def _of_script(function: Callable, items: Sequence[Any]) -> bool:
     """Whether a worker needs the script that runs.
 
     It does if the function, or what it is called with, is defined there: workers import the modules
-    that a pickle names.
+    that what is passed to them names.
     """
     pickler = _NamedModules()
     pickler.dump((function, items))

@@ -616,6 +616,7 @@ def _first_view(room: Room, rng: np.random.Generator) -> Float | None:
         else:
             distance = max(rng.uniform(*TABLE_DISTANCE), room.radius + CLOSEST_TO_SMALL)
             rise = np.sin(np.radians(rng.uniform(*TABLE_ELEVATION)))
+
         level = np.sqrt(1 - rise**2)
         direction = np.array([level * np.cos(azimuth), level * np.sin(azimuth), rise])
         aim = centre + rng.normal(0, AIM_OFF * distance, 3)

@@ -744,6 +744,7 @@ class ObservedObject:
     def _estimate(self, sightings: Sequence[Sighting], axes: Float) -> ObjectFrame:
         if self.known is not None:
             return self.known
+
         shown = np.array([np.count_nonzero(s.mask) for s in sightings])
         points = np.concatenate(
             [
@@ -759,6 +760,7 @@ class ObservedObject:
             floor = float(
                 np.median([axes[2] @ here - p.height(here) / (p.normal @ axes[2]) for p in planes])
             )
+
         return enclose(points, axes, floor)
 
     def _observe(self, sighting: Sighting, latest: ObjectFrame) -> Observation:
@@ -768,6 +770,7 @@ class ObservedObject:
         colour = _resampled(sighting.frame.colour, sighting.facets, facet)
         radius = latest.radius if self.life_size else None
         scene = _scene(sighting, pose, latest.radius)
+
         return Observation(
             depth,
             virtual_pose(pose),

@@ -45,6 +45,7 @@ class NearestViews:
         """
         found = np.empty((len(embeddings), self._views.shape[1]), np.float32)
         pairs = zip(np.asarray(embeddings, np.float32), shares, strict=True)
+
         for row, (embedding, share) in enumerate(pairs):
             rings = np.flatnonzero(share > 0)
             near = np.concatenate(

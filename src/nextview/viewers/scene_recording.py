@@ -64,13 +64,16 @@ class SceneRecorder:
         """Write what is new in a scene."""
         if not self._open:
             return
+
         for number in range(self._frames, len(scene.frames)):
             self._stream.set_time(FRAME_TIMELINE, sequence=number + 1)
             self._log_frame(scene, number)
         if len(scene.frames) == self._frames:
             return
+
         self._frames = len(scene.frames)
         objects = scene.objects
+
         for thing in objects:
             self._log_object(thing)
         for number in self._shown - {thing.number for thing in objects}:
