@@ -17,7 +17,16 @@ import numpy as np
 import trimesh
 
 NEXTVIEW = str(Path(sys.executable).with_name("nextview"))
-EXTRAS = ("torch", "pandas", "gymnasium", "viser", "rerun", "distributed", "pytest", "skimage")
+EXTRAS = (
+    "torch",
+    "pandas",
+    "gymnasium",
+    "viser",
+    "rerun",
+    "distributed",
+    "pytest",
+    "skimage",
+)
 # degrees by which a thing is turned over: to a side on which it rests
 OVER = {"rod": 90, "plate": 180, "angle": 90}
 MATPLOTLIB = {".cache", ".cache/matplotlib", ".config", ".config/matplotlib"}
@@ -29,7 +38,10 @@ def run(*arguments: object, status: int = 0) -> str:
     begun = time.monotonic()
     done = subprocess.run(command, capture_output=True, text=True)
     said = done.stdout + done.stderr
-    print(f"{time.monotonic() - begun:5.1f} s  nextview {' '.join(command[1:])}", flush=True)
+    print(
+        f"{time.monotonic() - begun:5.1f} s  nextview {' '.join(command[1:])}",
+        flush=True,
+    )
     assert done.returncode == status, said
     assert "Traceback" not in said, said
     return said
@@ -60,23 +72,41 @@ def learn_and_recognise() -> None:
     """Things are taught in each of their resting poses, and known lying on another side."""
     scans = Path("scans")
     scans.mkdir()
-    for (name, mesh), ending in zip(things().items(), ("ply", "stl", "obj"), strict=True):
+    for (name, mesh), ending in zip(
+        things().items(),
+        ("ply", "stl", "obj"),
+        strict=True,
+    ):
         mesh.export(scans / f"{name}.{ending}")
     run("learn", scans, "mine", "--unit", "m", "--workers", 0)
 
     card = json.loads(Path("mine/memory.json").read_text())
-    poses = np.bincount(card["calibration"]["hypotheses"], minlength=len(card["classes"]))
+    poses = np.bincount(
+        card["calibration"]["hypotheses"],
+        minlength=len(card["classes"]),
+    )
     poses = dict(zip(card["classes"], poses.tolist(), strict=True))
     assert set(poses) == set(things()), poses
     assert poses["rod"] > 1, f"a rod stands and lies: {poses}"
     assert poses["angle"] > 1, f"an angle rests on several sides: {poses}"
 
     for name, mesh in things().items():
-        turned = trimesh.transformations.rotation_matrix(np.radians(OVER[name]), (0, 1, 0))
+        turned = trimesh.transformations.rotation_matrix(
+            np.radians(OVER[name]),
+            (0, 1, 0),
+        )
         lying = mesh.copy().apply_transform(turned)
         for how, shown in (("as taught", mesh), ("on its side", lying)):
             shown.export("shown.ply")
-            found = recognised("shown.ply", "--models", "mine", "--unit", "m", "--start", 3)
+            found = recognised(
+                "shown.ply",
+                "--models",
+                "mine",
+                "--unit",
+                "m",
+                "--start",
+                3,
+            )
             assert found["most_like"] == name, f"{name} {how} is {found['most_like']}"
 
 
@@ -85,7 +115,14 @@ def look_at_samples() -> None:
     for name in ("chair", "table", "monitor"):
         found = recognised(f"samples/{name}.off", "--start", 3)
         assert found["answer"] == name, found["answer"]
-    said = run("recognise", "samples/chair.off", "--sensor", "wrist", "--figure", "episode.png")
+    said = run(
+        "recognise",
+        "samples/chair.off",
+        "--sensor",
+        "wrist",
+        "--figure",
+        "episode.png",
+    )
     assert "chair" in said
     assert Path("episode.png").stat().st_size > 50_000
     for _ in range(2):  # the second draws over the first
@@ -100,7 +137,16 @@ def sessions_with_frames() -> None:
         done = subprocess.run(command, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         assert name in done.stdout.splitlines()[-1], done.stdout
-    run("capture", "samples/chair.off", "captured", "--unit", "cm", "--table", "--viewpoints", 12)
+    run(
+        "capture",
+        "samples/chair.off",
+        "captured",
+        "--unit",
+        "cm",
+        "--table",
+        "--viewpoints",
+        12,
+    )
     assert recognised("captured")["answer"] == "chair"
 
 
@@ -111,16 +157,28 @@ def stores_and_predictions() -> None:
         place.mkdir(parents=True)
         Path(f"samples/{name}.off").rename(place / f"{name}.off")
     run("render", "shop", "views.zarr", "--size", 112, "--workers", 0)
-    assert "3 objects are sound, 0 damaged" in run("check", "views.zarr", "--workers", 0)
+    assert "3 objects are sound, 0 damaged" in run(
+        "check",
+        "views.zarr",
+        "--workers",
+        0,
+    )
     assert "3 objects" in run("predict", "views.zarr", "views.npz", "--workers", 0)
     assert "all 40 1.000" in run(
-        "predict", "views.zarr", "views.npz", "--workers", 0, "--overwrite"
+        "predict",
+        "views.zarr",
+        "views.npz",
+        "--workers",
+        0,
+        "--overwrite",
     )
     assert "DAMAGED" not in run("list", "models")
     said = run("benchmark", "views.npz", "results", status=2)
     assert "pip install 'nextview[benchmark]'" in said
     assert said.count("\n") == 1
-    assert run("train", "recogniser", "--help").startswith("usage: nextview train recogniser")
+    assert run("train", "recogniser", "--help").startswith(
+        "usage: nextview train recogniser"
+    )
     assert "recognise" in run("completion", "bash")
 
 
@@ -128,7 +186,9 @@ def nothing_unasked_is_written() -> None:
     """The home folder holds what matplotlib keeps of fonts, and nothing else."""
     home = Path(os.environ["HOME"])
     found = {path.relative_to(home).as_posix() for path in home.rglob("*")}
-    strange = {path for path in found - MATPLOTLIB if not path.startswith(".cache/matplotlib/")}
+    strange = {
+        path for path in found - MATPLOTLIB if not path.startswith(".cache/matplotlib/")
+    }
     assert not strange, f"in the home folder: {sorted(strange)}"
 
 

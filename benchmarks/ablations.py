@@ -41,7 +41,11 @@ VIEWS = (1, 2, 3, 5, 8, 15, 40)
 def accuracies(p: Predictions, calibration: Calibration) -> Float:
     """How often each object is named right after 1, 2, ... views, (V, N)."""
     return fused_views(
-        p.log_evidence, p.labels, calibration, np.random.default_rng(0), len(p.classes)
+        p.log_evidence,
+        p.labels,
+        calibration,
+        np.random.default_rng(0),
+        len(p.classes),
     )[0].mean(2)
 
 
@@ -56,7 +60,10 @@ def in_points(before: Float, after: Float, samples: int = 2000) -> str:
 
 
 def table(
-    before: Float, after: Float, labels: NDArray[np.int64], ways: tuple[str, str]
+    before: Float,
+    after: Float,
+    labels: NDArray[np.int64],
+    ways: tuple[str, str],
 ) -> Iterator[str]:
     """Accuracies (V, N) after some numbers of views, both ways, and their difference where there
     is one.
@@ -90,8 +97,14 @@ def bins_told(p: Predictions, store: ViewStore) -> tuple[float, float]:
     n = p.azimuth_bins.shape[3]
     v = len(p.sphere)
     rows = np.array([store.names.index(name) for name in p.names])
-    true = np.rint(azimuth_bins(store, n, mirror_planes(store, split_training(store)[0]))[rows])
-    features = p.azimuth_bins[np.arange(len(p))[:, None], np.arange(v), p.labels[:, None]].argmax(2)
+    true = np.rint(
+        azimuth_bins(store, n, mirror_planes(store, split_training(store)[0]))[rows]
+    )
+    features = p.azimuth_bins[
+        np.arange(len(p))[:, None],
+        np.arange(v),
+        p.labels[:, None],
+    ].argmax(2)
     off = (features - true) % n
     return float((off == 0).mean()), float((off % (n / 2) == 0).mean())
 
@@ -122,7 +135,12 @@ def agreement(
         after = accuracies(p, agreeing)
         print(
             "\n".join(
-                table(before, after, p.labels, ("logits alone", "agreeing on the azimuth bin"))
+                table(
+                    before,
+                    after,
+                    p.labels,
+                    ("logits alone", "agreeing on the azimuth bin"),
+                )
             )
             + "\n"
         )
@@ -146,7 +164,9 @@ def size(predictions: tyro.conf.Positional[Path]) -> None:
         raise PredictionsError(
             f"{predictions}: nothing is said of sizes; see nextview render --unit and fit size"
         )
-    if "test" not in p.splits:  # the test split counts as it is published, copies and all
+    if (
+        "test" not in p.splits
+    ):  # the test split counts as it is published, copies and all
         p = p.deduplicate()
     before, after = (accuracies(x, x.calibration) for x in (p.by_shape(), p))
     print(f"{len(p)} objects, split {p.splits[0]}:\n")
@@ -156,5 +176,6 @@ def size(predictions: tyro.conf.Positional[Path]) -> None:
 if __name__ == "__main__":
     with orderly_end("run it again"):
         tyro.extras.subcommand_cli_from_dict(
-            {"agreement": agreement, "size": size}, description=__doc__
+            {"agreement": agreement, "size": size},
+            description=__doc__,
         )

@@ -42,14 +42,27 @@ SPHERE = ViewSphere.named("40")
 
 
 def session(
-    scene: TargetScene, policy: str, models: str, start: int, views: int, seed: int
+    scene: TargetScene,
+    policy: str,
+    models: str,
+    start: int,
+    views: int,
+    seed: int,
 ) -> Recognition:
     """What a policy makes of a scene."""
     system = nextview.load(models, policy=policy)
     camera = RobotCamera(scene, named="box")
     rng = np.random.default_rng(seed)
     rule = FixedLength(max_views=views)
-    made = Session(system.models, system.policy, system.sphere, start, rule, rng, camera.object)
+    made = Session(
+        system.models,
+        system.policy,
+        system.sphere,
+        start,
+        rule,
+        rng,
+        camera.object,
+    )
     made.reachable = camera.reachable
     return made.run(camera)
 
@@ -98,7 +111,9 @@ def main(
         if e.split == split
     }
     if target not in files:
-        raise UsageError(f"{dataset}: no object of the split {split} is called {target}")
+        raise UsageError(
+            f"{dataset}: no object of the split {split} is called {target}"
+        )
     layout = draw_scene(
         files[target],
         Meshes(dataset, tuple(sorted(files.values()))),
@@ -111,10 +126,15 @@ def main(
     may = (shows >= SHOWS) & ~np.isin(np.arange(len(shows)), layout.unreachable)
     start = int(np.where(may, shows, np.inf).argmin())
     what = target.rpartition("_")[0].replace("_", " ")
-    with matplotlib.rc_context(FIGURE_STYLE | {"axes.grid": False, "axes.facecolor": PAPER}):
+    with matplotlib.rc_context(
+        FIGURE_STYLE | {"axes.grid": False, "axes.facecolor": PAPER}
+    ):
         figure = Figure((3.1 * (views + 1), 3.5 * len(policies)))
         axes = figure.subplots(
-            len(policies), views + 1, squeeze=False, gridspec_kw={"wspace": 0.06, "hspace": 0.2}
+            len(policies),
+            views + 1,
+            squeeze=False,
+            gridspec_kw={"wspace": 0.06, "hspace": 0.2},
         )
         for row, policy in zip(axes, policies, strict=True):
             found = session(scene, policy, models, start, views, seed)
@@ -123,7 +143,8 @@ def main(
                 axis.imshow(picture(scene, look_at_origin(elevation, azimuth)))
                 best = int(view.belief.argmax())
                 believed = (
-                    f"{found.classes[best].replace('_', ' ')} {100 * view.belief[best]:.0f} %"
+                    f"{found.classes[best].replace('_', ' ')} "
+                    f"{100 * view.belief[best]:.0f} %"
                 )
                 after = f"after {k} view{'s' * (k > 1)}: {believed}"
                 axis.set_title(
@@ -135,10 +156,19 @@ def main(
                 axis.set(xticks=[], yticks=[], xlim=(0, SIZE - 1), ylim=(SIZE - 1, 0))
                 axis.spines[:].set_visible(False)
             row[0].set_ylabel(
-                policy, fontsize=13, weight="bold", color=BLUE if policy != policies[0] else GREY
+                policy,
+                fontsize=13,
+                weight="bold",
+                color=BLUE if policy != policies[0] else GREY,
             )
             from_above(row[-1], scene, [view.direction for view in found.views])
-        figure.savefig(out, dpi=125, facecolor=PAPER, bbox_inches="tight", pad_inches=0.15)
+        figure.savefig(
+            out,
+            dpi=125,
+            facecolor=PAPER,
+            bbox_inches="tight",
+            pad_inches=0.15,
+        )
 
 
 if __name__ == "__main__":

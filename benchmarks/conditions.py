@@ -46,7 +46,12 @@ objects.
 class QuarterCut(SensedCamera):
     """Lacks a quarter of the object's width, or height, in every picture."""
 
-    def _cropped(self, depth: np.ndarray, mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def _cropped(
+        self,
+        depth: np.ndarray,
+        mask: np.ndarray,
+        rng: np.random.Generator,
+    ) -> np.ndarray:
         return super()._cropped(depth, mask, _Exactly(rng))
 
 
@@ -61,7 +66,9 @@ class _Exactly:
 
 
 def wrong_frame(
-    tilt: float = 0.0, centre: float = 0.0, size: float = 1.0
+    tilt: float = 0.0,
+    centre: float = 0.0,
+    size: float = 1.0,
 ) -> Callable[..., SensedCamera]:
     """A camera that takes the object to lean by so many degrees, to be so many radii away and so
     much larger.
@@ -72,7 +79,8 @@ def wrong_frame(
         towards = rng.normal(size=3)
         about = rng.uniform(0, 2 * np.pi)
         lean = Rotation.from_rotvec(
-            [tilt * np.cos(about), tilt * np.sin(about), 0], degrees=True
+            [tilt * np.cos(about), tilt * np.sin(about), 0],
+            degrees=True,
         ).as_matrix()
         off = centre * RENDER.radius * towards / np.linalg.norm(towards)
         camera.object_frame = ObjectFrame(off, size * RENDER.radius, lean)
@@ -83,7 +91,12 @@ def wrong_frame(
 
 def through(**errors: float) -> Callable[..., SensedCamera]:
     """A render with errors."""
-    return lambda mesh, rng, denoise: SensedCamera(mesh, replace(RENDER, **errors), rng, denoise)
+    return lambda mesh, rng, denoise: SensedCamera(
+        mesh,
+        replace(RENDER, **errors),
+        rng,
+        denoise,
+    )
 
 
 CONDITIONS: dict[str, Callable[..., Camera]] = {
@@ -95,7 +108,10 @@ CONDITIONS: dict[str, Callable[..., Camera]] = {
     "centre 0.15": wrong_frame(centre=0.15),
     "radius 1.25": wrong_frame(size=1.25),
     "quarter cut": lambda mesh, rng, denoise: QuarterCut(
-        mesh, replace(RENDER, crop=0.25), rng, denoise
+        mesh,
+        replace(RENDER, crop=0.25),
+        rng,
+        denoise,
     ),
     "boxes": through(boxes=BOXES),
 }
@@ -161,7 +177,13 @@ def system_of(models: str, policy: str, threshold: float, max_views: int) -> Sys
     """
     own = Path(models) / f"{policy}.json"
     chosen = str(own) if own.exists() else policy
-    return nextview.load(models, policy=chosen, threshold=threshold, max_views=max_views, threads=1)
+    return nextview.load(
+        models,
+        policy=chosen,
+        threshold=threshold,
+        max_views=max_views,
+        threads=1,
+    )
 
 
 def camera_of(name: str, mesh: Mesh, rng: np.random.Generator, denoise: bool) -> Camera:
@@ -171,7 +193,10 @@ def camera_of(name: str, mesh: Mesh, rng: np.random.Generator, denoise: bool) ->
     return SensedCamera(mesh, sensor_named(name), rng, denoise)
 
 
-def episodes(settings: Settings, item: tuple[int, Entry]) -> list[list[tuple[float, ...]]]:
+def episodes(
+    settings: Settings,
+    item: tuple[int, Entry],
+) -> list[list[tuple[float, ...]]]:
     """First view right, last belief right, views, travel, confidence, visible share: by models
     and condition.
     """
@@ -180,10 +205,20 @@ def episodes(settings: Settings, item: tuple[int, Entry]) -> list[list[tuple[flo
     start = int(np.random.default_rng([settings.seed, i]).integers(40))
     found = []
     for models in settings.models:
-        system = system_of(models, settings.policy, settings.threshold, settings.max_views)
+        system = system_of(
+            models,
+            settings.policy,
+            settings.threshold,
+            settings.max_views,
+        )
         rows = []
         for name, denoise in rows_of(settings):
-            camera = camera_of(name, mesh, np.random.default_rng([settings.seed, i, 1]), denoise)
+            camera = camera_of(
+                name,
+                mesh,
+                np.random.default_rng([settings.seed, i, 1]),
+                denoise,
+            )
             result = system.recognise(camera, start)
             first = (
                 system.classes[int(result.views[0].alone.argmax())]
@@ -196,7 +231,9 @@ def episodes(settings: Settings, item: tuple[int, Entry]) -> list[list[tuple[flo
                 else 1.0
             )
             right = first == entry.label, result.answer == entry.label
-            rows.append((*right, len(result.views), result.travel, result.confidence, shown))
+            rows.append(
+                (*right, len(result.views), result.travel, result.confidence, shown)
+            )
         found.append(rows)
     return found
 
@@ -211,12 +248,19 @@ def draw(table: dict[str, dict[str, tuple[float, float, float]]], path: Path) ->
     with matplotlib.rc_context(FIGURE_STYLE):
         figure = Figure((6.4, 4.6))
         axes = figure.subplots()
-        for k, ((models, rows), colour) in enumerate(zip(table.items(), SERIES, strict=False)):
+        for k, ((models, rows), colour) in enumerate(
+            zip(table.items(), SERIES, strict=False)
+        ):
             at = np.arange(len(rows)) + (k - (len(table) - 1) / 2) * 0.25
             value, low, high = np.array(list(rows.values())).T
             axes.hlines(at, low, high, lw=1.2, color=colour)
             axes.plot(value, at, "o", ms=4, color=colour, label=Path(models).name)
-        axes.set(yticks=range(len(rows)), yticklabels=list(rows), xlabel="accuracy", xlim=(None, 1))
+        axes.set(
+            yticks=range(len(rows)),
+            yticklabels=list(rows),
+            xlabel="accuracy",
+            xlim=(None, 1),
+        )
         axes.invert_yaxis()
         axes.legend()
         figure.tight_layout()
@@ -226,13 +270,20 @@ def draw(table: dict[str, dict[str, tuple[float, float, float]]], path: Path) ->
 def main(settings: Settings) -> None:
     unknown = [name for name in settings.conditions if name not in CONDITIONS]
     if unknown:
-        raise SystemExit(f"there is no condition {unknown[0]!r}; there are {', '.join(CONDITIONS)}")
+        raise SystemExit(
+            f"there is no condition {unknown[0]!r}; there are {', '.join(CONDITIONS)}"
+        )
     for text in settings.sensors:
         sensor_named(text)  # says what is wrong with it
     entries = [e for e in list_dataset(settings.dataset) if e.split == settings.split]
     if settings.split == "train":
         kept = set(
-            system_of(settings.models[0], settings.policy, 0.97, 5).models.recogniser.card.held_out
+            system_of(
+                settings.models[0],
+                settings.policy,
+                0.97,
+                5,
+            ).models.recogniser.card.held_out
         )
         entries = [e for e in entries if e.name in kept]
     entries = entries[:: max(1, len(entries) // settings.objects)][: settings.objects]
@@ -240,10 +291,14 @@ def main(settings: Settings) -> None:
 
     def run() -> Iterator[int]:
         for (_, entry), rows in each(
-            partial(episodes, settings), list(enumerate(entries)), settings.workers
+            partial(episodes, settings),
+            list(enumerate(entries)),
+            settings.workers,
         ):
             if isinstance(rows, WorkerDied):
-                raise nextview.NextviewError(f"{entry.path}: cannot be recognised ({rows})")
+                raise nextview.NextviewError(
+                    f"{entry.path}: cannot be recognised ({rows})"
+                )
             found.append(rows)
             yield len(found)
 
@@ -279,7 +334,9 @@ def main(settings: Settings) -> None:
                 f"{shown.mean():.2f}",
             ]
             for share in (single, right):
-                low, high = binomtest(int(share.sum()), len(share)).proportion_ci(method="wilson")
+                low, high = binomtest(int(share.sum()), len(share)).proportion_ci(
+                    method="wilson"
+                )
                 cells.append(f"{share.mean():.3f} ({low:.3f}-{high:.3f})")
             cells += [
                 f"{views.mean():.2f}",
@@ -289,7 +346,11 @@ def main(settings: Settings) -> None:
             ]
             print(f"| {' | '.join(cells)} |")
             if denoise:
-                table.setdefault(models, {})[name] = float(right.mean()), float(low), float(high)
+                table.setdefault(models, {})[name] = (
+                    float(right.mean()),
+                    float(low),
+                    float(high),
+                )
     if settings.figure:
         draw(table, settings.figure)
 

@@ -22,7 +22,17 @@ from nextview.benchmark.statistics import holm
 from nextview.benchmark.thing_tables import ALL, FAR_POSE, POSE_AFTER
 from nextview.errors import UsageError
 
-COLUMNS = ("set", "policy", "right after 1", "2", "3", "5", "points after 2", "until sure", "fewer")
+COLUMNS = (
+    "set",
+    "policy",
+    "right after 1",
+    "2",
+    "3",
+    "5",
+    "points after 2",
+    "until sure",
+    "fewer",
+)
 COLUMNS += ("wrong, of the sure", "pose, mm: median, 95 %", "its change")
 SURE = "views until sure"
 
@@ -40,7 +50,9 @@ def read_runs(runs: list[Path]) -> tuple[pd.DataFrame, pd.DataFrame]:
         if not (run / "tests.csv").is_file():
             raise UsageError(f"{run}: holds no results of nextview benchmark-things")
     measures = [pd.read_csv(run / "measures.csv").assign(set=run.name) for run in runs]
-    tests = pd.concat([pd.read_csv(run / "tests.csv").assign(set=run.name) for run in runs])
+    tests = pd.concat(
+        [pd.read_csv(run / "tests.csv").assign(set=run.name) for run in runs]
+    )
     tests["p_holm"] = holm(tests["p"].to_numpy(np.float64))
     return pd.concat(measures), tests
 
@@ -97,10 +109,14 @@ def main(runs: tyro.conf.Positional[list[Path]], things: str = ALL) -> None:
     for run in runs:
         own = measures[(measures["set"] == run.name) & (measures["things"] == things)]
         apart = tests[(tests["set"] == run.name) & (tests["things"] == things)]
-        reference = own[(own["policy"] == "random") & (own["measure"] == SURE)]["value"].item()
+        reference = own[(own["policy"] == "random") & (own["measure"] == SURE)][
+            "value"
+        ].item()
         for policy in own["policy"].unique():
             cells = row_of(
-                own[own["policy"] == policy], apart[apart["policy"] == policy], reference
+                own[own["policy"] == policy],
+                apart[apart["policy"] == policy],
+                reference,
             )
             print("| " + " | ".join([run.name, policy, *cells]) + " |")
 

@@ -38,7 +38,11 @@ def flops(card: ModelCard, shape: tuple[int, ...]) -> float:
     and matrix products.
     """
     model = onnx.load(card.path)
-    for size, dimension in zip(shape, model.graph.input[0].type.tensor_type.shape.dim, strict=True):
+    for size, dimension in zip(
+        shape,
+        model.graph.input[0].type.tensor_type.shape.dim,
+        strict=True,
+    ):
         dimension.Clear()
         dimension.dim_value = size
     graph = shape_inference.infer_shapes(model, data_prop=True).graph
@@ -51,7 +55,9 @@ def flops(card: ModelCard, shape: tuple[int, ...]) -> float:
     for node in graph.node:
         if node.op_type == "Conv":
             total += (
-                2 * int(np.prod(known[node.output[0]])) * int(np.prod(known[node.input[1]][1:]))
+                2
+                * int(np.prod(known[node.output[0]]))
+                * int(np.prod(known[node.input[1]][1:]))
             )
         elif node.op_type in ("Gemm", "MatMul"):
             deep = known[node.input[0]][-1]
@@ -61,16 +67,28 @@ def flops(card: ModelCard, shape: tuple[int, ...]) -> float:
 
 def matrix_product(threads: int) -> Callable[[], object]:
     """One product of two square matrices in single precision by ONNX Runtime."""
-    pair = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [SIDE, SIDE]) for name in "ab"]
+    pair = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, [SIDE, SIDE])
+        for name in "ab"
+    ]
     out = helper.make_tensor_value_info("c", TensorProto.FLOAT, [SIDE, SIDE])
     graph = helper.make_graph(
-        [helper.make_node("MatMul", ["a", "b"], ["c"])], "product", pair, [out]
+        [helper.make_node("MatMul", ["a", "b"], ["c"])],
+        "product",
+        pair,
+        [out],
     )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=8)
+    model = helper.make_model(
+        graph,
+        opset_imports=[helper.make_opsetid("", 18)],
+        ir_version=8,
+    )
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     session = ort.InferenceSession(
-        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+        model.SerializeToString(),
+        options,
+        providers=["CPUExecutionProvider"],
     )
     rng = np.random.default_rng(0)
     values = {name: rng.random((SIDE, SIDE), np.float32) for name in "ab"}
@@ -88,7 +106,12 @@ def seconds(run: Callable[[], object], rounds: int) -> NDArray[np.float64]:
     return np.array(found)
 
 
-def main(models: tuple[str, ...] = (), threads: int = 2, rounds: int = 200, seed: int = 0) -> None:
+def main(
+    models: tuple[str, ...] = (),
+    threads: int = 2,
+    rounds: int = 200,
+    seed: int = 0,
+) -> None:
     """Print the table.
 
     Args:
@@ -112,7 +135,9 @@ def main(models: tuple[str, ...] = (), threads: int = 2, rounds: int = 200, seed
             seen = rng.integers(0, 256, (1, channels, size, size), np.uint8)
         values = {session.get_inputs()[0].name: seen}
         work = flops(card, seen.shape)
-        limit = 2 * SIDE**3 / np.median(seconds(product, 5))  # beside each network: clocks change
+        limit = (
+            2 * SIDE**3 / np.median(seconds(product, 5))
+        )  # beside each network: clocks change
         took = seconds(lambda s=session, v=values: s.run(None, v), rounds)  # type: ignore[misc]
         rate = work / np.median(took)
         share = f"{rate / limit:.2f} of {limit / 1e9:.0f}"

@@ -79,7 +79,12 @@ class Place:
         up = np.array([0.0, 0.0, 1.0])
         return np.stack([self.outward, np.cross(up, self.outward), up], 1)
 
-    def put(self, part: trimesh.Trimesh, outward: float = 0.0, up: float = 0.0) -> trimesh.Trimesh:
+    def put(
+        self,
+        part: trimesh.Trimesh,
+        outward: float = 0.0,
+        up: float = 0.0,
+    ) -> trimesh.Trimesh:
         """A part whose x axis points outward, moved here and some metres farther."""
         moved = part.copy()
         pose = np.eye(4)
@@ -107,7 +112,11 @@ def _tube(centres: Float, radius: float) -> trimesh.Trimesh:
     for ball, centre in zip(parts, centres, strict=True):
         ball.apply_translation(centre)
     for begin, end in pairwise(centres):
-        rod = trimesh.creation.cylinder(radius=radius, segment=[begin, end], sections=16)
+        rod = trimesh.creation.cylinder(
+            radius=radius,
+            segment=[begin, end],
+            sections=16,
+        )
         parts.append(rod)
     return trimesh.util.concatenate(parts)
 
@@ -153,7 +162,9 @@ def hole(body: trimesh.Trimesh, place: Place) -> Pair:
     radius = max(0.008, 0.055 * _size(body))
     depth = 1.5 * radius
     corners = (body.triangles - place.point) @ place.axes
-    inside = (np.hypot(corners[..., 1], corners[..., 2]) < radius) & (corners[..., 0] > -depth)
+    inside = (np.hypot(corners[..., 1], corners[..., 2]) < radius) & (
+        corners[..., 0] > -depth
+    )
     fine = body.copy()
     fine.update_faces(~inside.all(1))
 
@@ -199,7 +210,9 @@ def place_on_side(body: trimesh.Trimesh, rng: np.random.Generator) -> Place | No
     aim[2] = low[2] + height * (high[2] - low[2])
     start = aim + 2 * _size(body) * outward
 
-    scene = embree_scene([(body.vertices.astype(np.float32), body.faces.astype(np.int32))])
+    scene = embree_scene(
+        [(body.vertices.astype(np.float32), body.faces.astype(np.int32))]
+    )
     ray = np.ascontiguousarray(-outward[None], np.float32)
     hits = scene.run(np.ascontiguousarray(start[None], np.float32), ray, output=1)
     if hits["primID"][0] < 0:
@@ -212,7 +225,9 @@ def place_on_side(body: trimesh.Trimesh, rng: np.random.Generator) -> Place | No
 
 def depth_pictures(mesh: trimesh.Trimesh, centre: Float, radius: float) -> Float:
     """Exact depth from the 40 views, (40, PICTURE_SIDE ** 2), metres; infinity beside the mesh."""
-    scene = embree_scene([(mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))])
+    scene = embree_scene(
+        [(mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))]
+    )
     matrix = pinhole(PICTURE_SIDE, RADII_AWAY / 1.3)
     at = (np.arange(PICTURE_SIDE) + 0.5 - matrix[0, 2]) / matrix[0, 0] / 1.02
     x, y = np.meshgrid(at, at)
@@ -221,7 +236,10 @@ def depth_pictures(mesh: trimesh.Trimesh, centre: Float, radius: float) -> Float
     for pose in VIEWPOINTS.poses:
         origin = centre + RADII_AWAY * radius * pose[:3, 3] / VIEWPOINTS.distance
         directions = np.ascontiguousarray(rays @ pose[:3, :3].T, np.float32)
-        starts = np.ascontiguousarray(np.broadcast_to(origin, directions.shape), np.float32)
+        starts = np.ascontiguousarray(
+            np.broadcast_to(origin, directions.shape),
+            np.float32,
+        )
         hits = scene.run(starts, directions, output=1)
         pictures.append(np.where(hits["primID"] >= 0, hits["tfar"], np.inf))
     return np.stack(pictures)
@@ -278,7 +296,12 @@ class Made:
     meshes: Pair
 
 
-def make_pairs(scans: list[Path], models: list[Path], count: int, seed: int) -> list[Made]:
+def make_pairs(
+    scans: list[Path],
+    models: list[Path],
+    count: int,
+    seed: int,
+) -> list[Made]:
     """Draw bodies, changes and places until there are enough pairs."""
     rng = np.random.default_rng(seed)
     scans = [scans[k] for k in rng.permutation(len(scans))]
@@ -289,7 +312,9 @@ def make_pairs(scans: list[Path], models: list[Path], count: int, seed: int) -> 
         scan = not models or number % 2 == 0
         files = scans if scan else models
         if not files:
-            raise UsageError(f"there are bodies for {number} pairs only, not for {count}")
+            raise UsageError(
+                f"there are bodies for {number} pairs only, not for {count}"
+            )
         path = files.pop()
         body = body_of(path, scan)
         if body is None:
@@ -312,7 +337,9 @@ def make_pairs(scans: list[Path], models: list[Path], count: int, seed: int) -> 
 
 
 def _changed(
-    body: trimesh.Trimesh, change: str, rng: np.random.Generator
+    body: trimesh.Trimesh,
+    change: str,
+    rng: np.random.Generator,
 ) -> tuple[Pair, float] | None:
     """A pair of a body that differs in the wanted share of the views; None if no place was
     found.
@@ -342,11 +369,13 @@ def draw(made: list[Made], path: Path) -> None:
         both = _joined(*pair.meshes)
         centre = both.bounds.mean(0)
         radius = float(np.linalg.norm(both.vertices - centre, axis=1).max())
-        pictures = np.stack([depth_pictures(mesh, centre, radius) for mesh in pair.meshes])
+        pictures = np.stack(
+            [depth_pictures(mesh, centre, radius) for mesh in pair.meshes]
+        )
         with np.errstate(invalid="ignore"):
-            different = ~(np.abs(pictures[0] - pictures[1]) < DIFFERENT_DEPTH) & np.isfinite(
-                pictures
-            ).any(0)
+            different = ~(
+                np.abs(pictures[0] - pictures[1]) < DIFFERENT_DEPTH
+            ) & np.isfinite(pictures).any(0)
         view = int(different.sum(1).argmax())
         for which in (0, 1):
             image = pictures[which, view].reshape(PICTURE_SIDE, PICTURE_SIDE)

@@ -65,7 +65,13 @@ from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.teaching.memory_fit import size_evidence
 from nextview.teaching.thing_views import COARSER, embeddings
-from nextview.things.memory import AZIMUTHS, RINGS, THING_PICTURE, Memory, TaughtRecogniser
+from nextview.things.memory import (
+    AZIMUTHS,
+    RINGS,
+    THING_PICTURE,
+    Memory,
+    TaughtRecogniser,
+)
 from nextview.things.stored_surfaces import StoredSurfaces
 from nextview.things.surface import FINEST_ERROR, Surface
 from nextview.things.taught import TaughtThings
@@ -119,13 +125,19 @@ def make(
             factors = np.exp(rng.uniform(*bounds, 3)) if turn else np.ones(3)
             file = files[which]
             surface = Surface.from_mesh(load_mesh(file, unit="m"), file.stem)
-            stretched = trimesh.Trimesh(surface.vertices * factors, surface.faces, process=False)
+            stretched = trimesh.Trimesh(
+                surface.vertices * factors,
+                surface.faces,
+                process=False,
+            )
             stretched.export(part / f"{turn:02d}_{file.stem}.ply")
     print(f"{count} things in {out}")
 
 
 def teach(
-    things: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path], first: int = 1000
+    things: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
+    first: int = 1000,
 ) -> None:
     """Teach the things coarsely.
 
@@ -205,7 +217,11 @@ def join(out: Path, names: Sequence[str], found: Sequence[dict[str, NDArray]]) -
         classes=tuple(names),
         azimuth_bins=AZIMUTHS,
         calibration=bundled.calibration.__class__(
-            1.0, 1.0, None, bundled.calibration.bin_correlation, tuple(range(count))
+            1.0,
+            1.0,
+            None,
+            bundled.calibration.bin_correlation,
+            tuple(range(count)),
         ),
         size=size_evidence(radii, np.arange(count)),
         training=Training(f"{count} things"),
@@ -283,18 +299,30 @@ def measure(
         if file is not None and file.exists():
             outcomes += read_record(file, Found, "what was found of a thing").outcomes
             continue
-        found = shown(known, things, thing, sensor, np.random.default_rng([seed, thing]))
+        found = shown(
+            known,
+            things,
+            thing,
+            sensor,
+            np.random.default_rng([seed, thing]),
+        )
         outcomes += found
         if file is not None:
             write_record(file, Found(tuple(found)))
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    print(f"{len(known.names)} things; loaded in {loaded:.1f} s; at most {peak:.2f} GB of memory")
+    print(
+        f"{len(known.names)} things; loaded in {loaded:.1f} s; at most {peak:.2f} GB of memory"
+    )
     print(*table(outcomes), sep="\n")
 
 
 def shown(
-    known: TaughtThings, things: Path, thing: int, sensor: str, rng: np.random.Generator
+    known: TaughtThings,
+    things: Path,
+    thing: int,
+    sensor: str,
+    rng: np.random.Generator,
 ) -> list[Outcome]:
     """Show a thing, and recognise it after one view and after two."""
     mesh = load_mesh(things / f"{known.names[thing]}.ply", unit="m")
@@ -320,14 +348,21 @@ def shown(
         evidence.append(known.log_evidence([observation])[0])
         found = known.verify(observations, np.stack(evidence))
         seconds = time.process_time() - begun
-        outcomes.append(outcome(known, found, thing, true_pose, len(observations), seconds))
+        outcomes.append(
+            outcome(known, found, thing, true_pose, len(observations), seconds)
+        )
         if len(observations) == max(VIEWS):
             break
     return outcomes
 
 
 def outcome(
-    known: TaughtThings, found: Verified, thing: int, true_pose: Float, views: int, seconds: float
+    known: TaughtThings,
+    found: Verified,
+    thing: int,
+    true_pose: Float,
+    views: int,
+    seconds: float,
 ) -> Outcome:
     """Compare what was found with the truth."""
     answer = int(found.belief.argmax())

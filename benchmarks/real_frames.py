@@ -81,12 +81,18 @@ def memory_with_surfaces(models: str, scans: Path) -> TaughtThings:
             f"{scans}: holds no scan of {missing[0]}, and of {len(missing) - 1} other things"
         )
 
-    whole = [Surface.from_mesh(load_mesh(files[name], unit="m"), name) for name in names]
+    whole = [
+        Surface.from_mesh(load_mesh(files[name], unit="m"), name) for name in names
+    ]
     return TaughtThings(recogniser, [surface.simplified() for surface in whole])
 
 
 def outline(
-    things: TaughtThings, found: Verified, hypothesis: int, view: Observation, frame: Frame
+    things: TaughtThings,
+    found: Verified,
+    hypothesis: int,
+    view: Observation,
+    frame: Frame,
 ) -> Mask:
     """The pixels of a frame in which the scan of a hypothesis shows."""
     assert view.scene is not None
@@ -100,18 +106,27 @@ def outline(
     focal = frame.intrinsics[[0, 1], [0, 1]]
     x = (columns + 0.5 - frame.intrinsics[0, 2]) / focal[0]
     y = (rows + 0.5 - frame.intrinsics[1, 2]) / focal[1]
-    rays = np.stack([x, y, np.ones(frame.shape)], -1).reshape(-1, 3) @ view.scene.pose[:3, :3].T
+    rays = (
+        np.stack([x, y, np.ones(frame.shape)], -1).reshape(-1, 3)
+        @ view.scene.pose[:3, :3].T
+    )
 
     origin = (view.scene.pose[:3, 3] * view.radius - place) @ turn
     thing = found.things[hypothesis : hypothesis + 1]
     depth, _ = caster.cast(
-        thing, origin[None].astype(np.float32), (rays @ turn)[None].astype(np.float32)
+        thing,
+        origin[None].astype(np.float32),
+        (rays @ turn)[None].astype(np.float32),
     )
     return np.isfinite(depth[0]).reshape(frame.shape)
 
 
 def name_one(
-    things: TaughtThings, name: str, label: Mask, frame: Frame, given: dict[str, Frame | str]
+    things: TaughtThings,
+    name: str,
+    label: Mask,
+    frame: Frame,
+    given: dict[str, Frame | str],
 ) -> Named | None:
     """Name the thing of a label, which is given by a point or by a mask; None where it is not
     found.
@@ -119,8 +134,18 @@ def name_one(
     by = str(given["by"])
     shown = label & (frame.depth > 0)
     point = np.median(frame.positions(*np.nonzero(shown)), axis=0)
-    thing = ObservedObject(up=None, point=point) if by == "point" else ObservedObject(up=None)
-    masked = Frame(frame.depth, frame.intrinsics, np.eye(4), mask=label, pixel_centre=0.5)
+    thing = (
+        ObservedObject(up=None, point=point)
+        if by == "point"
+        else ObservedObject(up=None)
+    )
+    masked = Frame(
+        frame.depth,
+        frame.intrinsics,
+        np.eye(4),
+        mask=label,
+        pixel_centre=0.5,
+    )
     try:
         view = thing.add(frame if by == "point" else masked)
     except ObservationError as error:
@@ -151,11 +176,16 @@ def name_one(
 
 
 def named_in(
-    things: TaughtThings, path: Path, names: list[str], intrinsics: NDArray[np.float64]
+    things: TaughtThings,
+    path: Path,
+    names: list[str],
+    intrinsics: NDArray[np.float64],
 ) -> Iterator[Named]:
     """All things of one frame, by a point and by a mask."""
     depth = np.asarray(Image.open(path))
-    labels = np.asarray(Image.open(path.with_name(path.name.replace("depth", "labels"))))
+    labels = np.asarray(
+        Image.open(path.with_name(path.name.replace("depth", "labels")))
+    )
     frame = Frame(depth, intrinsics, np.eye(4))
     for number, name in enumerate(names[1:], 1):
         label = labels == number
@@ -163,7 +193,11 @@ def named_in(
             continue
         for by in ("point", "mask"):
             found = name_one(
-                things, name, label, frame, {"name": path.name.split(".")[0], "by": by}
+                things,
+                name,
+                label,
+                frame,
+                {"name": path.name.split(".")[0], "by": by},
             )
             if found is not None:
                 yield found
@@ -189,7 +223,9 @@ def main(
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
     found: list[Named] = []
-    print("| frame | thing | given by | features | verified | belief | residual | overlap |")
+    print(
+        "| frame | thing | given by | features | verified | belief | residual | overlap |"
+    )
     print("|---|---|---|---|---|---|---|---|")
     for path in sorted(folder.glob("*.depth.png")):
         for each in named_in(things, path, names, matrix):

@@ -114,7 +114,9 @@ def one_process(files: list[str]) -> Cost:
     began = now()
     for file in files:
         render_object(
-            SimulatedCamera(load_mesh(file), SIZE, DISTANCE), ViewSphere.named("40"), SIZE
+            SimulatedCamera(load_mesh(file), SIZE, DISTANCE),
+            ViewSphere.named("40"),
+            SIZE,
         )
     return now() - began, 0
 
@@ -147,7 +149,12 @@ def open3d_window(files: list[str]) -> Cost:
     window.create_window(width=SIZE, height=SIZE, visible=False)
     camera = o3d.camera.PinholeCameraParameters()
     camera.intrinsic = o3d.camera.PinholeCameraIntrinsic(
-        SIZE, SIZE, FOCAL, FOCAL, SIZE / 2 - 0.5, SIZE / 2 - 0.5
+        SIZE,
+        SIZE,
+        FOCAL,
+        FOCAL,
+        SIZE / 2 - 0.5,
+        SIZE / 2 - 0.5,
     )
     seconds = np.zeros(2)
     with tempfile.TemporaryDirectory() as folder:
@@ -155,7 +162,8 @@ def open3d_window(files: list[str]) -> Cost:
             vertices, faces = read(file)
             began = now()
             mesh = o3d.geometry.TriangleMesh(
-                o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces)
+                o3d.utility.Vector3dVector(vertices),
+                o3d.utility.Vector3iVector(faces),
             )
             mesh.compute_vertex_normals()
             window.clear_geometries()
@@ -163,7 +171,8 @@ def open3d_window(files: list[str]) -> Cost:
             for view, pose in enumerate(poses()):
                 camera.extrinsic = np.linalg.inv(pose)
                 window.get_view_control().convert_from_pinhole_camera_parameters(
-                    camera, allow_arbitrary=True
+                    camera,
+                    allow_arbitrary=True,
                 )
                 window.poll_events()
                 window.update_renderer()
@@ -171,16 +180,21 @@ def open3d_window(files: list[str]) -> Cost:
                 depth = np.asarray(window.capture_depth_float_buffer(True))
                 assert image.any(), "the window shows nothing"
                 cloud = o3d.geometry.PointCloud.create_from_depth_image(
-                    o3d.geometry.Image(depth), camera.intrinsic, camera.extrinsic, depth_scale=1.0
+                    o3d.geometry.Image(depth),
+                    camera.intrinsic,
+                    camera.extrinsic,
+                    depth_scale=1.0,
                 )
                 if len(cloud.points) > 1024:
                     cloud = cloud.random_down_sample(1024 / len(cloud.points))
                 name = f"{folder}/{number}_{view}"
                 o3d.io.write_image(
-                    f"{name}.png", o3d.geometry.Image((255 * image).astype(np.uint8))
+                    f"{name}.png",
+                    o3d.geometry.Image((255 * image).astype(np.uint8)),
                 )
                 o3d.io.write_image(
-                    f"{name}_depth.png", o3d.geometry.Image((1e4 * depth).astype(np.uint16))
+                    f"{name}_depth.png",
+                    o3d.geometry.Image((1e4 * depth).astype(np.uint16)),
                 )
                 o3d.io.write_point_cloud(f"{name}.ply", cloud)
             seconds += now() - began
@@ -194,7 +208,14 @@ def pyrender_offscreen(files: list[str]) -> Cost:
     import trimesh
 
     renderer = pyrender.OffscreenRenderer(SIZE, SIZE)
-    camera = pyrender.IntrinsicsCamera(FOCAL, FOCAL, SIZE / 2, SIZE / 2, znear=0.5, zfar=6)
+    camera = pyrender.IntrinsicsCamera(
+        FOCAL,
+        FOCAL,
+        SIZE / 2,
+        SIZE / 2,
+        znear=0.5,
+        zfar=6,
+    )
     axes = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera looks along -z, y up
     seconds = np.zeros(2)
     for file in files:
@@ -203,7 +224,8 @@ def pyrender_offscreen(files: list[str]) -> Cost:
         scene = pyrender.Scene(bg_color=[0, 0, 0, 0])
         scene.add(
             pyrender.Mesh.from_trimesh(
-                trimesh.Trimesh(vertices, faces, process=False), smooth=False
+                trimesh.Trimesh(vertices, faces, process=False),
+                smooth=False,
             )
         )
         eye = scene.add(camera)
@@ -227,7 +249,11 @@ WAYS: dict[str, Callable[[list[str]], Cost]] = {
         pyrender_offscreen,
     )
 }
-NEEDS = {"open3d_raycasting": "open3d", "open3d_window": "open3d", "pyrender_offscreen": "pyrender"}
+NEEDS = {
+    "open3d_raycasting": "open3d",
+    "open3d_window": "open3d",
+    "pyrender_offscreen": "pyrender",
+}
 
 
 def command(way: str, python: str) -> list[str]:
@@ -238,7 +264,10 @@ def command(way: str, python: str) -> list[str]:
 
 
 def side_by_side(
-    way: str, files: list[str], workers: int, python: str
+    way: str,
+    files: list[str],
+    workers: int,
+    python: str,
 ) -> tuple[np.ndarray, float, float] | str:
     """Views/s by the clock and per processor second, million rays/s, peak memory (MB); or why it
     cannot run.
@@ -246,7 +275,10 @@ def side_by_side(
     needed = NEEDS.get(way)
     if (
         needed
-        and subprocess.run([python, "-c", f"import {needed}"], capture_output=True).returncode
+        and subprocess.run(
+            [python, "-c", f"import {needed}"],
+            capture_output=True,
+        ).returncode
     ):
         return f"{needed} is not installed"
     if command(way, python)[0] == "xvfb-run" and which("xvfb-run") is None:
@@ -278,7 +310,10 @@ def side_by_side(
     return np.array([clock, len(files) * 40 / processor]), rays, memory
 
 
-def end_to_end(files: list[str], workers: int) -> tuple[np.ndarray, float, float, float]:
+def end_to_end(
+    files: list[str],
+    workers: int,
+) -> tuple[np.ndarray, float, float, float]:
     """Views/s by the clock and per processor second of the whole command, bytes a view, peak memory
     (MB), seconds.
 
@@ -296,14 +331,25 @@ def end_to_end(files: list[str], workers: int) -> tuple[np.ndarray, float, float
         began = now()
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         done = list(
-            render(Path(folder, "meshes"), store, ViewSphere.named("40"), SIZE, workers=workers)
+            render(
+                Path(folder, "meshes"),
+                store,
+                ViewSphere.named("40"),
+                SIZE,
+                workers=workers,
+            )
         )
         seconds = now() - began
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         assert [reason for _, reason in done] == [None] * len(files)
         size = sum(file.stat().st_size for file in store.rglob("*") if file.is_file())
     seconds[1] += after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return len(files) * 40 / seconds, size / len(files) / 40, after.ru_maxrss / 1e3, seconds[0]
+    return (
+        len(files) * 40 / seconds,
+        size / len(files) / 40,
+        after.ru_maxrss / 1e3,
+        seconds[0],
+    )
 
 
 def main(
@@ -327,7 +373,9 @@ def main(
 
     entries = list_dataset(modelnet10)
     chosen = np.random.default_rng(seed).choice(
-        len(entries), min(objects, len(entries)), replace=False
+        len(entries),
+        min(objects, len(entries)),
+        replace=False,
     )
     files = [str(entries[i].path) for i in sorted(chosen)]
     print(f"{len(files)} meshes x 40 views of {SIZE} x {SIZE}, {workers} processes\n")
@@ -336,10 +384,18 @@ def main(
         f"{'way':20}{'views/s':>9}{'per CPU s':>11}{'Mrays/s':>9}{'MB/process':>12}   nextview is"
         " faster by, per CPU s"
     )
-    print(f"{'nextview, to disk':20}{ours[0]:9.0f}{ours[1]:11.0f}{'':9}{memory:12.0f}", end="")
+    print(
+        f"{'nextview, to disk':20}{ours[0]:9.0f}{ours[1]:11.0f}{'':9}{memory:12.0f}",
+        end="",
+    )
     print(f"   1.00, 1.00 ({seconds:.1f} s, {size / 1e3:.1f} kB a view)")
     for way in WAYS:
-        result = side_by_side(way, files, workers, python if way in NEEDS else sys.executable)
+        result = side_by_side(
+            way,
+            files,
+            workers,
+            python if way in NEEDS else sys.executable,
+        )
         if isinstance(result, str):
             print(f"{way:20}{'-':>9}   {result}", flush=True)
             continue
@@ -351,7 +407,11 @@ def main(
 
 def one(way: str) -> None:
     seconds, count = WAYS[way](json.load(sys.stdin))
-    print(json.dumps([*seconds, count, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3]))
+    print(
+        json.dumps(
+            [*seconds, count, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3]
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -38,7 +38,9 @@ def made_up(objects: int, azimuths: int = 8, classes: int = 10) -> Predictions:
     sphere = ViewSphere((0.0, 18.0, 36.0, 54.0, 72.0), azimuths)
     v = len(sphere)
     labels = np.arange(objects) % classes
-    logits = rng.normal(size=(objects, v, classes)) + 2 * np.eye(classes)[labels][:, None]
+    logits = (
+        rng.normal(size=(objects, v, classes)) + 2 * np.eye(classes)[labels][:, None]
+    )
     return Predictions(
         logits.astype(np.float32),
         {"lem": rng.random((objects, v, 5, 3)).astype(np.float32)},
@@ -57,10 +59,14 @@ def made_up(objects: int, azimuths: int = 8, classes: int = 10) -> Predictions:
 
 
 def run(
-    source: Path | tuple[int, int], names: list[str] | None, max_views: int = 5
+    source: Path | tuple[int, int],
+    names: list[str] | None,
+    max_views: int = 5,
 ) -> tuple[float, float, float, int]:
     """Seconds to load and replay, seconds to summarise, peak memory in GB, episodes."""
-    predictions = Predictions.load(source) if isinstance(source, Path) else made_up(*source)
+    predictions = (
+        Predictions.load(source) if isinstance(source, Path) else made_up(*source)
+    )
     began = time.perf_counter()
     specs = make_specs(predictions, 10, 0)
     grid = Grid(specs, 10, THESIS_THRESHOLDS, max_views, 0)
@@ -69,7 +75,12 @@ def run(
     summarise(grid, "random", 2000, np.random.default_rng(0))
     done = time.perf_counter()
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    return replayed - began, done - replayed, memory, len(specs.objects) * len(list(grid.cells()))
+    return (
+        replayed - began,
+        done - replayed,
+        memory,
+        len(specs.objects) * len(list(grid.cells())),
+    )
 
 
 def with_networks(meshes: list[Path], n_views: int = 40) -> float:
@@ -82,7 +93,9 @@ def with_networks(meshes: list[Path], n_views: int = 40) -> float:
 
     models = load(policy="lem").models
     sphere = ViewSphere.named("40")
-    cameras = [SimulatedCamera(load_mesh(path), 224, sphere.distance) for path in meshes]
+    cameras = [
+        SimulatedCamera(load_mesh(path), 224, sphere.distance) for path in meshes
+    ]
     models.evidence([cameras[0].observe(sphere.poses[0])])
     began = time.perf_counter()
     for camera in cameras:
@@ -112,7 +125,9 @@ def main(predictions: Path | None = None, meshes: list[Path] | None = None) -> N
         ("at most 10 views", (full, TEN, 10)),
         ("at most 20 views", (full, TEN, 20)),
     ]
-    print("| 10 starts, 5 thresholds | replay, s | tables, s | peak memory, GB | episodes |")
+    print(
+        "| 10 starts, 5 thresholds | replay, s | tables, s | peak memory, GB | episodes |"
+    )
     print("|---|---|---|---|---|")
     for what, case in cases:
         with ProcessPoolExecutor(1, get_context("spawn")) as pool:

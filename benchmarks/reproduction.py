@@ -67,7 +67,9 @@ class Compared(NamedTuple):
         """In words."""
         if self.p >= SIGNIFICANT:
             return "does not differ significantly from"
-        return "is more accurate than" if self.difference > 0 else "is less accurate than"
+        return (
+            "is more accurate than" if self.difference > 0 else "is less accurate than"
+        )
 
 
 def _p(p: float) -> str:
@@ -78,19 +80,26 @@ def tests_of(tables: Tables, measure: str) -> dict[tuple[str, float], Compared]:
     rows = tables.tests[tables.tests["measure"] == measure]
     columns = ["policy", "threshold", "difference", "low", "high", "p_holm"]
     return {
-        (policy, t): Compared(*rest) for policy, t, *rest in rows[columns].to_numpy(object).tolist()
+        (policy, t): Compared(*rest)
+        for policy, t, *rest in rows[columns].to_numpy(object).tolist()
     }
 
 
 def page(predictions: Path, samples: int = 2000) -> str:
-    table = replace(Predictions.load(predictions), calibration=PLAIN_SUM)  # as published
+    table = replace(
+        Predictions.load(predictions),
+        calibration=PLAIN_SUM,
+    )  # as published
     specs = make_specs(table, 10, 0)
     grid = Grid(specs, 10, THESIS_THRESHOLDS, 5, 0)
     list(run_grid(grid, default_entries(specs)))
     ran = {name for name, paths in grid.paths.items() if not paths.fixed}
-    references = [name for name in (*BASELINES, "lem", "true-lem", "lcm") if name in ran]
+    references = [
+        name for name in (*BASELINES, "lem", "true-lem", "lcm") if name in ran
+    ]
     tables = {
-        name: summarise(grid, name, samples, np.random.default_rng([0, 1])) for name in references
+        name: summarise(grid, name, samples, np.random.default_rng([0, 1]))
+        for name in references
     }
     rows = (
         tables["random"]
@@ -98,12 +107,19 @@ def page(predictions: Path, samples: int = 2000) -> str:
         .to_numpy(object)
         .tolist()
     )
-    value = {(p, None if t != t else t, m): (v, low, high) for p, t, m, v, low, high in rows}
+    value = {
+        (p, None if t != t else t, m): (v, low, high) for p, t, m, v, low, high in rows
+    }
     test = {name: tests_of(of, "accuracy") for name, of in tables.items()}
     clean = {name: tests_of(of, "clean_accuracy") for name, of in tables.items()}
     lems = {name: what for name, what in LEMS.items() if name in ran}
 
-    def number(policy: str, threshold: float | None, measure: str, digits: int = 3) -> str:
+    def number(
+        policy: str,
+        threshold: float | None,
+        measure: str,
+        digits: int = 3,
+    ) -> str:
         v, low, high = value[policy, threshold, measure]
         return (
             f"{v:.{digits}f} ({low:.{digits}f}-{high:.{digits}f})"
@@ -133,7 +149,8 @@ def page(predictions: Path, samples: int = 2000) -> str:
         f"The predictions (SHA-256 `{sha256_of(predictions)[:16]}...`) come from `nextview predict"
         " modelnet10.zarr predictions.npz --split test`; models: "
         + ", ".join(
-            f"{kind} {name} (`{sha[:12]}...`)" for kind, (name, sha) in table.models.items()
+            f"{kind} {name} (`{sha[:12]}...`)"
+            for kind, (name, sha) in table.models.items()
         )
         + f". Valley classes: {named(specs.valley_classes('lem'))} (LEM),"
         f" {named(specs.valley_classes('lcm'))} (LCM), chosen on validation objects. Single views"
@@ -179,11 +196,22 @@ def page(predictions: Path, samples: int = 2000) -> str:
         ),
         "|---|---|---|---|---|---|---|---|",
     ]
-    for name in (*BASELINES, "oracle-valley", "lem", "lcm-oracle-valley", "lcm", "lcm-peak"):
+    for name in (
+        *BASELINES,
+        "oracle-valley",
+        "lem",
+        "lcm-oracle-valley",
+        "lcm",
+        "lcm-peak",
+    ):
         if name in ran:
             t = published_threshold(name) or 0.99
             cells = []
-            for measure, digits in (("accuracy", 3), ("class_accuracy", 3), ("travel_moved", 2)):
+            for measure, digits in (
+                ("accuracy", 3),
+                ("class_accuracy", 3),
+                ("travel_moved", 2),
+            ):
                 theirs = published(name, t, measure, table.classes)
                 cells += [
                     number(name, t, measure, digits),
@@ -227,7 +255,9 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "|---|---|---|---|---|---|",
     ]
     for name, what in lems.items():
-        cells = [str(test[b][name, AT]) for b in BASELINES] + [str(clean["random"][name, AT])]
+        cells = [str(test[b][name, AT]) for b in BASELINES] + [
+            str(clean["random"][name, AT])
+        ]
         out.append(f"| {name} | {what} | " + " | ".join(cells) + " |")
     out += [
         "",
@@ -239,7 +269,9 @@ def page(predictions: Path, samples: int = 2000) -> str:
         "|---" * (1 + len(THESIS_THRESHOLDS)) + "|",
     ]
     for name in (
-        name for name in ("oracle-valley", "lem", "lcm", "gain", "oracle-gain") if name in lems
+        name
+        for name in ("oracle-valley", "lem", "lcm", "gain", "oracle-gain")
+        if name in lems
     ):
         out.append(
             f"| {name} | "
@@ -275,11 +307,17 @@ def page(predictions: Path, samples: int = 2000) -> str:
         ),
     ]
     if not {"lcm", "lcm-peak"} & ran:
-        out += ["", "Not reproduced: the LCM from a predicted map; no such network is bundled."]
+        out += [
+            "",
+            "Not reproduced: the LCM from a predicted map; no such network is bundled.",
+        ]
     return "\n".join(out) + "\n"
 
 
-def main(predictions: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path]) -> None:
+def main(
+    predictions: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
+) -> None:
     """Write the page.
 
     Args:

@@ -214,7 +214,9 @@ def episode(job: Job) -> tuple[Room, Session, list[Look]]:
     looks: list[Look] = []
     while not session.done and len(looks) < MOST_LOOKS:
         frame, shown = camera.look(pose)
-        mask = binary_dilation(shown, iterations=MASK_WIDER) if job.by == "mask" else None
+        mask = (
+            binary_dilation(shown, iterations=MASK_WIDER) if job.by == "mask" else None
+        )
         handed = Frame(frame.depth, frame.intrinsics, pose, mask=mask, pixel_centre=0.5)
         try:
             session.update(handed)
@@ -252,7 +254,9 @@ def outcome(job: Job) -> Outcome:
         unknown=result is not None and bool(result.unknown),
         views=len(accepted),
         refused=tuple(look.error for look in looks if look.error),
-        warnings=tuple(warning.name for view in session.views for warning in view.warnings),
+        warnings=tuple(
+            warning.name for view in session.views for warning in view.warnings
+        ),
         ratio=None if radius is None else radius / room.radius,
         taken=taken,
         own=own,
@@ -262,7 +266,10 @@ def outcome(job: Job) -> Outcome:
 def shares_of(shown: Mask, found: Mask) -> tuple[float, float]:
     """Share of the object's pixels that were found, and share of those found that are its own."""
     both = np.count_nonzero(shown & found)
-    return both / max(np.count_nonzero(shown), 1), both / max(np.count_nonzero(found), 1)
+    return both / max(np.count_nonzero(shown), 1), both / max(
+        np.count_nonzero(found),
+        1,
+    )
 
 
 def done_or_run(job: Job) -> None:
@@ -279,18 +286,33 @@ def jobs_of(
     sensors: Sequence[str],
 ) -> list[Job]:
     """All episodes, the cheap way first: all of one room after each other."""
-    files = sorted(path for path in rooms.rglob("*.json") if not path.name.startswith("."))
+    files = sorted(
+        path for path in rooms.rglob("*.json") if not path.name.startswith(".")
+    )
     if not files:
-        raise DatasetError(f"{rooms}: holds no rooms; nextview scenes --room draws some")
+        raise DatasetError(
+            f"{rooms}: holds no rooms; nextview scenes --room draws some"
+        )
     return [
-        Job(file, meshes, way, sensor, settings, out / sensor.replace(":", "_") / way / file.name)
+        Job(
+            file,
+            meshes,
+            way,
+            sensor,
+            settings,
+            out / sensor.replace(":", "_") / way / file.name,
+        )
         for file in files
         for sensor in sensors
         for way in by
     ]
 
 
-def table(found: Sequence[Outcome], sensors: Sequence[str], by: Sequence[By]) -> Iterator[str]:
+def table(
+    found: Sequence[Outcome],
+    sensors: Sequence[str],
+    by: Sequence[By],
+) -> Iterator[str]:
     """The results as lines of a table."""
     columns = (
         "camera, by",
@@ -320,7 +342,8 @@ def table(found: Sequence[Outcome], sensors: Sequence[str], by: Sequence[By]) ->
             cells = [f"{np.mean(share):.3f}" for share in shares]
             views = np.mean([o.views for o in some])
             first = (
-                f"{sensor}, {way} | {len(some)} | {right / len(some):.3f} ({low:.2f}-{high:.2f})"
+                f"{sensor}, {way} | {len(some)} | {right / len(some):.3f} "
+                f"({low:.2f}-{high:.2f})"
             )
             yield f"| {first} | {' | '.join(cells)} | {views:.2f} |"
 
@@ -343,18 +366,28 @@ def pictures(jobs: Sequence[Job]) -> Iterator[Picture]:
         _, session, looks = episode(job)
         masks = iter([sighting.mask for sighting in session.object.sightings])
         frames = [
-            (look, np.zeros_like(look.shown) if look.error else next(masks)) for look in looks
+            (look, np.zeros_like(look.shown) if look.error else next(masks))
+            for look in looks
         ]
         if ended.views:
             frames = [pair for pair in frames if not pair[0].error]
-        look, found = min(frames, key=lambda pair: np.prod(shares_of(pair[0].shown, pair[1])))
+        look, found = min(
+            frames, key=lambda pair: np.prod(shares_of(pair[0].shown, pair[1]))
+        )
         called = ended.answer or (
             look.error if not ended.views else f"unknown, most like {ended.most_like}"
         )
         title = f"{ended.room} by {ended.by}, {ended.sensor}"
         size = "" if ended.ratio is None else f", radius {ended.ratio:.2f}"
         sure = ", confident" if ended.confident else ""
-        yield Picture(ended.cause, title, f"{called}{sure}{size}", look.frame, look.shown, found)
+        yield Picture(
+            ended.cause,
+            title,
+            f"{called}{sure}{size}",
+            look.frame,
+            look.shown,
+            found,
+        )
 
 
 def main(
@@ -391,7 +424,10 @@ def main(
         if not record.exists():
             check_new(out, folder=True)
             write_record(record, settings)
-        if read_record(record, Settings, "settings of episodes", DatasetError) != settings:
+        if (
+            read_record(record, Settings, "settings of episodes", DatasetError)
+            != settings
+        ):
             raise UsageError(f"{out}: holds episodes of other models or another seed")
 
         jobs = jobs_of(rooms, meshes, out, settings, by, sensors)

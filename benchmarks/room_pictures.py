@@ -70,7 +70,11 @@ class Picture:
     found: Mask
 
 
-def write_page(folder: Path, pictures: Iterable[Picture], causes: Sequence[str]) -> None:
+def write_page(
+    folder: Path,
+    pictures: Iterable[Picture],
+    causes: Sequence[str],
+) -> None:
     """Write a folder with index.html and a picture for each cause; whole or not at all."""
     every = list(pictures)
     text = HEAD.format(ink=INK, paper=PAPER, truth=ACCENT, taken=BLUE)
@@ -98,7 +102,13 @@ def _draw(pictures: Sequence[Picture], path: Path) -> None:
         for axis, picture in zip(axes, pictures, strict=False):
             _panel(axis, picture)
         figure.tight_layout(pad=0.8)
-        figure.savefig(path, dpi=DOTS, facecolor=PAPER, bbox_inches="tight", pad_inches=0.15)
+        figure.savefig(
+            path,
+            dpi=DOTS,
+            facecolor=PAPER,
+            bbox_inches="tight",
+            pad_inches=0.15,
+        )
 
 
 def _panel(axis: Axes, picture: Picture) -> None:
@@ -112,7 +122,10 @@ def _panel(axis: Axes, picture: Picture) -> None:
         share = np.clip((depth - near) / max(far - near, 1e-6), 0, 1)
         grey[known] = (0.85 - 0.65 * share)[known]
     axis.imshow(grey, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
-    for mask, colour, wide in ((picture.shown, ACCENT, 1.8), (picture.found, BLUE, 1.2)):
+    for mask, colour, wide in (
+        (picture.shown, ACCENT, 1.8),
+        (picture.found, BLUE, 1.2),
+    ):
         outline = binary_closing(np.pad(mask[part], CLOSED), iterations=CLOSED)
         if outline.any():
             axis.contour(
@@ -135,7 +148,12 @@ def _part(mask: Mask) -> tuple[slice, slice]:
     spans = [np.flatnonzero(mask.any(axis))[[0, -1]] for axis in (1, 0)]
     extent = max(np.ptp(spans[0]), SHAPE * np.ptp(spans[1]), LEAST_SIDE)
     found = []
-    for span, side, wide in zip(spans, mask.shape, (extent, extent / SHAPE), strict=True):
+    for span, side, wide in zip(
+        spans,
+        mask.shape,
+        (extent, extent / SHAPE),
+        strict=True,
+    ):
         half = min(AROUND * wide, side) / 2
         middle = np.clip(span.mean(), half, side - half)
         found.append(slice(int(middle - half), int(middle + half) + 1))

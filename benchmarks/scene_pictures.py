@@ -26,7 +26,12 @@ from nextview.geometry.viewsphere import ViewSphere
 from nextview.session.style import FIGURE_STYLE, PAPER
 from nextview.simulation.scene import TargetScene, build_scene
 from nextview.simulation.scene_layout import CLUTTER_LEVELS
-from nextview.simulation.simulated import SHOWS_OTHER, SHOWS_TABLE, SHOWS_TARGET, SceneCamera
+from nextview.simulation.simulated import (
+    SHOWS_OTHER,
+    SHOWS_TABLE,
+    SHOWS_TARGET,
+    SceneCamera,
+)
 
 SIZE = 240
 WIDE = 0.55
@@ -47,7 +52,9 @@ def picture(scene: TargetScene, pose: np.ndarray) -> np.ndarray:
     image = np.tile(np.array([0.98, 0.965, 0.94]), (SIZE, SIZE, 1))
     for which, colour in COLOURS.items():
         image = np.where(
-            (owner == which)[..., None], np.array(colour) * (0.45 + 0.55 * shade), image
+            (owner == which)[..., None],
+            np.array(colour) * (0.45 + 0.55 * shade),
+            image,
         )
     return np.clip(image, 0, 1)
 
@@ -66,26 +73,59 @@ def main(
         if e.split == split
     }
     if target not in files:
-        raise UsageError(f"{dataset}: no object of the split {split} is called {target}")
+        raise UsageError(
+            f"{dataset}: no object of the split {split} is called {target}"
+        )
     meshes = Meshes(dataset, tuple(sorted(files.values())))
     sphere = ViewSphere.named("40")
     with matplotlib.rc_context(FIGURE_STYLE | {"axes.grid": False}):
         figure = Figure((1.65 * len(VIEWS), 1.85 * len(CLUTTER_LEVELS)))
         axes = figure.subplots(
-            len(CLUTTER_LEVELS), len(VIEWS), gridspec_kw={"wspace": 0.04, "hspace": 0.16}
+            len(CLUTTER_LEVELS),
+            len(VIEWS),
+            gridspec_kw={"wspace": 0.04, "hspace": 0.16},
         )
         for row, level in zip(axes, CLUTTER_LEVELS, strict=True):
-            layout = draw_scene(files[target], meshes, level, seed, f"{target}@{level}-0")
+            layout = draw_scene(
+                files[target],
+                meshes,
+                level,
+                seed,
+                f"{target}@{level}-0",
+            )
             scene = build_scene(layout, dataset)
             for axis, view in zip(row, VIEWS, strict=True):
                 axis.imshow(picture(scene, sphere.poses[view]))
-                axis.set_title(f"view {view}: {layout.visible[view]:.0%}", fontsize=8, pad=3)
+                axis.set_title(
+                    f"view {view}: {layout.visible[view]:.0%}",
+                    fontsize=8,
+                    pad=3,
+                )
                 axis.set(xticks=[], yticks=[])
                 if view in layout.unreachable:
-                    axis.plot([0, SIZE - 1], [0, SIZE - 1], color="#b00020", linewidth=1.2)
-                    axis.plot([0, SIZE - 1], [SIZE - 1, 0], color="#b00020", linewidth=1.2)
-            row[0].set_ylabel(f"{level}, {np.mean(layout.visible):.0%} on average", fontsize=8)
-        figure.savefig(out, dpi=120, facecolor=PAPER, bbox_inches="tight", pad_inches=0.05)
+                    axis.plot(
+                        [0, SIZE - 1],
+                        [0, SIZE - 1],
+                        color="#b00020",
+                        linewidth=1.2,
+                    )
+                    axis.plot(
+                        [0, SIZE - 1],
+                        [SIZE - 1, 0],
+                        color="#b00020",
+                        linewidth=1.2,
+                    )
+            row[0].set_ylabel(
+                f"{level}, {np.mean(layout.visible):.0%} on average",
+                fontsize=8,
+            )
+        figure.savefig(
+            out,
+            dpi=120,
+            facecolor=PAPER,
+            bbox_inches="tight",
+            pad_inches=0.05,
+        )
 
 
 if __name__ == "__main__":

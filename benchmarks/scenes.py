@@ -66,7 +66,16 @@ yet, in none.
 """
 LEAST = 10
 """Targets of which a row of the table tells."""
-COLOURS = ("#4a5560", "#d99000", "#0b5fa5", "#00805a", "#b5179e", "#d1495b", "#7a6fd0", "#38a0d9")
+COLOURS = (
+    "#4a5560",
+    "#d99000",
+    "#0b5fa5",
+    "#00805a",
+    "#b5179e",
+    "#d1495b",
+    "#7a6fd0",
+    "#38a0d9",
+)
 CEILING = dict(zip(CEILINGS, [("--", "#8a939b"), (":", "#8a939b")], strict=True))
 
 
@@ -122,7 +131,10 @@ def reached_in(grid: Grid, name: str) -> Reached:
     right = path.answers[rows, last] == grid.specs.labels[:, None]
     travel = path.travel[rows, last], SECONDS * last + TURN * path.arc[rows, last]
     return Reached(
-        *(grid_mean(grid, np.asarray(values, np.float64)) for values in (right, *travel))
+        *(
+            grid_mean(grid, np.asarray(values, np.float64))
+            for values in (right, *travel)
+        )
     )
 
 
@@ -155,11 +167,17 @@ def judge(
     """
     names = list(dict.fromkeys([REFERENCE, *policies, ours, *CEILINGS]))
     found: dict[str, dict[str, list[Reached]]] = {level: {} for level in CLUTTER_LEVELS}
-    looked_at = {name.rpartition("@")[0] for path in known for name in Predictions.load(path).names}
+    looked_at = {
+        name.rpartition("@")[0]
+        for path in known
+        for name in Predictions.load(path).names
+    }
     for path in predictions:
         p = Predictions.load(path)
         p = p.of_objects(
-            np.flatnonzero([name.rpartition("@")[0] not in looked_at for name in p.names])
+            np.flatnonzero(
+                [name.rpartition("@")[0] not in looked_at for name in p.names]
+            )
         )
         grid = Grid(make_specs(p, runs, seed), runs, (1.0,), max(COUNTS), seed)
         track(run_grid(grid, names), len(names), f"going through {path.name}")
@@ -184,7 +202,13 @@ def judge(
         for level, by_name in found.items()
         if by_name
     }
-    comparisons = compared(scenes, ours, rivals, samples, np.random.default_rng([seed, 1]))
+    comparisons = compared(
+        scenes,
+        ours,
+        rivals,
+        samples,
+        np.random.default_rng([seed, 1]),
+    )
     show(scenes, comparisons, ours)
     if table is not None:
         comparisons.to_csv(table, index=False)
@@ -204,20 +228,27 @@ def compared(
     """
     rows = []
     for level, of in scenes.items():
-        weights = resample(len(of[REFERENCE].right), samples, rng) / len(of[REFERENCE].right)
+        weights = resample(len(of[REFERENCE].right), samples, rng) / len(
+            of[REFERENCE].right
+        )
         pairs = [(name, REFERENCE) for name in of if name not in (REFERENCE, ours)]
         pairs += [(ours, rival) for rival in rivals if rival in of]
         for name, other in pairs:
             against = (of[name].right - of[other].right)[:, np.array(COUNTS) - 1]
             mean = against.mean(0)
             drawn = weights @ against
-            p = bootstrap_p(mean, drawn) if name == ours else np.full(len(COUNTS), np.nan)
+            p = (
+                bootstrap_p(mean, drawn)
+                if name == ours
+                else np.full(len(COUNTS), np.nan)
+            )
             rows += [
                 (level, name, other, *row)
                 for row in zip(COUNTS, mean, *interval(drawn), p, strict=True)
             ]
     table = pd.DataFrame(
-        rows, columns=["level", "policy", "other", "views", "points", "low", "high", "p"]
+        rows,
+        columns=["level", "policy", "other", "views", "points", "low", "high", "p"],
     )
     return table.assign(p_holm=holm(table["p"].to_numpy(np.float64)))
 
@@ -235,10 +266,13 @@ def show(scenes: dict[str, dict[str, Reached]], table: pd.DataFrame, ours: str) 
         print("|---" * (2 + 2 * len(COUNTS)) + "|")
         known = {name: means(reached) for name, reached in of.items()}
         print(
-            f"| {REFERENCE} | | " + " | ".join(f"{known[REFERENCE][k]} | " for k in COUNTS) + " |"
+            f"| {REFERENCE} | | "
+            + " | ".join(f"{known[REFERENCE][k]} | " for k in COUNTS)
+            + " |"
         )
         for (name, other), rows in table[table["level"] == level].groupby(
-            ["policy", "other"], sort=False
+            ["policy", "other"],
+            sort=False,
         ):
             cells = []
             for row in rows.itertuples():
@@ -284,7 +318,11 @@ def draw(scenes: dict[str, dict[str, Reached]], out: Path) -> None:
                     else CEILING.get(name)
                 )
                 line, colour = drawn or ("-.", "#8a939b")
-                for axis, travel in zip(column, (reached.cells, reached.seconds), strict=True):
+                for axis, travel in zip(
+                    column,
+                    (reached.cells, reached.seconds),
+                    strict=True,
+                ):
                     right = reached.right.mean(0)
                     axis.plot(
                         travel.mean(0),
@@ -301,7 +339,11 @@ def draw(scenes: dict[str, dict[str, Reached]], out: Path) -> None:
             column[0].yaxis.set_major_formatter(PercentFormatter(1, 0))
         for row in axes:
             row[0].set_ylabel("accuracy after 1 to 5 views")
-        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        figure.legend(
+            *axes[0, 0].get_legend_handles_labels(),
+            loc="outside lower center",
+            ncols=4,
+        )
         figure.savefig(out, dpi=110, facecolor="white")
 
 
@@ -321,12 +363,19 @@ class Believed:
         total = (
             weights[..., None] * p.log_evidence[rows[:, None], views].astype(np.float64)
         ).cumsum(1)
-        logs = p.calibration.log_belief(total, np.maximum(weights.cumsum(1), 1), len(p.classes))
+        logs = p.calibration.log_belief(
+            total,
+            np.maximum(weights.cumsum(1), 1),
+            len(p.classes),
+        )
         answers = logs.argmax(-1)
         labels = p.labels[rows]
         sure = np.exp(
             np.stack(
-                [of_true_class(step, answer) for step, answer in zip(logs, answers, strict=True)]
+                [
+                    of_true_class(step, answer)
+                    for step, answer in zip(logs, answers, strict=True)
+                ]
             )
         )
         return cls(sure, answers == labels[:, None], -of_true_class(logs, labels))
@@ -358,28 +407,51 @@ def calibration(
         if scenes is None:
             raise UsageError(f"{path}: holds single objects, no scenes")
         rows = np.repeat(np.arange(len(p)), episodes)
-        draws = np.where(scenes.reachable[rows], rng.random((len(rows), len(p.sphere))), -1)
+        draws = np.where(
+            scenes.reachable[rows],
+            rng.random((len(rows), len(p.sphere))),
+            -1,
+        )
         views = np.argsort(-draws, axis=1)[:, : max(COUNTS)]
         targets = np.array([name.partition("@")[0] for name in p.names])
-        single = next((single for single in singles if {*targets} <= {*single.names}), None)
+        single = next(
+            (single for single in singles if {*targets} <= {*single.names}),
+            None,
+        )
         if single is None:
             raise UsageError(
                 f"{path}: no predictions of single objects hold all targets of these scenes"
             )
         same = np.array([single.names.index(name) for name in targets])[rows]
-        share = np.stack([scenes.store.read("measures/visible_share", row) for row in scenes.rows])[
-            rows[:, None], views
-        ]
+        share = np.stack(
+            [scenes.store.read("measures/visible_share", row) for row in scenes.rows]
+        )[rows[:, None], views]
         nothing = ~p.seen[rows[:, None], views].cumsum(1).astype(bool)
-        show = np.where(nothing, np.nan, share.cumsum(1) / np.arange(1, max(COUNTS) + 1))
+        show = np.where(
+            nothing,
+            np.nan,
+            share.cumsum(1) / np.arange(1, max(COUNTS) + 1),
+        )
         ours = Believed.of(p, rows, views)
         bare = Believed.of(single, same, views)
         parts.append(
-            (levels_of(p.names)[rows], targets[rows], show, *(vars(of) for of in (ours, bare)))
+            (
+                levels_of(p.names)[rows],
+                targets[rows],
+                show,
+                *(vars(of) for of in (ours, bare)),
+            )
         )
-    level, target, show = (np.concatenate([part[i] for part in parts]) for i in range(3))
+    level, target, show = (
+        np.concatenate([part[i] for part in parts]) for i in range(3)
+    )
     both = [
-        Believed(*(np.concatenate([part[i][f.name] for part in parts]) for f in fields(Believed)))
+        Believed(
+            *(
+                np.concatenate([part[i][f.name] for part in parts])
+                for f in fields(Believed)
+            )
+        )
         for i in (3, 4)
     ]
     print(
@@ -390,7 +462,8 @@ def calibration(
     print("|---" * 9 + "|")
     rng = np.random.default_rng([seed, 1])
     for name, k in product(
-        (*(name for name in CLUTTER_LEVELS if name in level), "any"), (1, *COUNTS)
+        (*(name for name in CLUTTER_LEVELS if name in level), "any"),
+        (1, *COUNTS),
     ):
         mine = (level == name) | (name == "any")
         share = show[:, k - 1]

@@ -44,7 +44,12 @@ class Clock:
         self.now = now
         self.spent: dict[str, float] = defaultdict(float)
 
-    def timed(self, part: str, run: Callable[..., Any], within: str = "") -> Callable[..., Any]:
+    def timed(
+        self,
+        part: str,
+        run: Callable[..., Any],
+        within: str = "",
+    ) -> Callable[..., Any]:
         """A function that does the same and is timed; its time is taken from that of the part
         within which it runs.
         """
@@ -67,20 +72,34 @@ def frames(rng: np.random.Generator) -> list[Frame]:
     scene = EmbreeScene()
     vertices = 0.12 * mesh.vertices
     vertices[:, 2] -= vertices[:, 2].min()
-    corners = np.array([[-0.7, -0.7, 0], [0.7, -0.7, 0], [0.7, 0.7, 0], [-0.7, 0.7, 0]], np.float32)
-    TriangleMesh(scene, vertices.astype(np.float32), np.ascontiguousarray(mesh.faces, np.int32))
+    corners = np.array(
+        [[-0.7, -0.7, 0], [0.7, -0.7, 0], [0.7, 0.7, 0], [-0.7, 0.7, 0]],
+        np.float32,
+    )
+    TriangleMesh(
+        scene,
+        vertices.astype(np.float32),
+        np.ascontiguousarray(mesh.faces, np.int32),
+    )
     TriangleMesh(scene, corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
     row, column = np.indices(SHAPE)
-    rays = np.stack([column, row, np.ones(SHAPE)], -1).reshape(-1, 3) @ np.linalg.inv(INTRINSICS).T
+    rays = (
+        np.stack([column, row, np.ones(SHAPE)], -1).reshape(-1, 3)
+        @ np.linalg.inv(INTRINSICS).T
+    )
     found = []
     for _ in range(FRAMES):
-        pose = look_at_origin(np.radians(rng.uniform(15, 70)), rng.uniform(0, 2 * np.pi), 0.6)
+        pose = look_at_origin(
+            np.radians(rng.uniform(15, 70)),
+            rng.uniform(0, 2 * np.pi),
+            0.6,
+        )
         pose[2, 3] += 0.1
         origins = np.tile(pose[:3, 3].astype(np.float32), (len(rays), 1))
         hits = scene.run(origins, (rays @ pose[:3, :3].T).astype(np.float32), output=1)
-        depth = np.where(hits["primID"] >= 0, hits["tfar"], np.nan).reshape(SHAPE) + rng.normal(
-            0, 0.001, SHAPE
-        )
+        depth = np.where(hits["primID"] >= 0, hits["tfar"], np.nan).reshape(
+            SHAPE
+        ) + rng.normal(0, 0.001, SHAPE)
         depth[rng.random(SHAPE) < 0.03] = np.nan
         found.append(Frame(depth, INTRINSICS, pose))
     return found
@@ -93,7 +112,11 @@ def resident() -> float:
 
 
 def main(
-    updates: int = 200, threads: int = 2, cpu: bool = False, seed: int = 0, threshold: float = 1.0
+    updates: int = 200,
+    threads: int = 2,
+    cpu: bool = False,
+    seed: int = 0,
+    threshold: float = 1.0,
 ) -> None:
     """Print the tables.
 
@@ -113,12 +136,20 @@ def main(
     for name in ("fit_facets", "enclose", "look_again"):
         within = "finding"
         setattr(
-            observed_object, name, clock.timed("geometry", getattr(observed_object, name), within)
+            observed_object,
+            name,
+            clock.timed("geometry", getattr(observed_object, name), within),
         )
     observed_object.check_observation = clock.timed(
-        "rest", observed_object.check_observation, "finding"
+        "rest",
+        observed_object.check_observation,
+        "finding",
     )
-    observed_object.check_views = clock.timed("rest", observed_object.check_views, "finding")
+    observed_object.check_views = clock.timed(
+        "rest",
+        observed_object.check_views,
+        "finding",
+    )
     policy_type = type(system.policy)
     models_type = type(system.models)
     policy_type.scores = clock.timed("policy", policy_type.scores)  # type: ignore[attr-defined]
@@ -140,7 +171,9 @@ def main(
             took = clock.now() - begun
             clock.spent["rest"] += took - sum(clock.spent.values())
             if k >= 0:
-                taken.append((len(session.views), took, *(clock.spent[part] for part in PARTS)))
+                taken.append(
+                    (len(session.views), took, *(clock.spent[part] for part in PARTS))
+                )
                 if k % max(1, updates // 10) == 0 or k == updates - 1:
                     memory.append((k, resident()))
             k += 1
@@ -150,11 +183,17 @@ def main(
     print(
         "mean: "
         + ", ".join(
-            f"{name} {m:.1f}" for name, m in zip(("all", *PARTS), times.mean(0), strict=True)
+            f"{name} {m:.1f}"
+            for name, m in zip(("all", *PARTS), times.mean(0), strict=True)
         )
     )
-    print(f"{'ms':16}{'updates':>8}" + "".join(f"{name:>18}" for name in ("all", *PARTS)))
-    for label, rows in [("all", numbers > 0), *((f"frame {n}", numbers == n) for n in range(1, 6))]:
+    print(
+        f"{'ms':16}{'updates':>8}" + "".join(f"{name:>18}" for name in ("all", *PARTS))
+    )
+    for label, rows in [
+        ("all", numbers > 0),
+        *((f"frame {n}", numbers == n) for n in range(1, 6)),
+    ]:
         if rows.any():
             middle = np.median(times[rows], 0)
             high = np.percentile(times[rows], 99, axis=0)

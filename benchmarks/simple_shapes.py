@@ -87,11 +87,15 @@ def main(
     """
     strange = sorted(set(shapes) - set(SHAPES))
     if strange:
-        raise UsageError(f"no shape is called {strange[0]}; there are {', '.join(SHAPES)}")
+        raise UsageError(
+            f"no shape is called {strange[0]}; there are {', '.join(SHAPES)}"
+        )
     system = nextview.load(models=models, threads=1)
     taught = boxes_of_taught(system)
     rng = np.random.default_rng(seed)
-    asked = [(name, radius) for name in shapes for radius in radii for _ in range(draws)]
+    asked = [
+        (name, radius) for name in shapes for radius in radii for _ in range(draws)
+    ]
     found: dict[Key, list[nextview.Recognition]] = {}
 
     def work():
@@ -100,7 +104,10 @@ def main(
                 turn = rng.uniform(0, 2 * np.pi)
                 path = write_shape(Path(folder) / f"{name}.ply", name, radius, turn)
                 result = system.recognise(
-                    path, seed=int(rng.integers(2**32)), unit="m", sensor=sensor
+                    path,
+                    seed=int(rng.integers(2**32)),
+                    unit="m",
+                    sensor=sensor,
                 )
                 found.setdefault((name, radius), []).append(result)
                 yield done
@@ -111,7 +118,9 @@ def main(
 
 
 def table(
-    found: dict[Key, list[nextview.Recognition]], radii: tuple[float, ...], like: set[Key]
+    found: dict[Key, list[nextview.Recognition]],
+    radii: tuple[float, ...],
+    like: set[Key],
 ) -> str:
     """What was said, as text: names of confident answers in bold; ``like`` marks some shapes."""
     lines = [
@@ -127,10 +136,18 @@ def table(
 
     lines += [
         "",
-        counts({key: found[key] for key in found if key not in like}, "of no taught size"),
+        counts(
+            {key: found[key] for key in found if key not in like},
+            "of no taught size",
+        ),
     ]
     if like:
-        lines.append(counts({key: found[key] for key in like}, "of the size of a taught thing (*)"))
+        lines.append(
+            counts(
+                {key: found[key] for key in like},
+                "of the size of a taught thing (*)",
+            )
+        )
     return "\n".join(lines)
 
 
@@ -139,7 +156,9 @@ def counts(found: dict[Key, list[nextview.Recognition]], what: str) -> str:
     results = [result for each in found.values() for result in each]
     named = sum(result.answer is not None for result in results)
     sure = sum(result.confident for result in results)
-    some = sum(any(result.answer is not None for result in each) for each in found.values())
+    some = sum(
+        any(result.answer is not None for result in each) for each in found.values()
+    )
     return (
         f"{len(results)} episodes with shapes {what}: {named} end with a name, {sure} of them"
         f" confident. {some} of {len(found)} shapes get a name at least once."

@@ -61,13 +61,17 @@ def main(
         judged = sorted({entry.label for entry in entries})[1::2]
         entries = [entry for entry in entries if entry.label in judged]
 
-    places = {entry.name: entry.path.relative_to(meshes).as_posix() for entry in entries}
+    places = {
+        entry.name: entry.path.relative_to(meshes).as_posix() for entry in entries
+    }
     others = Meshes(meshes, tuple(sorted(places.values())))
     chosen = np.sort(np.random.default_rng(seed).permutation(len(entries))[:objects])
     entries = [entries[i] for i in chosen]
 
     def camera_before(
-        entry: Entry, draw: int, rng: np.random.Generator
+        entry: Entry,
+        draw: int,
+        rng: np.random.Generator,
     ) -> Camera | FrameCamera | None:
         if around is not None:
             scene = f"{entry.name}@{around}-{draw}"
@@ -102,7 +106,9 @@ def main(
                 most_like = entry.label == result.most_like
                 named_right = most_like and not result.unknown
                 sure = result.confident and not result.unknown
-                outcomes.append((result.unknown, named_right, most_like, sure, len(result.views)))
+                outcomes.append(
+                    (result.unknown, named_right, most_like, sure, len(result.views))
+                )
             if outcomes:
                 rows.append(np.mean(outcomes, axis=0))
                 labels.append(entry.label)
@@ -120,9 +126,14 @@ def main(
     print(f"{'views':22} {table[:, -1].mean():.2f}")
 
     of_class = np.array(labels)
-    shares = {label: table[of_class == label, 0].mean() for label in sorted(set(labels))}
+    shares = {
+        label: table[of_class == label, 0].mean() for label in sorted(set(labels))
+    }
     most = sorted(shares, key=lambda label: -shares[label])[:MOST_UNKNOWN_CLASSES]
-    print("most often unknown: " + ", ".join(f"{label} {shares[label]:.3f}" for label in most))
+    print(
+        "most often unknown: "
+        + ", ".join(f"{label} {shares[label]:.3f}" for label in most)
+    )
 
 
 if __name__ == "__main__":

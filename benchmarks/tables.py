@@ -102,7 +102,13 @@ def mesh_of(path: Path, radius: float | None = None) -> Mesh:
     """A scan in metres, or a mesh of no unit that gets a radius, metres."""
     if radius is None:
         return replace(load_mesh(path, unit="m"), name=path.stem)
-    return replace(load_mesh(path), radius=radius, centre=np.zeros(3), name=STRANGER, unit="m")
+    return replace(
+        load_mesh(path),
+        radius=radius,
+        centre=np.zeros(3),
+        name=STRANGER,
+        unit="m",
+    )
 
 
 @lru_cache(maxsize=512)
@@ -113,7 +119,9 @@ def rests_of(name: str, radius: float, path: Path) -> Float:
 
 
 def draw_table(
-    scans: Sequence[Path], strangers: Sequence[Path], rng: np.random.Generator
+    scans: Sequence[Path],
+    strangers: Sequence[Path],
+    rng: np.random.Generator,
 ) -> SimulatedTable:
     """A table with 6 to 10 things, the last of them a stranger."""
     count = int(rng.integers(FEWEST_THINGS, MOST_THINGS + 1))
@@ -125,7 +133,9 @@ def draw_table(
     where = {id(mesh): path for mesh, path in zip(meshes, paths, strict=True)}
     order = [meshes[k] for k in rng.permutation(len(meshes))]
     return SimulatedTable.draw(
-        order, rng, resting=lambda mesh: rests_of(mesh.name, mesh.radius, where[id(mesh)])
+        order,
+        rng,
+        resting=lambda mesh: rests_of(mesh.name, mesh.radius, where[id(mesh)]),
     )
 
 
@@ -209,7 +219,10 @@ class Looking:
 
 
 def look_at_table(
-    system: nextview.System, table: SimulatedTable, seed: tuple[int, int], by: By
+    system: nextview.System,
+    table: SimulatedTable,
+    seed: tuple[int, int],
+    by: By,
 ) -> tuple[dict[str, Counts], int]:
     """Look at a table from four views.
 
@@ -299,7 +312,10 @@ def comparison(lines: Sequence[dict]) -> str:
     """Things named right, and frames until done: target against the others, paired by table."""
     said = []
     for frames in COMPARED:
-        right = {(one["by"], one["table"]): one["counts"][str(frames)]["right"] for one in lines}
+        right = {
+            (one["by"], one["table"]): one["counts"][str(frames)]["right"]
+            for one in lines
+        }
         said += _differences(right, f"things named right a table after {frames} frames")
     done = {(one["by"], one["table"]): one["done"] for one in lines}
     return "\n".join(said + _differences(done, "frames until done"))
@@ -311,7 +327,9 @@ def _differences(values: dict[tuple[By, int], int], what: str) -> list[str]:
     """
     said = []
     for other in ("random", "fixed"):
-        both = sorted(table for by, table in values if by == other and ("target", table) in values)
+        both = sorted(
+            table for by, table in values if by == other and ("target", table) in values
+        )
         if not both:
             continue
         difference = np.array([values["target", k] - values[other, k] for k in both])
@@ -345,7 +363,11 @@ def main(
         by: ways in which views are chosen, each on every table.
         models: memory of the things.
     """
-    lines = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
+    lines = (
+        [json.loads(line) for line in out.read_text().splitlines()]
+        if out.exists()
+        else []
+    )
     of_scans = sorted(path for path in scans.iterdir() if path.is_file())
     of_strangers = sorted(path for path in strangers.rglob("*") if path.is_file())
     if not of_scans or not of_strangers:
@@ -363,7 +385,9 @@ def main(
             for one in left:
                 counts, after = look_at_table(system, table, (seed, number), one)
                 line = {"seed": seed, "table": number, "by": one, "done": after}
-                line["counts"] = {frames: asdict(found) for frames, found in counts.items()}
+                line["counts"] = {
+                    frames: asdict(found) for frames, found in counts.items()
+                }
                 written.write(json.dumps(line, default=int) + "\n")
                 written.flush()
                 lines.append(line)

@@ -34,7 +34,12 @@ from nextview.data.predictions import Predictions
 from nextview.errors import UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.base import EpisodeState, best_view
-from nextview.recognition.belief import Calibration, Stopping, log_evidence_of, of_true_class
+from nextview.recognition.belief import (
+    Calibration,
+    Stopping,
+    log_evidence_of,
+    of_true_class,
+)
 from nextview.things.memory import TaughtRecogniser
 
 if TYPE_CHECKING:
@@ -74,21 +79,38 @@ class FairCeiling:
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Whole:
         """See ``Policy.next_views``."""
-        rows = np.split(np.arange(len(state.current)), range(ROWS, len(state.current), ROWS))
+        rows = np.split(
+            np.arange(len(state.current)),
+            range(ROWS, len(state.current), ROWS),
+        )
         return best_view(
-            self.sphere, state, np.concatenate([self._worth(state, each) for each in rows])
+            self.sphere,
+            state,
+            np.concatenate([self._worth(state, each) for each in rows]),
         )
 
-    def _worth(self, state: EpisodeState, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _worth(
+        self,
+        state: EpisodeState,
+        rows: NDArray[np.int64],
+    ) -> NDArray[np.float64]:
         """Mean logarithm of the belief in the truth after each view, (rows, V)."""
-        draw, thing = np.divmod(self.objects[state.episodes[rows]], self.log_evidence.shape[1])
+        draw, thing = np.divmod(
+            self.objects[state.episodes[rows]],
+            self.log_evidence.shape[1],
+        )
         seen = np.matmul(
-            state.visited[rows, None].astype(np.float32), self.log_evidence[draw, thing]
+            state.visited[rows, None].astype(np.float32),
+            self.log_evidence[draw, thing],
         )
         worth = np.zeros((len(rows), len(self.sphere)))
         for step in range(1, len(self.log_evidence)):
             other = self.log_evidence[(draw + step) % len(self.log_evidence), thing]
-            logs = self.calibration.log_belief(seen + other, state.step + 1, self.classes)
+            logs = self.calibration.log_belief(
+                seen + other,
+                state.step + 1,
+                self.classes,
+            )
             worth += of_true_class(logs, self.labels[thing])
         return worth
 
@@ -99,7 +121,9 @@ def together(draws: Sequence[Predictions]) -> Predictions:
         raise UsageError("the predictions are of other things, or by another memory")
     fields = ["logits", "depth_entropy", "labels", "splits", "conflicting"]
     fields += ["azimuth_bins"] * (draws[0].azimuth_bins is not None)
-    arrays = {name: np.concatenate([getattr(draw, name) for draw in draws]) for name in fields}
+    arrays = {
+        name: np.concatenate([getattr(draw, name) for draw in draws]) for name in fields
+    }
     names = tuple(f"{name} {k}" for k, draw in enumerate(draws) for name in draw.names)
     return replace(draws[0], **arrays, names=names, maps={}, of_size=None)
 
@@ -111,7 +135,10 @@ def margins(recogniser: TaughtRecogniser, by_shape: bool) -> NDArray[np.float64]
     memory = recogniser.memory
     k, f = memory.held_out.shape[1:]
     where = memory.held_out_views.reshape(-1, 2)
-    evidence = recogniser.evidence(memory.held_out.reshape(-1, f).astype(np.float32), where[:, 0])
+    evidence = recogniser.evidence(
+        memory.held_out.reshape(-1, f).astype(np.float32),
+        where[:, 0],
+    )
     logits = evidence.logits
     size = recogniser.card.size
     if size is not None and not by_shape:
@@ -126,28 +153,48 @@ def margins(recogniser: TaughtRecogniser, by_shape: bool) -> NDArray[np.float64]
 
 
 def run(
-    draws: Sequence[Predictions], card: Path, others: Sequence[str], runs: int, seed: int, most: int
+    draws: Sequence[Predictions],
+    card: Path,
+    others: Sequence[str],
+    runs: int,
+    seed: int,
+    most: int,
 ) -> dict[str, Trajectories]:
     """Where each policy goes, by its name in the table; ``others`` are compared too."""
     specs = make_specs(together(draws), runs, seed)
     p = specs.predictions
     n = len(draws[0])
-    found = {name: replay(name, specs, MOST, seed) for name in dict.fromkeys((*RIVALS, *others))}
+    found = {
+        name: replay(name, specs, MOST, seed)
+        for name in dict.fromkeys((*RIVALS, *others))
+    }
     found[OWN] = replay(str(card), specs, MOST, seed)
     found[FORESIGHT] = replay("oracle-gain-all", specs, most, seed)
     if len(draws) > 1:
         evidence = p.log_evidence.reshape(len(draws), n, len(p.sphere), -1)
         policy = FairCeiling(
-            p.sphere, evidence, p.labels[:n], specs.objects, len(p.classes), p.calibration
+            p.sphere,
+            evidence,
+            p.labels[:n],
+            specs.objects,
+            len(p.classes),
+            p.calibration,
         )
         found[CEILING] = replay_policy(
-            CEILING, policy, specs, Stopping(1.0, most), np.random.default_rng(seed)
+            CEILING,
+            policy,
+            specs,
+            Stopping(1.0, most),
+            np.random.default_rng(seed),
         )
     return found
 
 
 def measured(
-    paths: dict[str, Trajectories], labels: Whole, things: Whole, n_views: Sequence[int]
+    paths: dict[str, Trajectories],
+    labels: Whole,
+    things: Whole,
+    n_views: Sequence[int],
 ) -> list[dict]:
     """Numbers of some of the things: accuracy, travel, the lead over random, its p, and the
     share of the ceiling's.
@@ -157,7 +204,8 @@ def measured(
     for name, path in paths.items():
         for k in range(1, (max(n_views) if name in (FORESIGHT, CEILING) else MOST) + 1):
             answer = path.answers[
-                np.arange(len(path.views)), np.minimum(k, (path.views >= 0).sum(1)) - 1
+                np.arange(len(path.views)),
+                np.minimum(k, (path.views >= 0).sum(1)) - 1,
             ]
             right[name, k] = (answer.reshape(-1, len(labels)) == labels)[:, things]
     rows = []
@@ -165,7 +213,11 @@ def measured(
         random = right[RIVALS[0], k]
         each = np.stack([hits.mean(0), hits.mean(0) - random.mean(0)], 1)
         low, high = interval(ratio(each, np.ones_like(each), weights))
-        gap = right[CEILING, k].mean() - random.mean() if (CEILING, k) in right else np.nan
+        gap = (
+            right[CEILING, k].mean() - random.mean()
+            if (CEILING, k) in right
+            else np.nan
+        )
         ends = paths[name].travel[:, :k][:, -1].reshape(-1, len(labels))[:, things]
         tested = name not in (RIVALS[0], FORESIGHT, CEILING) and k in n_views and k > 1
         lead = each[:, 1].mean()
@@ -209,7 +261,9 @@ def markdown(table: pd.DataFrame, n_views: Sequence[int]) -> str:
                 )
                 cell += "" if np.isnan(row.p_holm) else f", p {row.p_holm:.2g}"
                 cell += (
-                    "" if np.isnan(row.of_ceiling) or name == CEILING else f", {row.of_ceiling:.0%}"
+                    ""
+                    if np.isnan(row.of_ceiling) or name == CEILING
+                    else f", {row.of_ceiling:.0%}"
                 )
             cells.append(cell + (f", travel {row.travel:.1f}" if k > 1 else ""))
         enough = rows.n_views[rows.accuracy >= ENOUGH]
@@ -252,7 +306,10 @@ def main(
         raise UsageError(
             "name at least one file of predictions, made by nextview predict with these models"
         )
-    draws = [draw.by_shape() if by_shape else draw for draw in map(Predictions.load, predictions)]
+    draws = [
+        draw.by_shape() if by_shape else draw
+        for draw in map(Predictions.load, predictions)
+    ]
     recogniser = TaughtRecogniser(card)
     if recogniser.classes != draws[0].classes:
         raise UsageError(f"{card}: knows other things than the predictions")
@@ -260,8 +317,14 @@ def main(
     half = np.sort(np.argsort(margin, kind="stable")[: len(margin) // 2])
     paths = run(draws, card, policies, runs, seed, max(views))
     rows: list[dict] = []
-    for name, things in (("all", np.arange(len(margin))), ("the confusable half", half)):
-        rows += [{"things": name} | row for row in measured(paths, draws[0].labels, things, views)]
+    for name, things in (
+        ("all", np.arange(len(margin))),
+        ("the confusable half", half),
+    ):
+        rows += [
+            {"things": name} | row
+            for row in measured(paths, draws[0].labels, things, views)
+        ]
     table = pd.DataFrame(rows)
     table["p_holm"] = holm(table["p"].to_numpy())
     out.mkdir(parents=True, exist_ok=True)

@@ -53,17 +53,27 @@ class Judged:
     def after(self, n_views: int) -> NDArray[np.float64]:
         """Mean scores over disjoint runs of so many views, (N, runs)."""
         runs = self.scores.shape[1] // n_views
-        return self.scores[:, : runs * n_views].reshape(len(self.scores), runs, n_views).mean(2)
+        return (
+            self.scores[:, : runs * n_views]
+            .reshape(len(self.scores), runs, n_views)
+            .mean(2)
+        )
 
 
 def judge(
-    store: Path, split: str | None, objects: int | None, recogniser: NetworkRecogniser, seed: int
+    store: Path,
+    split: str | None,
+    objects: int | None,
+    recogniser: NetworkRecogniser,
+    seed: int,
 ) -> Judged:
     views = ViewStore.open(store)
     rng = np.random.default_rng(seed)
     chosen = np.flatnonzero(views.done & ((views.splits == split) if split else True))
     chosen = np.sort(rng.permutation(chosen)[:objects])
-    drawn = np.array([rng.permutation(len(views.sphere))[: 2 * max(VIEWS)] for _ in chosen])
+    drawn = np.array(
+        [rng.permutation(len(views.sphere))[: 2 * max(VIEWS)] for _ in chosen]
+    )
     scores = []
     evidence = []
     features = Features()
@@ -75,11 +85,17 @@ def judge(
             found = recogniser.from_inputs(inputs)
             known = features.card.input == recogniser.card.input
             seen = features(
-                inputs if known else from_store(features.card.input, views, int(i), drawn[k])
+                inputs
+                if known
+                else from_store(features.card.input, views, int(i), drawn[k])
             )
             scores.append(recogniser.novelty.scores(seen, exact))
             evidence.append(
-                log_evidence_of(found.logits, found.azimuth_bins, views.sphere.azimuth[drawn[k]])
+                log_evidence_of(
+                    found.logits,
+                    found.azimuth_bins,
+                    views.sphere.azimuth[drawn[k]],
+                )
             )
             yield k + 1
 
@@ -88,7 +104,12 @@ def judge(
     return Judged(labels, np.array(scores), np.array(evidence, np.float64))
 
 
-def roc_area(known: NDArray, unknown: NDArray, of_known: NDArray, of_unknown: NDArray) -> float:
+def roc_area(
+    known: NDArray,
+    unknown: NDArray,
+    of_known: NDArray,
+    of_unknown: NDArray,
+) -> float:
     """Area under the ROC curve: how often an unknown object scores higher than a known one, equal
     scores half.
 
@@ -102,7 +123,8 @@ def roc_area(known: NDArray, unknown: NDArray, of_known: NDArray, of_unknown: ND
     order = np.argsort(k)
     below = np.r_[0, np.cumsum(weights[order])]
     at = (
-        below[np.searchsorted(k[order], u, "left")] + below[np.searchsorted(k[order], u, "right")]
+        below[np.searchsorted(k[order], u, "left")]
+        + below[np.searchsorted(k[order], u, "right")]
     ) / 2
     of_each = np.repeat(of_unknown, unknown.shape[1])
     return float(at @ of_each / weights.sum() / of_each.sum())
@@ -130,7 +152,9 @@ def main(
         " unknown classes\n"
     )
     rng = np.random.default_rng(seed)
-    of_ours, of_others = (resample(len(each.labels), samples, rng) for each in (ours, others))
+    of_ours, of_others = (
+        resample(len(each.labels), samples, rng) for each in (ours, others)
+    )
     ones = np.ones(len(ours.labels)), np.ones(len(others.labels))
 
     def spread(values: list[float]) -> str:
@@ -161,9 +185,16 @@ def main(
 
     def answers(judged: Judged, n: int) -> NDArray[np.int64]:
         classes = len(network.classes)
-        return network.calibration.log_belief(judged.evidence[:, :n].sum(1), n, classes).argmax(1)
+        return network.calibration.log_belief(
+            judged.evidence[:, :n].sum(1),
+            n,
+            classes,
+        ).argmax(1)
 
-    caught = {n: network.novelty.p_value(others.scores[:, :n].mean(1), n) < 0.05 for n in (1, 3)}
+    caught = {
+        n: network.novelty.p_value(others.scores[:, :n].mean(1), n) < 0.05
+        for n in (1, 3)
+    }
     taken = answers(others, 3)
     print(f"\nUnknown classes of which less than {HARD:.0%} are caught after 3 views:")
     print(
@@ -171,14 +202,18 @@ def main(
         " |\n|---|---|---|---|---|"
     )
     classes = ((label, others.labels == label) for label in sorted(set(others.labels)))
-    for label, here in ((label, here) for label, here in classes if caught[3][here].mean() < HARD):
+    for label, here in (
+        (label, here) for label, here in classes if caught[3][here].mean() < HARD
+    ):
         most = Counter(network.classes[c] for c in taken[here]).most_common(3)
         named = ", ".join(f"{name} {count}" for name, count in most)
         print(
             f"| {label} | {here.sum()} | {caught[1][here].mean():.2f} |"
             f" {caught[3][here].mean():.2f} | {named} |"
         )
-    right = answers(ours, 3) == np.array([network.classes.index(label) for label in ours.labels])
+    right = answers(ours, 3) == np.array(
+        [network.classes.index(label) for label in ours.labels]
+    )
     kept = network.novelty.p_value(ours.scores[:, :3].mean(1), 3) >= 0.05
     print(
         f"\nknown objects after 3 views: right {right.mean():.3f}; of those not taken for unknown"

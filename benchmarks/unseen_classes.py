@@ -30,7 +30,8 @@ from nextview.recognition.inference import MapNetwork
 from nextview.recognition.network_input import from_store
 
 PUBLISHED = (
-    "published LEM, trained on 10 classes, tested on its own unseen ones (table 4): d <= 1 0.364"
+    "published LEM, trained on 10 classes, tested on its own "
+    "unseen ones (table 4): d <= 1 0.364"
 )
 
 
@@ -51,13 +52,16 @@ def main(
     views = ViewStore.open(store)
     network = MapNetwork(model)
     objects = np.flatnonzero(views.done)
-    maps = np.empty((len(objects), len(views.sphere), views.sphere.rings, 3), np.float32)
+    maps = np.empty(
+        (len(objects), len(views.sphere), views.sphere.rings, 3),
+        np.float32,
+    )
 
     def predict() -> object:
         for row, i in enumerate(objects):
-            maps[row] = network.from_inputs(from_store(network.card.input, views, int(i)))[
-                network.card.kind
-            ]
+            maps[row] = network.from_inputs(
+                from_store(network.card.input, views, int(i))
+            )[network.card.kind]
             yield row + 1
 
     track(predict(), len(objects), f"maps of {views.path.name}")
@@ -71,7 +75,9 @@ def main(
         f"{len(objects)} objects of {len(views.classes)} classes, {len(views.sphere)} views each;"
         f" {PUBLISHED}\n"
     )
-    print(f"{'':22}{'objects':>8}{'MSE':>9}{'d = 0':>8}{'d <= 1':>8}{'d < 2':>8}{'regret':>8}")
+    print(
+        f"{'':22}{'objects':>8}{'MSE':>9}{'d = 0':>8}{'d <= 1':>8}{'d < 2':>8}{'regret':>8}"
+    )
     rows = {"all": (maps, true)}
     rows["baselines: mean map"] = (baselines(true, labels)["mean map"], true)
     for name, (log_evidence, right) in rows.items():
@@ -80,7 +86,9 @@ def main(
             f"{name:22}{len(right):8}{scores['mse']:9.4f}",
             *(f"{v:7.3f}" for k, v in scores.items() if k != "mse"),
         )
-    near = np.array([map_scores(m, t)["d_le_1"] for m, t in zip(maps, true, strict=True)])
+    near = np.array(
+        [map_scores(m, t)["d_le_1"] for m, t in zip(maps, true, strict=True)]
+    )
     weights = resample(len(objects), samples, np.random.default_rng(seed))
     (low,), (high,) = interval(ratio(near[:, None], np.ones((len(near), 1)), weights))
     print(

@@ -66,8 +66,12 @@ SPHERE = ViewSphere((0.0, 18.0, 36.0, 54.0, 72.0), 8)
 CONFIDENT = 0.97
 REJECTED = 0.02  # p-value below which a thing is called unknown
 POINTS = 1000  # of a surface, for symmetries and ADD-S
-SYMMETRIC = 0.1  # largest distance to a turned copy, diameters, of a symmetric thing, as in BOP
-UPRIGHT = 20.0  # degrees that the vertical of a thing in the right resting pose may be off
+SYMMETRIC = (
+    0.1  # largest distance to a turned copy, diameters, of a symmetric thing, as in BOP
+)
+UPRIGHT = (
+    20.0  # degrees that the vertical of a thing in the right resting pose may be off
+)
 COLUMNS = (
     "views",
     "features",
@@ -236,7 +240,10 @@ class Taught:
             )
 
         meshes = [load_mesh(files[name], unit="m") for name in names]
-        whole = [Surface.from_mesh(mesh, name) for mesh, name in zip(meshes, names, strict=True)]
+        whole = [
+            Surface.from_mesh(mesh, name)
+            for mesh, name in zip(meshes, names, strict=True)
+        ]
         points = [surface.sample(POINTS, np.random.default_rng(0)) for surface in whole]
         orders = [symmetry_order(*both) for both in zip(whole, points, strict=True)]
         surfaces = list(known.verifier.caster.surfaces)
@@ -275,7 +282,9 @@ def symmetry_order(surface: Surface, points: Float) -> int:
         turn = rotation_z(2 * np.pi / order)
         distance = np.quantile(tree.query(centred @ turn.T)[0], 0.99) - apart
         same.append(distance < SYMMETRIC * surface.diameter)
-    highest = max(order for order, alike in zip(ORDERS, same, strict=True) if alike or order == 1)
+    highest = max(
+        order for order, alike in zip(ORDERS, same, strict=True) if alike or order == 1
+    )
     return 0 if highest >= ROUND else highest
 
 
@@ -310,7 +319,9 @@ def shown(
     around = None
     if setting.clutter:
         around = boxes_around(
-            standing.vertices, setting.clutter, np.random.default_rng([thing, draw, 2])
+            standing.vertices,
+            setting.clutter,
+            np.random.default_rng([thing, draw, 2]),
         )
     if setting.any_orientation:
         around = room_around(standing)
@@ -342,18 +353,34 @@ def shown(
     begun = time.process_time()  # one thread; others on the machine do not count
     evidence = things.log_evidence(observations)
     seconds = (time.process_time() - begun) / len(observations)
-    return Episode(thing, observations, evidence, to_object @ in_truth, in_cameras, seconds)
+    return Episode(
+        thing,
+        observations,
+        evidence,
+        to_object @ in_truth,
+        in_cameras,
+        seconds,
+    )
 
 
 def room_around(mesh: Mesh) -> Mesh:
     """The wall of a round room in whose middle a thing hangs: something is behind it everywhere."""
     assert mesh.metres is not None
     wall = trimesh.creation.icosphere(3, min(ROOM / mesh.metres, FARTHEST))
-    return replace(mesh, vertices=wall.vertices, faces=wall.faces.astype(np.int32), name="room")
+    return replace(
+        mesh,
+        vertices=wall.vertices,
+        faces=wall.faces.astype(np.int32),
+        name="room",
+    )
 
 
 def judged(
-    things: TaughtThings, taught: Taught, some: NDArray[np.int64], episode: Episode, views: int
+    things: TaughtThings,
+    taught: Taught,
+    some: NDArray[np.int64],
+    episode: Episode,
+    views: int,
 ) -> Outcome:
     """Recognise the thing of an episode after some views, among some things."""
     begun = time.process_time()
@@ -416,7 +443,9 @@ def pose_errors(
     true_in_camera = episode.in_cameras[views - 1]
 
     centre = np.append(surface.centre, 1)
-    apart = cKDTree(moved(points, true_in_camera)).query(moved(points, in_camera))[0].mean()
+    apart = (
+        cKDTree(moved(points, true_in_camera)).query(moved(points, in_camera))[0].mean()
+    )
     add_s = apart / surface.diameter
     turn = pose[:3, :3] @ episode.true_pose[:3, :3].T
     azimuth = np.degrees(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
@@ -425,7 +454,9 @@ def pose_errors(
     up = pose[2, :3] @ episode.true_pose[2, :3]
     same_pose = up > np.cos(np.radians(UPRIGHT))
     return {
-        "azimuth": abs((azimuth + step / 2) % step - step / 2) if order and same_pose else None,
+        "azimuth": abs((azimuth + step / 2) % step - step / 2)
+        if order and same_pose
+        else None,
         "rotation": rotation_error(pose[:3, :3], episode.true_pose[:3, :3], symmetries),
         "place": float(np.linalg.norm((in_camera - true_in_camera) @ centre)),
         "place_in_world": float(np.linalg.norm((pose - episode.true_pose) @ centre)),
@@ -434,7 +465,11 @@ def pose_errors(
     }
 
 
-def rotation_error(found: Float, true: Float, symmetries: Sequence[Symmetry]) -> float | None:
+def rotation_error(
+    found: Float,
+    true: Float,
+    symmetries: Sequence[Symmetry],
+) -> float | None:
     """The angle between two rotations of a thing that its symmetries leave.
 
     Args:
@@ -453,7 +488,9 @@ def rotation_error(found: Float, true: Float, symmetries: Sequence[Symmetry]) ->
     same = [apart]
     for symmetry in symmetries:
         angles = 2 * np.pi * np.arange(symmetry.order) / max(symmetry.order, 1)
-        turns = [Rotation.from_rotvec(angle * np.array(symmetry.axis)) for angle in angles]
+        turns = [
+            Rotation.from_rotvec(angle * np.array(symmetry.axis)) for angle in angles
+        ]
         same = [each * turn for each in same for turn in turns] or same
     if free:
         cosines = [free[0] @ each.apply(free[0]) for each in same]
@@ -475,7 +512,11 @@ def calibration_error(outcomes: Sequence[Outcome]) -> float:
     return float(sum(gaps) / len(right))
 
 
-def table(outcomes: Sequence[Outcome], views: Sequence[int], held: bool) -> Iterator[str]:
+def table(
+    outcomes: Sequence[Outcome],
+    views: Sequence[int],
+    held: bool,
+) -> Iterator[str]:
     """The results as lines of a table.
 
     Args:
@@ -518,10 +559,16 @@ def row(some: Sequence[Outcome], views: int) -> tuple[str, ...]:
 def median_and_most(errors: Sequence[float | None]) -> str:
     """Median and 95 % quantile of the errors that are known."""
     known = np.array([error for error in errors if error is not None])
-    return f"{np.median(known):.1f}, {np.quantile(known, 0.95):.1f}" if len(known) else "-"
+    return (
+        f"{np.median(known):.1f}, {np.quantile(known, 0.95):.1f}" if len(known) else "-"
+    )
 
 
-def mistakes(taught: Taught, outcomes: Sequence[Outcome], views: Sequence[int]) -> Iterator[str]:
+def mistakes(
+    taught: Taught,
+    outcomes: Sequence[Outcome],
+    views: Sequence[int],
+) -> Iterator[str]:
     """What was taken for what."""
     for k in views:
         wrong = [o for o in outcomes if o.views == k and not o.right]
@@ -533,7 +580,9 @@ def mistakes(taught: Taught, outcomes: Sequence[Outcome], views: Sequence[int]) 
 
 
 def unknown_table(
-    outcomes: Sequence[Outcome], known: NDArray[np.int64], views: Sequence[int]
+    outcomes: Sequence[Outcome],
+    known: NDArray[np.int64],
+    views: Sequence[int],
 ) -> Iterator[str]:
     """How many of the things that were not taught, and of those that were, are called unknown."""
     yield "| views | strangers unknown | known unknown | strangers named with confidence |"
@@ -544,7 +593,9 @@ def unknown_table(
         taught = [o for o in some if o.thing in known]
         refused = np.mean([unknown(o) for o in strangers])
         wrongly = np.mean([unknown(o) for o in taught])
-        sure = np.mean([not unknown(o) and o.confidence >= CONFIDENT for o in strangers])
+        sure = np.mean(
+            [not unknown(o) and o.confidence >= CONFIDENT for o in strangers]
+        )
         yield f"| {k} | {refused:.3f} | {wrongly:.3f} | {sure:.3f} |"
 
 
@@ -557,7 +608,9 @@ def kept(file: Path, asked: Draw) -> list[Outcome]:
     """The outcomes of a draw that an earlier run kept; ResultsError if it asked for others."""
     found = read_record(file, Draw, "what was found in a draw", ResultsError)
     if replace(found, outcomes=(), command=asked.command) != asked:
-        raise ResultsError(f"{file}: is of {found.command!r}; give another folder to --save")
+        raise ResultsError(
+            f"{file}: is of {found.command!r}; give another folder to --save"
+        )
     return list(found.outcomes)
 
 
@@ -624,7 +677,9 @@ def main(
         )
     else:
         print(*unknown_table(together, some, views), sep="\n")
-    print(f"memory: at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GB")
+    print(
+        f"memory: at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GB"
+    )
 
 
 if __name__ == "__main__":

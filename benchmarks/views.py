@@ -62,7 +62,10 @@ POLICIES = (
 REFERENCES = ("random", "random-all")
 
 
-def families(names: Sequence[str], specs: EpisodeSpecs) -> dict[str, list[tuple[float, str]]]:
+def families(
+    names: Sequence[str],
+    specs: EpisodeSpecs,
+) -> dict[str, list[tuple[float, str]]]:
     """The policies that were run at two travel weights or more: travel weight and full name of
     each, ascending.
 
@@ -74,11 +77,16 @@ def families(names: Sequence[str], specs: EpisodeSpecs) -> dict[str, list[tuple[
         if travel_weight is not None:
             found.setdefault(name.partition("@")[0], {}).setdefault(travel_weight, name)
     return {
-        family: sorted(members.items()) for family, members in found.items() if len(members) > 1
+        family: sorted(members.items())
+        for family, members in found.items()
+        if len(members) > 1
     }
 
 
-def front(table: pd.DataFrame, travel_weights: dict[str, list[tuple[float, str]]]) -> Figure:
+def front(
+    table: pd.DataFrame,
+    travel_weights: dict[str, list[tuple[float, str]]],
+) -> Figure:
     """Accuracy against travel, a panel for each number of views; what takes the truth is only named
     above it.
 
@@ -90,16 +98,22 @@ def front(table: pd.DataFrame, travel_weights: dict[str, list[tuple[float, str]]
     at_prices = {name for members in travel_weights.values() for _, name in members}
     drawn = [name for name in table["policy"].unique() if not knows_truth(name)]
     names = [
-        name for name in drawn if name in at_prices or name.partition("@")[0] not in travel_weights
+        name
+        for name in drawn
+        if name in at_prices or name.partition("@")[0] not in travel_weights
     ]
     colour = {name: POLICY_COLOURS.get(name, "#4a5560") for name in names}
     text_of = {name: Path(name).name for name in names}
     for own, (family, members) in zip(
-        OWN * len(travel_weights), travel_weights.items(), strict=False
+        OWN * len(travel_weights),
+        travel_weights.items(),
+        strict=False,
     ):
         for travel_weight, name in members:
             colour[name] = own
-            text_of[name] = f"{Path(family).name if name == family else ''}@{travel_weight:g}"
+            text_of[name] = (
+                f"{Path(family).name if name == family else ''}@{travel_weight:g}"
+            )
         if family not in text_of:
             text_of[members[0][1]] = Path(members[0][1]).name
     with matplotlib.rc_context(FIGURE_STYLE):
@@ -109,12 +123,16 @@ def front(table: pd.DataFrame, travel_weights: dict[str, list[tuple[float, str]]
         lines = []
         for axes, k in zip(panels, n_views, strict=True):
             place = {
-                name: (found[name, k, "travel"][0], found[name, k, "accuracy"][0]) for name in names
+                name: (found[name, k, "travel"][0], found[name, k, "accuracy"][0])
+                for name in names
             }
             for members in travel_weights.values():
                 line = [place[name] for _, name in members]
                 axes.plot(
-                    *zip(*line, strict=True), color=colour[members[0][1]], linewidth=1.2, zorder=2
+                    *zip(*line, strict=True),
+                    color=colour[members[0][1]],
+                    linewidth=1.2,
+                    zorder=2,
                 )
                 lines.append((axes, line))
             for name, (x, y) in place.items():
@@ -165,9 +183,16 @@ def front(table: pd.DataFrame, travel_weights: dict[str, list[tuple[float, str]]
         figure.set_layout_engine("none")
         for axes, k in zip(panels, n_views, strict=True):
             points = {
-                name: (found[name, k, "travel"][0], found[name, k, "accuracy"][0]) for name in names
+                name: (found[name, k, "travel"][0], found[name, k, "accuracy"][0])
+                for name in names
             }
-            label(axes, points, text_of, colour, [line for of, line in lines if of is axes])
+            label(
+                axes,
+                points,
+                text_of,
+                colour,
+                [line for of, line in lines if of is axes],
+            )
     return figure
 
 
@@ -187,13 +212,21 @@ def label(
     point = axes.figure.dpi / 72  # in pixels
     dots = {name: axes.transData.transform(at) for name, at in points.items()}
     along = [
-        np.linspace(a, b, 60) for line in lines for a, b in pairwise(axes.transData.transform(line))
+        np.linspace(a, b, 60)
+        for line in lines
+        for a, b in pairwise(axes.transData.transform(line))
     ]
-    taken = [Bbox.from_extents(*(at - 3.5 * point), *(at + 3.5 * point)) for at in dots.values()]
+    taken = [
+        Bbox.from_extents(*(at - 3.5 * point), *(at + 3.5 * point))
+        for at in dots.values()
+    ]
     inside = axes.get_window_extent()
     tied = []
     everyone = np.array(list(dots.values()))
-    crowd = {name: np.sort(np.hypot(*(everyone - at).T))[:4].sum() for name, at in dots.items()}
+    crowd = {
+        name: np.sort(np.hypot(*(everyone - at).T))[:4].sum()
+        for name, at in dots.items()
+    }
     for name in sorted(dots, key=crowd.__getitem__):
         at = dots[name]
         text = axes.annotate(
@@ -208,7 +241,10 @@ def label(
         )
         size = np.array(text.get_window_extent().size)
         tries = []
-        for far, angle in product((6, 11, 17, 25, 35, 47), np.radians(np.arange(0, 360, 15))):
+        for far, angle in product(
+            (6, 11, 17, 25, 35, 47),
+            np.radians(np.arange(0, 360, 15)),
+        ):
             way = np.array([np.cos(angle), np.sin(angle)])
             tie = np.linspace(at, at + way * far * point, 20)
             centre = tie[-1] + way * size / 2
@@ -227,7 +263,14 @@ def label(
         if far > 11:
             tied.append(tie)
             ends = axes.transData.inverted().transform(tie[[0, -1]])
-            axes.plot(*ends.T, color=GREY, linewidth=0.6, zorder=1, scalex=False, scaley=False)
+            axes.plot(
+                *ends.T,
+                color=GREY,
+                linewidth=0.6,
+                zorder=1,
+                scalex=False,
+                scaley=False,
+            )
 
 
 def _overlap(a: Bbox, b: Bbox) -> float:
@@ -269,10 +312,14 @@ def main(
             " compared"
         )
     if not views or not 1 <= min(views) <= max(views) <= len(table.sphere):
-        raise UsageError(f"policies are compared after 1 to {len(table.sphere)} views, not {views}")
+        raise UsageError(
+            f"policies are compared after 1 to {len(table.sphere)} views, not {views}"
+        )
     specs = make_specs(table, runs, seed)
     sys.path.insert(0, str(Path.cwd()))  # where a user's own policy lies
-    names = list(dict.fromkeys([*REFERENCES, *against, *(policies or POLICIES), CEILING]))
+    names = list(
+        dict.fromkeys([*REFERENCES, *against, *(policies or POLICIES), CEILING])
+    )
     grid = Grid(specs, runs, (), max(views), seed)
     track(run_grid(grid, names), len(names), "replaying policies")
     for name in [
@@ -282,7 +329,9 @@ def main(
     ]:
         grid.failures[name] = f"{name} is over before view {max(views)}"
         del grid.paths[name]
-    compared = [name for name in dict.fromkeys((REFERENCES[0], *against)) if name in grid.paths]
+    compared = [
+        name for name in dict.fromkeys((REFERENCES[0], *against)) if name in grid.paths
+    ]
     found = measured(grid, sorted(set(views)), samples, compared)
     text = markdown(as_rows(found), list(grid.failures.values()))
     out.mkdir(parents=True, exist_ok=True)

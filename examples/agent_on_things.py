@@ -52,7 +52,9 @@ def paid(env: gymnasium.Env, agent: Agent, episodes: int, seed: int) -> float:
         observation, info = env.reset(seed=1000 * seed + number)
         over = False
         while not over:
-            observation, reward, over, _, info = env.step(agent.action(observation, info))
+            observation, reward, over, _, info = env.step(
+                agent.action(observation, info)
+            )
             total += float(reward)
     return total / episodes
 
@@ -78,7 +80,9 @@ def learn(env: gymnasium.Env, rounds: int, episodes: int, seed: int = 0) -> Agen
         best = weights[np.argsort(rewards)[-KEPT:]]
         mean = best.mean(0)
         deviation = best.std(0) + 0.02
-        print(f"round {turn + 1}: reward {np.sort(rewards)[-KEPT:].mean():.3f}, weights {mean}")
+        print(
+            f"round {turn + 1}: reward {np.sort(rewards)[-KEPT:].mean():.3f}, weights {mean}"
+        )
     return Agent(*mean.tolist())
 
 

@@ -61,7 +61,8 @@ class Arm:
 def recognise(arm: Arm) -> nextview.Recognition:
     """What a user writes."""
     session = nextview.load(threshold=0.99).session(
-        object=ObservedObject(life_size=False), distance=0.6
+        object=ObservedObject(life_size=False),
+        distance=0.6,
     )
     session.reachable = arm.can_reach
     session.travel_cost = arm.seconds
@@ -76,7 +77,11 @@ def recognise(arm: Arm) -> nextview.Recognition:
     return session.result
 
 
-def main(mesh: tyro.conf.Positional[Path], seed: int = 0, figure: Path | None = None) -> None:
+def main(
+    mesh: tyro.conf.Positional[Path],
+    seed: int = 0,
+    figure: Path | None = None,
+) -> None:
     result = recognise(Arm(nextview.load_mesh(mesh), np.random.default_rng(seed)))
     print(result)
     if figure:

@@ -46,16 +46,23 @@ NEEDED = ("research", "mujoco", "mink", "gymnasium_robotics")
 MIDDLE = np.array([0.48, 0.0, 0.05])  # of the things, metres from the arm's base
 WIDEST = 0.24  # metres from there within which things are put
 AROUND = 0.36  # metres from the middle of the things within which is looked
-GAPS = (0.01, 0.04)  # metres between a thing and what hides it; the first: between any two
+GAPS = (
+    0.01,
+    0.04,
+)  # metres between a thing and what hides it; the first: between any two
 ASIDE = 0.01  # metres by which a hidden thing stands beside the line of sight
 TRIES = 50  # places that are tried for a thing
 FIRST_VIEW = np.radians([30.0, 240.0])  # elevation and azimuth, seen from ``MIDDLE``
 DISTANCE = 0.5  # metres from ``MIDDLE`` to the camera
 STRANGER_RADIUS = 0.07  # metres
-HIDDEN = 0.5  # share of its pixels of which a thing shows less that is hidden behind others
+HIDDEN = (
+    0.5  # share of its pixels of which a thing shows less that is hidden behind others
+)
 HIDDEN_THINGS = 3
 SMALLEST = 0.05  # metres across: what is smaller shows on too few pixels
-LARGE = 0.25  # share of the scans, the largest ones, of which those are that hide others
+LARGE = (
+    0.25  # share of the scans, the largest ones, of which those are that hide others
+)
 DRAWS = 500
 FORMATS = (".ply", ".obj", ".stl", ".off", ".glb")
 COARSE = 4  # only each so many-th pixel is looked at to see what is hidden
@@ -79,16 +86,25 @@ class FullTable:
     def hidden(self) -> list[str]:
         """Names of the things that others hide from the first frame."""
         return [
-            one.name for one, share in zip(self.things, self.shown, strict=True) if share < HIDDEN
+            one.name
+            for one, share in zip(self.things, self.shown, strict=True)
+            if share < HIDDEN
         ]
 
 
 def recognise(
-    arm: Arm, system: nextview.System, looked: Callable[[nextview.Scene, Look], None]
+    arm: Arm,
+    system: nextview.System,
+    looked: Callable[[nextview.Scene, Look], None],
 ) -> nextview.Scene:
     """What a user writes: look, and go where the scene asks for, until it is done."""
     before = Box(MIDDLE - AROUND, MIDDLE + AROUND)  # not the arm's own base
-    scene = nextview.Scene(system, region=before, distance=DISTANCE, reachable=arm.can_reach)
+    scene = nextview.Scene(
+        system,
+        region=before,
+        distance=DISTANCE,
+        reachable=arm.can_reach,
+    )
     looked(scene, scene.update(arm.look(itself=False)))
     while not scene.done and scene.target is not None:
         arm.go_to(scene.target)
@@ -132,14 +148,17 @@ def draw_table(scans: Sequence[Path], count: int, seed: int) -> FullTable:
     for draw in range(DRAWS):
         rng = np.random.default_rng([seed, draw])
         things = arranged(
-            [lying(mesh, rest, rng) for mesh, rest in zip(meshes, rests, strict=True)], rng
+            [lying(mesh, rest, rng) for mesh, rest in zip(meshes, rests, strict=True)],
+            rng,
         )
         if things is None:
             continue
         table = FullTable(things, draw, shares_shown(things, first_pose()))
         if len(table.hidden) == HIDDEN_THINGS:
             return table
-    raise UsageError(f"in {DRAWS} draws no {HIDDEN_THINGS} of {count} things hide behind others")
+    raise UsageError(
+        f"in {DRAWS} draws no {HIDDEN_THINGS} of {count} things hide behind others"
+    )
 
 
 def named_scan(path: Path) -> Mesh:
@@ -171,7 +190,9 @@ def lying(mesh: Mesh, rests: np.ndarray, rng: np.random.Generator) -> PlacedThin
     """A thing on the table in one of its resting poses, (P, 3, 3), turned; above the origin."""
     metres = mesh.vertices * mesh.radius + mesh.centre
     pose = np.eye(4)
-    pose[:3, :3] = rotation_z(rng.uniform(0, 2 * np.pi)) @ rests[rng.integers(len(rests))]
+    pose[:3, :3] = (
+        rotation_z(rng.uniform(0, 2 * np.pi)) @ rests[rng.integers(len(rests))]
+    )
     turned = metres @ pose[:3, :3].T
     low, high = turned.min(0), turned.max(0)
     pose[:3, 3] = -np.array([*(low + high)[:2] / 2, low[2]])
@@ -179,7 +200,8 @@ def lying(mesh: Mesh, rests: np.ndarray, rng: np.random.Generator) -> PlacedThin
 
 
 def arranged(
-    things: Sequence[PlacedThing], rng: np.random.Generator
+    things: Sequence[PlacedThing],
+    rng: np.random.Generator,
 ) -> tuple[PlacedThing, ...] | None:
     """Put things before the arm: the highest at random, the lowest behind them, then the rest.
 
@@ -206,7 +228,10 @@ def arranged(
             )
             if row in low:
                 before = high[low.index(row)]
-                depth = np.ptp(outlines[before] @ away) / 2 + np.ptp(outlines[row] @ away) / 2
+                depth = (
+                    np.ptp(outlines[before] @ away) / 2
+                    + np.ptp(outlines[row] @ away) / 2
+                )
                 behind = (depth + rng.uniform(*GAPS)) * away
                 place = places[before] + behind + rng.normal(0, ASIDE, 2)
             apart = [
@@ -230,18 +255,31 @@ def arranged(
 def toy(name: str) -> Mesh:
     """A sample, made as small as a toy: nothing that nextview knows looks like it."""
     mesh = sample_mesh(name)
-    return replace(mesh, name=f"toy {name}", radius=STRANGER_RADIUS, centre=np.zeros(3), unit="m")
+    return replace(
+        mesh,
+        name=f"toy {name}",
+        radius=STRANGER_RADIUS,
+        centre=np.zeros(3),
+        unit="m",
+    )
 
 
 def shares_shown(things: Sequence[PlacedThing], pose: np.ndarray) -> np.ndarray:
     """Share of its pixels that a camera at a pose, (4, 4), sees of each thing, (N,)."""
     sensor = SENSORS["wrist"]
-    rays = PinholeCamera.of(sensor.intrinsics, sensor.shape).rays[::COARSE, ::COARSE].reshape(-1, 3)
+    rays = (
+        PinholeCamera.of(sensor.intrinsics, sensor.shape)
+        .rays[::COARSE, ::COARSE]
+        .reshape(-1, 3)
+    )
     rays = rays @ pose[:3, :3].T
     triangles = [(thing.placed, thing.faces) for thing in things]
     _, owner = RayCaster(triangles).cast(pose[:3, 3], rays)
     shown = np.bincount(owner[owner >= 0], minlength=len(things))
-    alone = [np.isfinite(RayCaster([one]).cast(pose[:3, 3], rays)[0]).sum() for one in triangles]
+    alone = [
+        np.isfinite(RayCaster([one]).cast(pose[:3, 3], rays)[0]).sum()
+        for one in triangles
+    ]
     return shown / np.maximum(alone, 1)
 
 
@@ -290,7 +328,11 @@ class Verdict:
         return f"{self.found}: right, {1000 * off:.0f} mm off"
 
 
-def verdicts(scene: nextview.Scene, table: FullTable, truly: Sequence[np.ndarray]) -> list[Verdict]:
+def verdicts(
+    scene: nextview.Scene,
+    table: FullTable,
+    truly: Sequence[np.ndarray],
+) -> list[Verdict]:
     """What each object truly is: what most of its pixels show.
 
     Args:
@@ -300,7 +342,9 @@ def verdicts(scene: nextview.Scene, table: FullTable, truly: Sequence[np.ndarray
     """
     found = []
     for thing in scene.objects:
-        shown = np.concatenate([truly[frame][mask] for frame, mask in thing.pixels.items()])
+        shown = np.concatenate(
+            [truly[frame][mask] for frame, mask in thing.pixels.items()]
+        )
         row = int(np.bincount(shown + 1).argmax()) - 1
         true = table.things[row] if row >= 0 else None
         found.append(Verdict(thing, row, true, 0 <= row < len(table.things) - 1))
@@ -313,7 +357,9 @@ def summary(found: Sequence[Verdict], table: FullTable) -> list[str]:
     known = len(table.things) - 1
     named = [one for row, one in right.items() if row < known]
     sure = sum(one.found.confident for one in named)
-    said = [f"{len(named)} of {known} things named right, {sure} of them with confidence"]
+    said = [
+        f"{len(named)} of {known} things named right, {sure} of them with confidence"
+    ]
     if known in right:
         said.append(f"the stranger, a {table.things[-1].name}, is told as unknown")
     wrong = {one.row: one for one in found if one.wrong}
@@ -370,7 +416,9 @@ def main(
     arm = Arm(standing, np.random.default_rng(seed), sensor=SENSORS["wrist"])
     start = arm.solve(first_pose())
     if start is None:
-        raise UsageError("the arm cannot look from where it is to begin: try another --seed")
+        raise UsageError(
+            "the arm cannot look from where it is to begin: try another --seed"
+        )
     arm.joints = start
 
     shown = None
@@ -385,15 +433,21 @@ def main(
         if look.taken:
             truly.append(arm.owner)
         sure = sum(thing.confident for thing in scene.objects)
-        print(f"look {len(truly)}: {len(scene.objects)} objects, {sure} with a sure name")
+        print(
+            f"look {len(truly)}: {len(scene.objects)} objects, {sure} with a sure name"
+        )
         if shown is not None and look.taken:
             found = verdicts(scene, table, truly)
-            wrong = {one.found.number for one in found if one.wrong and one.found.confident}
+            wrong = {
+                one.found.number for one in found if one.wrong and one.found.confident
+            }
             shown.looked(scene, {one.found.number: one.row for one in found}, wrong)
 
     scene = recognise(arm, nextview.load("ycb", max_views=looks), looked)
     found = verdicts(scene, table, truly)
-    print("\n".join([*(one.line(arm.lean) for one in found), "", *summary(found, table)]))
+    print(
+        "\n".join([*(one.line(arm.lean) for one in found), "", *summary(found, table)])
+    )
     print(f"{arm.seconds:.2f} s of motion")
     if shown is not None:
         shown.save(summary(found, table))

@@ -32,7 +32,9 @@ def mug() -> trimesh.Trimesh:
     wall = trimesh.creation.annulus(0.036, 0.04, 0.1).apply_translation((0, 0, 0.05))
     bottom = trimesh.creation.cylinder(0.04, 0.006).apply_translation((0, 0, 0.003))
     handle = trimesh.creation.torus(0.03, 0.006)
-    handle.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
+    handle.apply_transform(
+        trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0))
+    )
     handle.apply_translation((0.055, 0, 0.05))
     return trimesh.util.concatenate([wall, bottom, handle])
 
@@ -55,9 +57,14 @@ class Robot:
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
         self.true = np.eye(4)
-        self.true[:3, :3] = Rotation.from_rotvec([0, 0, rng.uniform(0, 2 * np.pi)]).as_matrix()
+        self.true[:3, :3] = Rotation.from_rotvec(
+            [0, 0, rng.uniform(0, 2 * np.pi)]
+        ).as_matrix()
         self.true[:3, 3] = *rng.uniform(-0.3, 0.3, 2), 0.0
-        things = [mug().apply_transform(self.true), trimesh.creation.box((1.5, 1.5, 0.04))]
+        things = [
+            mug().apply_transform(self.true),
+            trimesh.creation.box((1.5, 1.5, 0.04)),
+        ]
         things[1].apply_translation((0, 0, -0.02))
         self.caster = RayCaster(
             [(thing.vertices, thing.faces.astype(np.int32)) for thing in things]

@@ -30,7 +30,8 @@ def recognise(
 ) -> nextview.Recognition:
     """What a user writes; ``arm.run`` is the loop of ``arm_and_object.py``."""
     session = nextview.load(threshold=threshold).session(
-        object=ObservedObject(life_size=False), distance=0.4
+        object=ObservedObject(life_size=False),
+        distance=0.4,
     )
     return arm.run(session, lambda: looked(session))
 

@@ -63,7 +63,8 @@ class Film:
             return
         palette = self.frames[-1].quantize(96)
         frames = [
-            frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in self.frames
+            frame.quantize(palette=palette, dither=Image.Dither.NONE)
+            for frame in self.frames
         ]
         frames += [frames[-1]] * (2 * RATE)
         frames[0].save(
@@ -103,7 +104,9 @@ def evenly(way, n):
     out.
     """
     fine = along(way, 0.02)
-    at = np.array([seconds_of(fine[: k + 1]) for k in range(len(fine))]) / seconds_of(fine)
+    at = np.array([seconds_of(fine[: k + 1]) for k in range(len(fine))]) / seconds_of(
+        fine
+    )
     for done in np.linspace(0, 1, max(n, 1) + 1)[1:]:
         k = min(int(np.searchsorted(at, done)), len(fine) - 1)
         yield fine[k], done
@@ -114,7 +117,8 @@ def scene(things, pose):
     width = FINER * SIZE[0]
     height = FINER * SIZE[1]
     x, y = np.meshgrid(
-        (np.arange(width) + 0.5) / width - 0.5, (np.arange(height) + 0.5 - height / 2) / width
+        (np.arange(width) + 0.5) / width - 0.5,
+        (np.arange(height) + 0.5 - height / 2) / width,
     )
     rays = np.stack([x, y, np.full(x.shape, 1.0)], -1).reshape(-1, 3) @ pose[:3, :3].T
     triangles = [each for each, _ in things]
@@ -125,11 +129,15 @@ def scene(things, pose):
     normals = hits["Ng"][hit] / np.linalg.norm(hits["Ng"][hit], axis=1, keepdims=True)
     normals *= -np.sign((normals * rays[hit]).sum(1))[:, None]
     points = pose[:3, 3] + rays[hit] * hits["tfar"][hit, None] + 1e-3 * normals
-    shadow = first_hits(cast, points, np.broadcast_to(LIGHT, points.shape))["primID"] >= 0
+    shadow = (
+        first_hits(cast, points, np.broadcast_to(LIGHT, points.shape))["primID"] >= 0
+    )
     lit = np.maximum(normals @ LIGHT, 0) * ~shadow
     facing = np.abs((normals * rays[hit]).sum(1)) / np.linalg.norm(rays[hit], axis=1)
     picture = np.tile(np.array(BACKGROUND, float) / 255, (len(rays), 1))
-    picture[hit] = colours[hits["geomID"][hit]] * (0.22 + 0.2 * facing + 0.55 * lit)[:, None]
+    picture[hit] = (
+        colours[hits["geomID"][hit]] * (0.22 + 0.2 * facing + 0.55 * lit)[:, None]
+    )
     image = Image.fromarray(
         (255 * picture.clip(0, 1) + 0.5).astype(np.uint8).reshape(height, width, 3)
     )
@@ -166,7 +174,8 @@ def beside(session):
     for row, k in enumerate(order):
         y = 306 + 21 * row
         draw.rectangle(
-            (90, y + 2, 90 + 100 * float(view.belief[k]), y + 14), ACCENT if row == 0 else GREY
+            (90, y + 2, 90 + 100 * float(view.belief[k]), y + 14),
+            ACCENT if row == 0 else GREY,
         )
         text(panel, (8, y), session.models.classes[k].replace("_", " "), 12)
     return panel

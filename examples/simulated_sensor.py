@@ -17,7 +17,11 @@ def look(things, pose, rng):
     """
     scene = EmbreeScene()
     for vertices, faces in things:
-        TriangleMesh(scene, np.asarray(vertices, np.float32), np.ascontiguousarray(faces, np.int32))
+        TriangleMesh(
+            scene,
+            np.asarray(vertices, np.float32),
+            np.ascontiguousarray(faces, np.int32),
+        )
     row, column = np.indices(SHAPE)
     x = (column - INTRINSICS[0, 2]) / INTRINSICS[0, 0]
     y = (row - INTRINSICS[1, 2]) / INTRINSICS[1, 1]
@@ -33,7 +37,12 @@ def look(things, pose, rng):
 def square(half, height=0.0):
     """A level square about the z axis."""
     corners = np.array(
-        [[-half, -half, height], [half, -half, height], [half, half, height], [-half, half, height]]
+        [
+            [-half, -half, height],
+            [half, -half, height],
+            [half, half, height],
+            [-half, half, height],
+        ]
     )
     return corners, np.array([[0, 1, 2], [0, 2, 3]])
 
@@ -41,6 +50,12 @@ def square(half, height=0.0):
 def disc(radius, height=0.0):
     """A level disc about the z axis."""
     around = np.linspace(0, 2 * np.pi, 360, endpoint=False)
-    rim = np.stack([radius * np.cos(around), radius * np.sin(around), np.full(360, height)], 1)
+    rim = np.stack(
+        [radius * np.cos(around), radius * np.sin(around), np.full(360, height)],
+        1,
+    )
     k = np.arange(360)
-    return np.vstack([[[0, 0, height]], rim]), np.stack([0 * k, 1 + k, 1 + (k + 1) % 360], 1)
+    return np.vstack([[[0, 0, height]], rim]), np.stack(
+        [0 * k, 1 + k, 1 + (k + 1) % 360],
+        1,
+    )

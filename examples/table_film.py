@@ -17,7 +17,12 @@ from scipy import ndimage
 
 import nextview
 from nextview.geometry.viewsphere import look_at_origin
-from nextview.scene.figure import FIGURE_CELL, OBJECT_COLOURS, grey_picture, seen_from_above
+from nextview.scene.figure import (
+    FIGURE_CELL,
+    OBJECT_COLOURS,
+    grey_picture,
+    seen_from_above,
+)
 from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.session.style import ACCENT, GREY, INK, PAPER
 from research.arm import Arm, seconds_of
@@ -28,7 +33,9 @@ SIDE = 348  # width of what is shown beside it, pixels
 INSET = 12  # pixels
 FINER = 2  # rays for a pixel, along each side
 RATE = 12  # frames a second
-SLOWER = 4.0  # so many times slower than at the joints' velocity limits motions are shown
+SLOWER = (
+    4.0  # so many times slower than at the joints' velocity limits motions are shown
+)
 STILL = 1.4  # seconds that are shown after a look
 LAST = 4.0  # and at the end
 FOCAL = 1.45  # of the camera that films, widths of the picture
@@ -38,12 +45,16 @@ AWAY = 2.05  # metres
 CLAY = np.array([0.60, 0.57, 0.53])
 TABLE = np.array([0.66, 0.58, 0.47])
 LAMP = 0.09  # radius of the lamp, a unit away
-SHADOW_SAMPLES = 5  # rays to the lamp from each point on which the arm may throw its shadow
+SHADOW_SAMPLES = (
+    5  # rays to the lamp from each point on which the arm may throw its shadow
+)
 SKY_SAMPLES = 48
 PLAN = 0.31  # metres from its middle to the border of the view from above
 COLOURS_IN_GIF = 255
 FRAMES_OF_PALETTE = 10  # from which the palette is made
-NO_RED = tuple(OBJECT_COLOURS[k] for k in (0, 2, 3, 4, 5, 7, 8))  # red is for what is wrong
+NO_RED = tuple(
+    OBJECT_COLOURS[k] for k in (0, 2, 3, 4, 5, 7, 8)
+)  # red is for what is wrong
 BESIDE = 24  # pixels beside what was found that are shown with it
 ABOVE = np.array([0, 0, 0.035])  # metres from the top of a thing to its name
 VIEW = 0.42  # metres to where the view of the camera on the wrist is drawn
@@ -75,7 +86,12 @@ class Film:
         self._pose[:3, 3] += LOOKED_AT
         self._light_table()
 
-    def looked(self, scene: nextview.Scene, owner: dict[int, int], wrong: set[int]) -> None:
+    def looked(
+        self,
+        scene: nextview.Scene,
+        owner: dict[int, int],
+        wrong: set[int],
+    ) -> None:
         """Film the way to the last look, and what is known after it.
 
         Args:
@@ -106,7 +122,9 @@ class Film:
         coverage = Image.Quantize.MAXCOVERAGE  # small things keep their colours
         palette = few.quantize(COLOURS_IN_GIF, method=coverage, kmeans=3)
         plain = Image.Dither.NONE
-        frames = [frame.quantize(palette=palette, dither=plain) for frame in self.frames]
+        frames = [
+            frame.quantize(palette=palette, dither=plain) for frame in self.frames
+        ]
         frames[0].save(
             self.path,
             save_all=True,
@@ -120,12 +138,20 @@ class Film:
 
     def _light_table(self) -> None:
         """Cast the table and the things on it once: where light falls and what each pixel shows."""
-        things = [triangles for triangles, _ in self.arm.things()[: 1 + self.arm.standing]]
-        stage = Stage([(*apart(*one), (float(k), 0, 0)) for k, one in enumerate(things)])
+        things = [
+            triangles for triangles, _ in self.arm.things()[: 1 + self.arm.standing]
+        ]
+        stage = Stage(
+            [(*apart(*one), (float(k), 0, 0)) for k, one in enumerate(things)]
+        )
         rays = self._rays()
         hit, points, normals, rows = stage.hits(self._pose[:3, 3], rays)
         sky, lamp = stage.lit(
-            points, normals, np.ones_like(points), np.random.default_rng(0), SKY_SAMPLES
+            points,
+            normals,
+            np.ones_like(points),
+            np.random.default_rng(0),
+            SKY_SAMPLES,
         )
         # the same places of the lamp for all pixels and all frames: shadows without grain
         ball = np.random.default_rng(0).normal(size=(SHADOW_SAMPLES, 3))
@@ -139,14 +165,25 @@ class Film:
         self._albedo = np.tile(CLAY, (len(things), 1))
         self._albedo[0] = TABLE
         self._tops = [
-            0.5 * (v.min(0) + v.max(0)) * [1, 1, 0] + [0, 0, v[:, 2].max()] for v, _ in things
+            0.5 * (v.min(0) + v.max(0)) * [1, 1, 0] + [0, 0, v[:, 2].max()]
+            for v, _ in things
         ]
 
     def _rays(self) -> Array:
         """Rays of the camera that films, row by row."""
-        return rays_of(self._pose, FINER * FOCAL * SIZE[0], FINER * SIZE[0], FINER * SIZE[1])
+        return rays_of(
+            self._pose,
+            FINER * FOCAL * SIZE[0],
+            FINER * SIZE[0],
+            FINER * SIZE[1],
+        )
 
-    def _colour(self, scene: nextview.Scene, owner: dict[int, int], wrong: set[int]) -> None:
+    def _colour(
+        self,
+        scene: nextview.Scene,
+        owner: dict[int, int],
+        wrong: set[int],
+    ) -> None:
         """Give the things that are known their colours and names."""
         self._albedo[1:] = CLAY
         self._labels = []
@@ -159,7 +196,12 @@ class Film:
                 self._albedo[row] = linear(colour)
             self._labels.append((self._tops[row], words(thing, wrong), colour))
 
-    def _show(self, seconds: float, said: Sequence[str] = (), looking: bool = False) -> None:
+    def _show(
+        self,
+        seconds: float,
+        said: Sequence[str] = (),
+        looking: bool = False,
+    ) -> None:
         """Add a frame: the arm as it is now, and lines on it."""
         frame = Image.new("RGB", (SIZE[0] + SIDE, SIZE[1]), PAPER)
         picture = self._filmed_now()
@@ -167,7 +209,10 @@ class Film:
         if looking:
             self._draw_view(draw)
         taken: list[Array] = []
-        placed = [(self._place(top + ABOVE), name, colour) for top, name, colour in self._labels]
+        placed = [
+            (self._place(top + ABOVE), name, colour)
+            for top, name, colour in self._labels
+        ]
         for at, name, colour in sorted(placed, key=lambda label: -label[0][1]):
             tag(draw, at, name, colour, taken)
         frame.paste(picture, (0, 0))
@@ -181,7 +226,9 @@ class Film:
     def _filmed_now(self) -> Image.Image:
         """The arm over the table, lit."""
         links = self.arm.things()[1 + self.arm.standing :]
-        stage = Stage([(vertices, faces, colour) for (vertices, faces), colour in links])
+        stage = Stage(
+            [(vertices, faces, colour) for (vertices, faces), colour in links]
+        )
         eye = self._pose[:3, 3]
         shadow = stage.blocked(self._points + 1e-3 * KEY, self._lamps[:, None]).mean(0)
         lamp = self._lamp * (1 - shadow)[:, None]
@@ -190,9 +237,11 @@ class Film:
 
         corners = np.concatenate([vertices for (vertices, _), _ in links])
         low, high = (
-            np.clip(f(self._place(corners), axis=0) * FINER + d, 0, np.array(SIZE) * FINER).astype(
-                int
-            )
+            np.clip(
+                f(self._place(corners), axis=0) * FINER + d,
+                0,
+                np.array(SIZE) * FINER,
+            ).astype(int)
             for f, d in ((np.min, -2), (np.max, 2))
         )
         part = np.zeros((SIZE[1] * FINER, SIZE[0] * FINER), bool)
@@ -218,8 +267,12 @@ class Film:
         pose = self.arm.pose
         k = self.arm.sensor.intrinsics
         height, width = self.arm.sensor.shape
-        corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - k[:2, 2]
-        rays = np.column_stack([corners / k[[0, 1], [0, 1]], np.ones(4)]) @ pose[:3, :3].T
+        corners = (
+            np.array([[0, 0], [width, 0], [width, height], [0, height]]) - k[:2, 2]
+        )
+        rays = (
+            np.column_stack([corners / k[[0, 1], [0, 1]], np.ones(4)]) @ pose[:3, :3].T
+        )
         ends = pose[:3, 3] + VIEW * rays
         eye = tuple(self._place(pose[:3, 3]))
         flat = [tuple(one) for one in self._place(ends)]
@@ -286,7 +339,8 @@ def wrist_picture(scene: nextview.Scene, wrong: set[int]) -> Image.Image:
         colour = np.array(ImageColor.getrgb(colour_of(thing, wrong)))
         whole = ndimage.binary_fill_holes(ndimage.binary_closing(mask, iterations=3))
         rim = ndimage.binary_dilation(whole, iterations=2) & ~ndimage.binary_erosion(
-            whole, iterations=2
+            whole,
+            iterations=2,
         )
         picture[whole] = 0.65 * picture[whole] + 0.35 * colour
         picture[rim] = colour
@@ -295,12 +349,21 @@ def wrist_picture(scene: nextview.Scene, wrong: set[int]) -> Image.Image:
     width = SIDE - 2 * INSET
     left, top, right, bottom = part_of_frame(scene)
     share = width / (right - left)
-    cut = Image.fromarray(picture.clip(0, 255).astype(np.uint8)).crop((left, top, right, bottom))
+    cut = Image.fromarray(picture.clip(0, 255).astype(np.uint8)).crop(
+        (left, top, right, bottom)
+    )
     small = cut.resize((width, round(share * (bottom - top))), Image.Resampling.LANCZOS)
     draw = ImageDraw.Draw(small)
     taken: list[tuple[float, float, float]] = []
     for thing, x, y in sorted(names, key=lambda each: -each[2]):
-        write(draw, thing, (share * (x - left), share * (y - top) - 6), wrong, taken, small.size)
+        write(
+            draw,
+            thing,
+            (share * (x - left), share * (y - top) - 6),
+            wrong,
+            taken,
+            small.size,
+        )
     return small
 
 
@@ -321,7 +384,10 @@ def part_of_frame(scene: nextview.Scene) -> tuple[int, int, int, int]:
 
 
 def plan_picture(
-    scene: nextview.Scene, middle: Array, wrong: set[int], size: tuple[int, int]
+    scene: nextview.Scene,
+    middle: Array,
+    wrong: set[int],
+    size: tuple[int, int],
 ) -> Image.Image:
     """All from above as the camera that films sees it: away from it is up."""
     ahead = -np.array([np.cos(FILMED_FROM[1]), np.sin(FILMED_FROM[1]), 0.0])
@@ -341,12 +407,20 @@ def plan_picture(
             corners = [tuple(one) for one in flat(ring)]
             draw.polygon(corners, (*colour, 70))
             draw.line([*corners, corners[0]], (*colour, 255), 2 * FINER)
-    places = np.array([frame.camera_to_world[:3, 3] for frame in scene.frames]) @ upright.T
-    dots = [tuple(np.clip(one, 8, FINER * np.array(size) - 8)) for one in flat(places[:, :2])]
+    places = (
+        np.array([frame.camera_to_world[:3, 3] for frame in scene.frames]) @ upright.T
+    )
+    dots = [
+        tuple(np.clip(one, 8, FINER * np.array(size) - 8))
+        for one in flat(places[:, :2])
+    ]
     draw.line(dots, (*ImageColor.getrgb(INK), 110), FINER)
     for k, (x, y) in enumerate(dots):
         r = (3 if k < len(dots) - 1 else 5) * FINER
-        draw.ellipse((x - r, y - r, x + r, y + r), ACCENT if k == len(dots) - 1 else INK)
+        draw.ellipse(
+            (x - r, y - r, x + r, y + r),
+            ACCENT if k == len(dots) - 1 else INK,
+        )
     picture = picture.resize(size, Image.Resampling.LANCZOS)
     draw = ImageDraw.Draw(picture)
     taken: list[tuple[float, float, float]] = []
@@ -382,14 +456,31 @@ def write(
     half = draw.textlength(text, letters) / 2 + 2
     x = float(np.clip(at[0], half, size[0] - half))
     y = float(np.clip(at[1], 14, size[1] - 4))
-    while any(abs(y - b) < 12 and abs(x - a) < half + other for a, b, other in taken) and y > 14:
+    while (
+        any(abs(y - b) < 12 and abs(x - a) < half + other for a, b, other in taken)
+        and y > 14
+    ):
         y -= 4
     taken.append((x, y, half))
     colour = INK if thing.name == UNKNOWN_NAME else colour_of(thing, wrong)
-    draw.text((x, y), text, colour, letters, anchor="ms", stroke_width=2, stroke_fill="white")
+    draw.text(
+        (x, y),
+        text,
+        colour,
+        letters,
+        anchor="ms",
+        stroke_width=2,
+        stroke_fill="white",
+    )
 
 
-def tag(draw: ImageDraw.ImageDraw, at: Array, text: str, colour: str, taken: list[Array]) -> None:
+def tag(
+    draw: ImageDraw.ImageDraw,
+    at: Array,
+    text: str,
+    colour: str,
+    taken: list[Array],
+) -> None:
     """Write a name on a coloured ground where no other is, and remember where."""
     letters = font(12, True)
     half = draw.textlength(text, letters) / 2 + 8
@@ -414,7 +505,9 @@ def colour_of(thing: SceneObject, wrong: set[int]) -> str:
     """The colour of an object: grey for an unknown one, red for a wrong name."""
     if thing.number in wrong:
         return ACCENT
-    return GREY if thing.name == UNKNOWN_NAME else NO_RED[(thing.number - 1) % len(NO_RED)]
+    return (
+        GREY if thing.name == UNKNOWN_NAME else NO_RED[(thing.number - 1) % len(NO_RED)]
+    )
 
 
 def linear(colour: str) -> Array:
@@ -426,4 +519,7 @@ def apart(vertices: Array, faces: Array) -> tuple[Array, Array]:
     """The same triangles without shared corners where they are few: edges stay sharp."""
     if len(faces) > SHARP:
         return vertices, faces
-    return vertices[faces].reshape(-1, 3), np.arange(3 * len(faces), dtype=np.int32).reshape(-1, 3)
+    return vertices[faces].reshape(-1, 3), np.arange(
+        3 * len(faces),
+        dtype=np.int32,
+    ).reshape(-1, 3)

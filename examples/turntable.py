@@ -40,7 +40,9 @@ class Turntable:
         pose = look_at_origin(np.radians(ELEVATION), np.radians(-self.angle), DISTANCE)
         pose[2, 3] += 0.08  # it aims a little over the plate
         return look(
-            [disc(0.25), disc(9.0, -0.1), *([] if empty else [self.thing])], pose, self.rng
+            [disc(0.25), disc(9.0, -0.1), *([] if empty else [self.thing])],
+            pose,
+            self.rng,
         ), pose
 
     def turn_to(self, angle):
@@ -61,7 +63,8 @@ def recognise(turntable: Turntable) -> nextview.Recognition:
     empty = np.fmax(turntable.look(empty=True)[0], turntable.look(empty=True)[0])
     thing = ObservedObject(support=False, life_size=False)
     session = nextview.load(viewpoints=f"rings:{ELEVATION}x24", threshold=0.99).session(
-        object=thing, distance=DISTANCE
+        object=thing,
+        distance=DISTANCE,
     )
     session.travel_cost = seconds
     while not session.done:
@@ -73,7 +76,11 @@ def recognise(turntable: Turntable) -> nextview.Recognition:
     return session.result
 
 
-def main(mesh: tyro.conf.Positional[Path], seed: int = 0, figure: Path | None = None) -> None:
+def main(
+    mesh: tyro.conf.Positional[Path],
+    seed: int = 0,
+    figure: Path | None = None,
+) -> None:
     result = recognise(Turntable(nextview.load_mesh(mesh), np.random.default_rng(seed)))
     print(result)
     if figure:

@@ -57,7 +57,10 @@ class ActiveRecogniseEnv(ap_gym.ActiveClassificationEnv):
         self.observation_space = self._env.observation_space
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """See ``gymnasium.Env.reset``."""
         super().reset(seed=seed)
@@ -65,7 +68,9 @@ class ActiveRecogniseEnv(ap_gym.ActiveClassificationEnv):
         return self._env.reset(options=options)
 
     def _step(
-        self, action: Any, prediction: NDArray[np.floating]
+        self,
+        action: Any,
+        prediction: NDArray[np.floating],
     ) -> tuple[Any, float, bool, bool, dict, Any]:
         seen = self._env.go(action)
         info = info_of(seen)
@@ -77,7 +82,10 @@ class ActiveRecogniseEnv(ap_gym.ActiveClassificationEnv):
 class ActiveRecogniseVectorEnv(ap_gym.ActiveClassificationVectorEnv):
     """Many episodes at once; arguments as for ``RecogniseVectorEnv``."""
 
-    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": [],
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
 
     def __init__(
         self,
@@ -88,12 +96,19 @@ class ActiveRecogniseVectorEnv(ap_gym.ActiveClassificationVectorEnv):
         **rules: Any,
     ) -> None:
         self._env = RecogniseVectorEnv(num_envs, predictions, split, balanced, **rules)
-        super().__init__(num_envs, len(self._env.task.classes), self._env.single_action_space)
+        super().__init__(
+            num_envs,
+            len(self._env.task.classes),
+            self._env.single_action_space,
+        )
         self.single_observation_space = self._env.single_observation_space
         self.observation_space = self._env.observation_space
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """See ``gymnasium.vector.VectorEnv.reset``."""
         super().reset(seed=seed)
@@ -101,7 +116,9 @@ class ActiveRecogniseVectorEnv(ap_gym.ActiveClassificationVectorEnv):
         return self._env.reset(options=options)
 
     def _step(
-        self, action: Any, prediction: NDArray[np.floating]
+        self,
+        action: Any,
+        prediction: NDArray[np.floating],
     ) -> tuple[Any, Any, Any, Any, dict, Any]:
         seen, info = self._env.go(action)
         target = (

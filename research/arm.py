@@ -102,7 +102,8 @@ def _assets() -> Path:
     if spec is None or spec.origin is None:
         with extras():
             raise ModuleNotFoundError(
-                "No module named 'gymnasium_robotics'", name="gymnasium_robotics"
+                "No module named 'gymnasium_robotics'",
+                name="gymnasium_robotics",
             )
     return Path(spec.origin).parent / "envs/assets/kitchen_franka/franka_assets"
 
@@ -120,7 +121,9 @@ def put_down(mesh: Mesh, rng: np.random.Generator, radius: float = 0.1) -> Trian
     """
     cos = np.cos(turn := rng.uniform(0, 2 * np.pi))
     sin = np.sin(turn)
-    vertices = radius * mesh.vertices @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+    vertices = (
+        radius * mesh.vertices @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+    )
     vertices += [*(OBJECT + rng.uniform(-0.05, 0.05, 2)), -vertices[:, 2].min()]
     return vertices, mesh.faces
 
@@ -133,7 +136,9 @@ def _model(things: Sequence[Triangles]) -> Any:
     with extras():
         import mujoco
 
-    spec = mujoco.MjSpec.from_string(SCENE.format(assets=_assets(), clearance=CLEARANCE))
+    spec = mujoco.MjSpec.from_string(
+        SCENE.format(assets=_assets(), clearance=CLEARANCE)
+    )
     for finger in "12":  # it holds nothing: the hand stays closed
         spec.delete(spec.joint(f"robot:panda0_finger_joint{finger}"))
     for k, limits in enumerate(RANGES - OFFSETS[:, None]):
@@ -161,10 +166,17 @@ def _model(things: Sequence[Triangles]) -> Any:
             rgba=[0.15, 0.15, 0.18, 1],
             mass=0.05,
         )
-    shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # of meshes that enclose no volume, too
+    shell = (
+        mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    )  # of meshes that enclose no volume, too
     for k, (vertices, faces) in enumerate(things):
         name = f"thing{k}"
-        spec.add_mesh(name=name, uservert=vertices.ravel(), userface=faces.ravel(), inertia=shell)
+        spec.add_mesh(
+            name=name,
+            uservert=vertices.ravel(),
+            userface=faces.ravel(),
+            inertia=shell,
+        )
         spec.worldbody.add_geom(
             name=name,
             type=mujoco.mjtGeom.mjGEOM_MESH,
@@ -225,13 +237,20 @@ class Arm:
         # Turning the camera about its line of sight shows nothing new: that much the arm is free to
         # choose.
         self._aim = mink.FrameTask(
-            "camera", "site", position_cost=1.0, orientation_cost=[0.3, 0.3, 0.0], lm_damping=1e-4
+            "camera",
+            "site",
+            position_cost=1.0,
+            orientation_cost=[0.3, 0.3, 0.0],
+            lm_damping=1e-4,
         )
         self._rest = mink.PostureTask(self.model, cost=1e-3)
         self._rest.set_target(HOME)
         names = [self.model.joint(k).name for k in range(7)]
         limits = dict(zip(names, FASTEST, strict=True))
-        self._limits = [mink.ConfigurationLimit(self.model), mink.VelocityLimit(self.model, limits)]
+        self._limits = [
+            mink.ConfigurationLimit(self.model),
+            mink.VelocityLimit(self.model, limits),
+        ]
         self._solved: dict[tuple[bytes, bytes], Float | None] = {}
 
     # Kinematics
@@ -300,7 +319,11 @@ class Arm:
             self._aim.set_target(mink.SE3.from_matrix(target))
             try:
                 velocity = mink.solve_ik(
-                    arm, [self._aim, self._rest], 0.2, "daqp", limits=self._limits
+                    arm,
+                    [self._aim, self._rest],
+                    0.2,
+                    "daqp",
+                    limits=self._limits,
                 )
             except mink.NoSolutionFound:
                 return None
@@ -321,7 +344,11 @@ class Arm:
             return None
         ways = ([self.joints, end], [self.joints, HOME, end])
         return next(
-            (way for way in ways if not any(self.touches(joints) for joints in along(way, FINE))),
+            (
+                way
+                for way in ways
+                if not any(self.touches(joints) for joints in along(way, FINE))
+            ),
             None,
         )
 
@@ -384,12 +411,17 @@ class Arm:
         for k in range(model.ngeom):
             if model.geom_group[k] != 3:  # those are hulls, for collisions
                 vertices, faces = _triangles(model, k, self._mujoco)
-                placed = vertices @ data.geom_xmat[k].reshape(3, 3).T + data.geom_xpos[k]
+                placed = (
+                    vertices @ data.geom_xmat[k].reshape(3, 3).T + data.geom_xpos[k]
+                )
                 found.append(((placed, faces), model.geom_rgba[k, :3].astype(float)))
         return found
 
     def run(
-        self, session: Session, looked: Callable[[], None] = lambda: None, costs: bool = True
+        self,
+        session: Session,
+        looked: Callable[[], None] = lambda: None,
+        costs: bool = True,
     ) -> Recognition:
         """Go on with a session to its end: look, and move to where it asks, if there is a way.
 
@@ -417,7 +449,12 @@ class Arm:
         return session.result
 
 
-def first_joints(arm: Arm, elevation: float, azimuth: float, distance: float) -> Float | None:
+def first_joints(
+    arm: Arm,
+    elevation: float,
+    azimuth: float,
+    distance: float,
+) -> Float | None:
     """Joints with which the camera looks at the middle of ``OBJECT`` from some angles, radians,
     and metres; or None.
     """
@@ -457,7 +494,10 @@ def _turned_least(rotation: Float, forward: Float) -> Float:
     return (np.eye(3) + across + across @ across / (1 + cosine)) @ rotation
 
 
-CORNERS = np.stack(np.meshgrid([-1.0, 1], [-1.0, 1], [-1.0, 1], indexing="ij"), -1).reshape(8, 3)
+CORNERS = np.stack(
+    np.meshgrid([-1.0, 1], [-1.0, 1], [-1.0, 1], indexing="ij"),
+    -1,
+).reshape(8, 3)
 SIDES = np.array(
     [
         [0, 1, 3],

@@ -17,7 +17,10 @@ corners of its own.
 
 def bent(surface: Surface) -> BentSurface:
     """A surface with its curvature; the same one for the same surface."""
-    return surface.__dict__.setdefault("bent", BentSurface(surface.vertices, surface.faces))
+    return surface.__dict__.setdefault(
+        "bent",
+        BentSurface(surface.vertices, surface.faces),
+    )
 
 
 class BentSurface(Surface):
@@ -56,7 +59,9 @@ class BentSurface(Surface):
                 .astype(np.int64)
             )
             _, edge, count = np.unique(
-                both @ [int(ends.max()) + 1, 1], return_inverse=True, return_counts=True
+                both @ [int(ends.max()) + 1, 1],
+                return_inverse=True,
+                return_counts=True,
             )
             two = count[edge] == 2
             found.append(left[two][np.argsort(edge[two], kind="stable")].reshape(-1, 2))
@@ -72,7 +77,10 @@ class BentSurface(Surface):
 
         first, second = self._pairs
         n = len(self.faces)
-        graph = coo_array((np.ones(len(first), bool), (first // 3, second // 3)), (n, n))
+        graph = coo_array(
+            (np.ones(len(first), bool), (first // 3, second // 3)),
+            (n, n),
+        )
         return connected_components(graph, directed=False)[1].astype(np.int64)
 
     @cached_property
@@ -90,12 +98,18 @@ class BentSurface(Surface):
         place = self.places.ravel()
         begin = second
         end = second - second % 3 + (second + 1) % 3
-        same = place[first] == place[begin]  # the neighbour may run along the edge either way
+        same = (
+            place[first] == place[begin]
+        )  # the neighbour may run along the edge either way
         ahead = first - first % 3 + (first + 1) % 3
         one = np.concatenate([first, ahead])
         other = np.concatenate([np.where(same, begin, end), np.where(same, end, begin)])
         graph = coo_array((np.ones(len(one), bool), (one, other)), (n, n))
-        return connected_components(graph, directed=False)[1].astype(np.int64).reshape(-1, 3)
+        return (
+            connected_components(graph, directed=False)[1]
+            .astype(np.int64)
+            .reshape(-1, 3)
+        )
 
     @cached_property
     def angles(self) -> NDArray[np.float64]:
@@ -126,8 +140,20 @@ class BentSurface(Surface):
         thesis's equation 4, which has the 3 below the line: nine times less, everywhere alike). 1 /
         r^2 on a sphere of radius r.
         """
-        around = np.bincount(self.corners.ravel(), np.repeat(self.areas, 3), len(self.deficits)) / 3
-        return np.divide(self.deficits, around, out=np.zeros_like(around), where=around > 0)
+        around = (
+            np.bincount(
+                self.corners.ravel(),
+                np.repeat(self.areas, 3),
+                len(self.deficits),
+            )
+            / 3
+        )
+        return np.divide(
+            self.deficits,
+            around,
+            out=np.zeros_like(around),
+            where=around > 0,
+        )
 
     @cached_property
     def bends(self) -> NDArray[np.float64]:
@@ -140,7 +166,9 @@ class BentSurface(Surface):
         along = np.roll(corners, -1, 1) - corners
         inward = np.roll(corners, -2, 1) - corners
         square = np.maximum((along**2).sum(2, keepdims=True), np.finfo(float).tiny)
-        inward = (inward - along * (inward * along).sum(2, keepdims=True) / square).reshape(-1, 3)
+        inward = (
+            inward - along * (inward * along).sum(2, keepdims=True) / square
+        ).reshape(-1, 3)
         first, second = self._pairs
         u = inward[first]
         v = inward[second]
@@ -171,6 +199,15 @@ class BentSurface(Surface):
 
         Each corner's angle deficit, without sign, shared among its faces by their angles there.
         """
-        total = np.bincount(self.corners.ravel(), self.angles.ravel(), len(self.deficits))
-        each = np.divide(np.abs(self.deficits), total, out=np.zeros_like(total), where=total > 0)
+        total = np.bincount(
+            self.corners.ravel(),
+            self.angles.ravel(),
+            len(self.deficits),
+        )
+        each = np.divide(
+            np.abs(self.deficits),
+            total,
+            out=np.zeros_like(total),
+            where=total > 0,
+        )
         return (each[self.corners] * self.angles).sum(1)

@@ -31,7 +31,9 @@ def curvature_entropy(view: MeshView) -> float:
     """
     surface, (faces, _) = bent(view.surface), view.pixels
     curvature = surface.gaussian[surface.corners[faces]]
-    level = np.rint(np.arctan(curvature) * (2 * LEVELS / np.pi)).astype(np.int64) + LEVELS
+    level = (
+        np.rint(np.arctan(curvature) * (2 * LEVELS / np.pi)).astype(np.int64) + LEVELS
+    )
     weight = np.bincount(level.ravel(), np.repeat(seen_area(view), 3))
     return bits(weight / weight.sum()) if weight.sum() > 0 else 0.0
 
@@ -46,7 +48,9 @@ def mean_curvature(view: MeshView) -> float:
     Returns:
         Object radii: of a sphere of radius 1 from distance d, 2 pi (1 - 1/d).
     """
-    return float((bent(view.surface).mean_of_faces[view.pixels[0]] * seen_share(view)).sum())
+    return float(
+        (bent(view.surface).mean_of_faces[view.pixels[0]] * seen_share(view)).sum()
+    )
 
 
 def gaussian_curvature(view: MeshView) -> float:
@@ -59,4 +63,6 @@ def gaussian_curvature(view: MeshView) -> float:
     Returns:
         Radians squared: of a sphere from distance d, 2 pi (1 - 1/d).
     """
-    return float((bent(view.surface).gaussian_of_faces[view.pixels[0]] * seen_share(view)).sum())
+    return float(
+        (bent(view.surface).gaussian_of_faces[view.pixels[0]] * seen_share(view)).sum()
+    )

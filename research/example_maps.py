@@ -63,35 +63,71 @@ def example_maps(p: Predictions, name: str, rng: np.random.Generator) -> Figure:
     predicted = p.maps[name][kept, view]
     error = ((true.astype(np.float64) - predicted) ** 2).mean((1, 2))
     classes = np.unique(labels)
-    order = np.argsort([error[labels == index].mean() for index in classes], kind="stable")
+    order = np.argsort(
+        [error[labels == index].mean() for index in classes],
+        kind="stable",
+    )
     classes = classes[np.sort(order[_steps(len(classes), ROWS)])]
     gap = np.full((true.shape[1], 1), np.nan)
     with matplotlib.rc_context(style.FIGURE_STYLE):
         figure = style.PlainFigure((9.6, 0.6 + 1.3 * len(classes)))
         grid = figure.subplots(
-            len(classes), EXAMPLES, squeeze=False, gridspec_kw={"hspace": 0.35, "wspace": 0.12}
+            len(classes),
+            EXAMPLES,
+            squeeze=False,
+            gridspec_kw={"hspace": 0.35, "wspace": 0.12},
         )
     for axes in grid.flat:
         axes.set_axis_off()
     for row, index in zip(grid, classes, strict=True):
         row[0].text(
-            -0.1, 0.5, words(p.classes[index]), ha="right", va="center", transform=row[0].transAxes
+            -0.1,
+            0.5,
+            words(p.classes[index]),
+            ha="right",
+            va="center",
+            transform=row[0].transAxes,
         )
         here = np.flatnonzero(labels == index)
         here = here[np.argsort(error[here], kind="stable")]
         for axes, at in zip(row, here[_steps(len(here), EXAMPLES)], strict=False):
             pair = np.hstack([true[at], gap, predicted[at]])
-            axes.imshow(pair, cmap="viridis", vmin=0, vmax=1, origin="lower", aspect="auto")
-            for values, look in ((true[at], TRUE_PEAK), (predicted[at], PREDICTED_PEAK)):
+            axes.imshow(
+                pair,
+                cmap="viridis",
+                vmin=0,
+                vmax=1,
+                origin="lower",
+                aspect="auto",
+            )
+            for values, look in (
+                (true[at], TRUE_PEAK),
+                (predicted[at], PREDICTED_PEAK),
+            ):
                 ring, column = np.unravel_index(values.argmax(), values.shape)
                 axes.plot(
-                    [column, column + values.shape[1] + 1], [ring, ring], linestyle="", **look
+                    [column, column + values.shape[1] + 1],
+                    [ring, ring],
+                    linestyle="",
+                    **look,
                 )
-            thing = p.names[kept[at]].removeprefix(p.classes[index]).strip("_") or p.names[kept[at]]
-            axes.set_title(f"{thing[-12:]} view {view[at]}: {error[at]:.3f}", fontsize=7.5)
-    marks = [Line2D([], [], linestyle="", **look) for look in (TRUE_PEAK, PREDICTED_PEAK)]
+            thing = (
+                p.names[kept[at]].removeprefix(p.classes[index]).strip("_")
+                or p.names[kept[at]]
+            )
+            axes.set_title(
+                f"{thing[-12:]} view {view[at]}: {error[at]:.3f}",
+                fontsize=7.5,
+            )
+    marks = [
+        Line2D([], [], linestyle="", **look) for look in (TRUE_PEAK, PREDICTED_PEAK)
+    ]
     figure.legend(
-        marks, ["true peak", "predicted peak"], loc="upper right", ncols=2, bbox_to_anchor=(0.9, 1)
+        marks,
+        ["true peak", "predicted peak"],
+        loc="upper right",
+        ncols=2,
+        bbox_to_anchor=(0.9, 1),
     )
     return figure
 
@@ -122,7 +158,11 @@ def draw(
     """
     check_new(out, overwrite)
     p = chosen_split(Predictions.load(predictions), predictions, split)
-    if name not in p.maps or name not in known_maps(p) or len(judged_objects(p, name)) == 0:
+    if (
+        name not in p.maps
+        or name not in known_maps(p)
+        or len(judged_objects(p, name)) == 0
+    ):
         raise ResultsError(f"{predictions}: holds no map {name!r} whose truth is known")
     with new_file(out, overwrite) as part:
         style.to_png(example_maps(p, name, np.random.default_rng([seed, 1])), part)

@@ -61,7 +61,9 @@ from research.film_stage import (
 )
 
 PAIRS = 6
-SURE = 0.97  # belief in a name from which an episode ends, unless the thing may be unknown
+SURE = (
+    0.97  # belief in a name from which an episode ends, unless the thing may be unknown
+)
 COLOURS = (
     (0.10, 0.42, 0.68),
     (0.78, 0.16, 0.10),
@@ -76,7 +78,10 @@ TABLE = (0.50, 0.36, 0.24)
 SPACING = 0.5  # metres between things
 TABLE_RADIUS = 0.42  # metres, as of a thing: how wide the whole table is drawn
 TABLE_MIDDLE = np.array([0.02, -0.05, -0.2])
-OVER_THE_TABLE = (48.0, -90.0)  # elevation and azimuth from which the whole table is drawn, degrees
+OVER_THE_TABLE = (
+    48.0,
+    -90.0,
+)  # elevation and azimuth from which the whole table is drawn, degrees
 RIVAL_SIDE = 120  # pixels of the pictures of rivals
 STEP = 0.5  # seconds a view is shown
 PAUSE = 0.7  # seconds an answer is shown
@@ -128,13 +133,19 @@ class Cast:
             first, second = np.unravel_index(some.argmin(), some.shape)
             left[[first, second]] = False
             pairs.append((things.names[first], things.names[second]))
-            print(f"{pairs[-1][0]} and {pairs[-1][1]}: {some[first, second]:.3f} radii apart")
+            print(
+                f"{pairs[-1][0]} and {pairs[-1][1]}: {some[first, second]:.3f} radii apart"
+            )
         colour = {name: COLOURS[k] for k, pair in enumerate(pairs) for name in pair}
         order = rng.permutation(sorted(colour)).tolist()
         return cls({name: colour[name] for name in order})
 
 
-def laid_out(folder: Path, cast: Cast, rng: np.random.Generator) -> list[tuple[Mesh, Array]]:
+def laid_out(
+    folder: Path,
+    cast: Cast,
+    rng: np.random.Generator,
+) -> list[tuple[Mesh, Array]]:
     """The things, turned at random, and where their centres are, metres."""
     placed = []
     for k, name in enumerate(cast.names):
@@ -142,7 +153,9 @@ def laid_out(folder: Path, cast: Cast, rng: np.random.Generator) -> list[tuple[M
         mesh = rotated(load_mesh(folder / f"{name}.ply", unit="m"), turn)
         column = k % 4 - 1.5 + 0.25 * (k // 4 % 2)
         x, y = SPACING * np.array([column, 1 - k // 4]) + rng.uniform(-0.05, 0.05, 2)
-        placed.append((mesh, np.array([x, y, -mesh.vertices[:, 2].min() * mesh.metres])))
+        placed.append(
+            (mesh, np.array([x, y, -mesh.vertices[:, 2].min() * mesh.metres]))
+        )
     return placed
 
 
@@ -177,13 +190,19 @@ def episode(system: nextview.System, placed: list, k: int, seed: int) -> Run:
     camera = SensedCamera(mesh, "wrist", rng, around=around, table=40.0)
     session = system.session(seed=seed + k)
     stands = system.sphere.directions * camera.sensor.distance / camera.sensor.radius
-    apart = np.linalg.norm(stands[:, None] - around.vertices[::7], axis=2).min(1) * mesh.metres
+    apart = (
+        np.linalg.norm(stands[:, None] - around.vertices[::7], axis=2).min(1)
+        * mesh.metres
+    )
     session.reachable = (apart > 0.1) & (stands[:, 2] * mesh.metres + centre[2] > 0.04)
 
     looks = []
     while not session.done:
         view = session.update(camera.observe(session.pose))
-        leading = [(system.classes[c], float(view.belief[c])) for c in np.argsort(-view.belief)[:3]]
+        leading = [
+            (system.classes[c], float(view.belief[c]))
+            for c in np.argsort(-view.belief)[:3]
+        ]
         outlook = None if session.done else session.outlook
         rivals = None
         names = ("", "")
@@ -191,18 +210,31 @@ def episode(system: nextview.System, placed: list, k: int, seed: int) -> Run:
             towards = system.sphere.directions[[view.next_view]]
             rivals = outlook.rivals(outlook.cameras(towards)[0], RIVAL_SIDE)
         if rivals is not None:
-            names = tuple(outlook.caster.surfaces[thing].name for thing in rivals.things)
+            names = tuple(
+                outlook.caster.surfaces[thing].name for thing in rivals.things
+            )
         seen = view.observation.picture
         values = view.values
         next_view = view.next_view
         looks.append(
-            Look(view.direction, seen, leading, values, rivals, names, next_view, view.travel)
+            Look(
+                view.direction,
+                seen,
+                leading,
+                values,
+                rivals,
+                names,
+                next_view,
+                view.travel,
+            )
         )
     return Run(looks, session.result.answer, found_at(session.result, camera, centre))
 
 
 def found_at(
-    result: nextview.Recognition, camera: SensedCamera, centre: Array
+    result: nextview.Recognition,
+    camera: SensedCamera,
+    centre: Array,
 ) -> tuple[Array, Array] | None:
     """The scan of what was named, where it was found: vertices on the table, and faces."""
     if result.pose is None:
@@ -241,9 +273,13 @@ class Thumbs:
             pose = look_at_origin(np.radians(35), np.radians(35), 9.0)
             n = 3 * side
             rays = rays_of(pose, n / 2 / (1.12 / 9), n, n)
-            stage = Stage([(mesh.vertices, mesh.faces, self.cast.colours.get(name, PLAIN))])
+            stage = Stage(
+                [(mesh.vertices, mesh.faces, self.cast.colours.get(name, PLAIN))]
+            )
             hit, points, normals, colours = stage.hits(pose[:3, 3], rays)
-            light = sum(stage.lit(points, normals, colours, np.random.default_rng(0), 3))
+            light = sum(
+                stage.lit(points, normals, colours, np.random.default_rng(0), 3)
+            )
             pixels = np.tile(np.array(PAPER, np.uint8), (len(rays), 1))
             pixels[hit] = toned(light)
             picture = Image.fromarray(pixels.reshape(n, n, 3))
@@ -277,7 +313,13 @@ class Side:
 
 
 def half(
-    shot: Shot, side: Side, name: str, thumbs: Thumbs, at: int, progress: float, over: bool
+    shot: Shot,
+    side: Side,
+    name: str,
+    thumbs: Thumbs,
+    at: int,
+    progress: float,
+    over: bool,
 ) -> Image.Image:
     """A policy's half of a frame, twice as large as it is shown."""
     run = side.runs[name]
@@ -292,7 +334,12 @@ def half(
             outlined(picture, shot, *run.found, colour)
     page.paste(picture, (0, 92))
     if over:
-        tag(draw, ("✓ " if right else "✗ ") + called(run.answer), (SIZE[0] // 2, 134), colour)
+        tag(
+            draw,
+            ("✓ " if right else "✗ ") + called(run.answer),
+            (SIZE[0] // 2, 134),
+            colour,
+        )
     draw.text((28, 14), side.name, side.colour, font(34, True))
     draw.text((28, 56), side.line, GREY, font(22))
     count, views, _ = side.stands
@@ -300,7 +347,8 @@ def half(
     draw.text((SIZE[0] - 28, 24), tally, INK, font(26), anchor="ra")
     known = looks[at if progress == 1 else at - 1]
     page.paste(
-        Image.fromarray(known.picture).resize((150, 150), Image.LANCZOS), (SIZE[0] - 174, 532)
+        Image.fromarray(known.picture).resize((150, 150), Image.LANCZOS),
+        (SIZE[0] - 174, 532),
     )
     draw.rectangle((SIZE[0] - 177, 529, SIZE[0] - 22, 684), None, PAPER, 4)
     for k, (thing, belief) in enumerate(known.leading):
@@ -325,14 +373,23 @@ def half(
             right = side.right(thing)
             circle(draw, np.array([x + 54, 1050]), 14, RIGHT if right else WRONG)
             draw.text(
-                (x + 54, 1050), "✓" if right else "✗", (255, 255, 255), font(20, True), anchor="mm"
+                (x + 54, 1050),
+                "✓" if right else "✗",
+                (255, 255, 255),
+                font(20, True),
+                anchor="mm",
             )
     draw.line((0, 978, SIZE[0], 978), FAINT, 2)
     return page
 
 
 def bar(
-    page: Image.Image, y: int, small: Image.Image, name: str, share: float, colour: Colour
+    page: Image.Image,
+    y: int,
+    small: Image.Image,
+    name: str,
+    share: float,
+    colour: Colour,
 ) -> None:
     """How much a thing is believed in, below its name."""
     draw = ImageDraw.Draw(page)
@@ -358,7 +415,11 @@ def beside(page: Image.Image, side: Side, name: str, look: Look, over: bool) -> 
     if over or look.rivals is None or look.next_view is None:
         return
 
-    why = "next: where these two differ" if side.colour == OURS else "next: any view, at random"
+    why = (
+        "next: where these two differ"
+        if side.colour == OURS
+        else "next: any view, at random"
+    )
     if look.leading[0][1] >= SURE:
         why = "sure, but fits badly: once more"  # it may be none of the known things
     draw.text((x, 718), why, INK, font(24))
@@ -366,12 +427,22 @@ def beside(page: Image.Image, side: Side, name: str, look: Look, over: bool) -> 
     below = [*map(called, look.names), differ_in(look.rivals.share)]
     for k, (pixels, text) in enumerate(zip(pictures, below, strict=True)):
         left = x + 138 * k
-        page.paste(Image.fromarray(pixels).resize((128, 128), Image.LANCZOS), (left, 758))
+        page.paste(
+            Image.fromarray(pixels).resize((128, 128), Image.LANCZOS),
+            (left, 758),
+        )
         draw.rectangle((left, 758, left + 128, 886), None, FAINT, 2)
         colour = side.colour if k == 2 else GREY
         lines = fill(text, 13)
         middle = left + 64, 896
-        draw.multiline_text(middle, lines, colour, font(20), anchor="ma", align="center")
+        draw.multiline_text(
+            middle,
+            lines,
+            colour,
+            font(20),
+            anchor="ma",
+            align="center",
+        )
 
 
 def differ_in(share: float) -> str:
@@ -380,11 +451,19 @@ def differ_in(share: float) -> str:
 
 
 def pages(
-    stage: Stage, placed: list, sides: tuple[Side, Side], thumbs: Thumbs
+    stage: Stage,
+    placed: list,
+    sides: tuple[Side, Side],
+    thumbs: Thumbs,
 ) -> Iterator[Image.Image]:
     """The frames, twice as large as they are shown."""
     for k, name in enumerate(thumbs.cast.names):
-        still = shot(stage, placed[k][0].metres, placed[k][1], (2 * VIEW[0], 2 * VIEW[1]))
+        still = shot(
+            stage,
+            placed[k][0].metres,
+            placed[k][1],
+            (2 * VIEW[0], 2 * VIEW[1]),
+        )
         most = max(len(side.runs[name].looks) for side in sides)
         seconds = STEP * most + PAUSE
         drawn: dict[tuple, Image.Image] = {}
@@ -402,15 +481,27 @@ def pages(
                 if state not in drawn:
                     drawn[state] = half(still, side, name, thumbs, *state[1:])
                 page.paste(
-                    drawn[state].crop((0, 0, SIZE[0] - 2, 2 * SIZE[1])), (n * (SIZE[0] + 2), 0)
+                    drawn[state].crop((0, 0, SIZE[0] - 2, 2 * SIZE[1])),
+                    (n * (SIZE[0] + 2), 0),
                 )
             yield page
     yield from [closing(stage, placed, sides, thumbs.cast)] * round(END * RATE)
 
 
-def closing(stage: Stage, placed: list, sides: tuple[Side, Side], cast: Cast) -> Image.Image:
+def closing(
+    stage: Stage,
+    placed: list,
+    sides: tuple[Side, Side],
+    cast: Cast,
+) -> Image.Image:
     """The whole table with what was found of each thing, and how both did."""
-    wide = shot(stage, TABLE_RADIUS, TABLE_MIDDLE, (2 * VIEW[0], 2 * VIEW[1]), OVER_THE_TABLE)
+    wide = shot(
+        stage,
+        TABLE_RADIUS,
+        TABLE_MIDDLE,
+        (2 * VIEW[0], 2 * VIEW[1]),
+        OVER_THE_TABLE,
+    )
     page = Image.new("RGB", (2 * SIZE[0], 2 * SIZE[1]), FAINT)
     for n, side in enumerate(sides):
         half = Image.new("RGB", (SIZE[0] - 2, 2 * SIZE[1]), PAPER)
@@ -470,7 +561,8 @@ def main(
     """
     rng = np.random.default_rng(seed)
     ours, theirs = (
-        nextview.load(models="ycb", policy=name, threads=1) for name in (None, "random-all")
+        nextview.load(models="ycb", policy=name, threads=1)
+        for name in (None, "random-all")
     )
     cast = Cast.most_alike(ours.models.recogniser.things, rng)
     placed = laid_out(folder, cast, rng)
@@ -504,15 +596,29 @@ def written(drawn: Iterable[Image.Image], out: Path) -> None:
     """Write the frames as a video and as a GIF."""
     with TemporaryDirectory() as part:
         for n, page in enumerate(track(drawn, "frames")):
-            page.resize(SIZE, Image.LANCZOS).save(f"{part}/{n:04}.png", compress_level=1)
-        read = ["-y", "-loglevel", "error", "-framerate", str(RATE), "-i", f"{part}/%04d.png"]
+            page.resize(SIZE, Image.LANCZOS).save(
+                f"{part}/{n:04}.png",
+                compress_level=1,
+            )
+        read = [
+            "-y",
+            "-loglevel",
+            "error",
+            "-framerate",
+            str(RATE),
+            "-i",
+            f"{part}/%04d.png",
+        ]
         start = [get_ffmpeg_exe(), *read]
         h264 = ["-c:v", "libx264", "-crf", "20", "-preset", "slow"]
         h264 += ["-pix_fmt", "yuv420p", "-movflags", "+faststart"]
         subprocess.run([*start, *h264, str(out / "things.mp4")], check=True)
         use = "paletteuse=dither=sierra2_4a:diff_mode=rectangle"
         palette = f"split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]{use}"
-        subprocess.run([*start, "-filter_complex", palette, str(out / "things.gif")], check=True)
+        subprocess.run(
+            [*start, "-filter_complex", palette, str(out / "things.gif")],
+            check=True,
+        )
 
 
 if __name__ == "__main__":

@@ -16,7 +16,12 @@ from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import binary_dilation, binary_erosion
 
-from nextview.geometry.viewsphere import VIEW_LAYOUTS, great_circle, level_pose, look_at_origin
+from nextview.geometry.viewsphere import (
+    VIEW_LAYOUTS,
+    great_circle,
+    level_pose,
+    look_at_origin,
+)
 from nextview.session.style import heat
 from nextview.things.expected_views import RivalPictures
 
@@ -43,10 +48,14 @@ class Stage:
         self.things = []
         for vertices, faces, colour in things:
             TriangleMesh(
-                self.scene, vertices.astype(np.float32), np.ascontiguousarray(faces, np.int32)
+                self.scene,
+                vertices.astype(np.float32),
+                np.ascontiguousarray(faces, np.int32),
             )
             normals = np.zeros_like(vertices)
-            of_faces = np.cross(*(vertices[faces[:, i]] - vertices[faces[:, 0]] for i in (1, 2)))
+            of_faces = np.cross(
+                *(vertices[faces[:, i]] - vertices[faces[:, 0]] for i in (1, 2))
+            )
             for i in range(3):
                 np.add.at(normals, faces[:, i], of_faces)
             self.things.append((faces, normals, np.array(colour)))
@@ -55,14 +64,17 @@ class Stage:
         """Whether rays (..., 3) from points meet anything."""
         points, rays = np.broadcast_arrays(points, rays)
         shape = rays.shape[:-1]
-        flat = [np.ascontiguousarray(x.reshape(-1, 3), np.float32) for x in (points, rays)]
+        flat = [
+            np.ascontiguousarray(x.reshape(-1, 3), np.float32) for x in (points, rays)
+        ]
         return (self.scene.run(*flat) >= 0).reshape(shape)
 
     def hits(self, eye: Array, rays: Array) -> tuple[Array, Array, Array, Array]:
         """Which rays (N, 3) hit, and of these points, normals and colours."""
         origins = np.broadcast_to(eye, rays.shape)
         found = self.scene.run(
-            *(np.ascontiguousarray(x, np.float32) for x in (origins, rays)), output=1
+            *(np.ascontiguousarray(x, np.float32) for x in (origins, rays)),
+            output=1,
         )
         hit = found["primID"] >= 0
         points = eye + rays[hit] * found["tfar"][hit, None]
@@ -74,7 +86,9 @@ class Stage:
             own = found["geomID"][hit] == k
             corner = of_vertices[faces[found["primID"][hit][own]]]
             normals[own] = (
-                (1 - u - v)[own] * corner[:, 0] + u[own] * corner[:, 1] + v[own] * corner[:, 2]
+                (1 - u - v)[own] * corner[:, 0]
+                + u[own] * corner[:, 1]
+                + v[own] * corner[:, 2]
             )
             colours[own] = colour
         normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12
@@ -82,7 +96,12 @@ class Stage:
         return hit, points, normals, colours
 
     def lit(
-        self, points: Array, normals: Array, colours: Array, rng: np.random.Generator, samples: int
+        self,
+        points: Array,
+        normals: Array,
+        colours: Array,
+        rng: np.random.Generator,
+        samples: int,
     ) -> tuple[Array, Array]:
         """The light of the sky, and of the lamp, that comes from each point."""
         start = points + 1e-4 * normals
@@ -116,9 +135,9 @@ def toned(light: Array) -> Array:
     """Light as sRGB, uint8: filmic (Narkowicz's fit of ACES)."""
     x = 0.82 * light
     x = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1)
-    return (255 * np.where(x < 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055) + 0.5).astype(
-        np.uint8
-    )
+    return (
+        255 * np.where(x < 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055) + 0.5
+    ).astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -139,12 +158,16 @@ class Shot:
         """Pixels (N, 2) of points, and their depths."""
         inside = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
         height, width = self.sky.shape[:2]
-        return inside[:, :2] / inside[:, 2:] * self.focal + [width / 2, height / 2], inside[:, 2]
+        return inside[:, :2] / inside[:, 2:] * self.focal + [
+            width / 2,
+            height / 2,
+        ], inside[:, 2]
 
 
 def rays_of(pose: Array, focal: float, width: int, height: int) -> Array:
     x, y = np.meshgrid(
-        (np.arange(width) + 0.5 - width / 2) / focal, (np.arange(height) + 0.5 - height / 2) / focal
+        (np.arange(width) + 0.5 - width / 2) / focal,
+        (np.arange(height) + 0.5 - height / 2) / focal,
     )
     return np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3) @ pose[:3, :3].T
 
@@ -153,13 +176,19 @@ def wood(points: Array) -> Array:
     """How light the table's boards are, beside their mean."""
     board = np.floor(points[:, 1] / 0.16)
     along = points[:, 0] + 0.37 * np.floor(points[:, 1] / 0.16)
-    across = points[:, 1] + 0.006 * np.sin(9 * along + 2 * board) + 0.003 * np.sin(23 * along)
+    across = (
+        points[:, 1]
+        + 0.006 * np.sin(9 * along + 2 * board)
+        + 0.003 * np.sin(23 * along)
+    )
     fine = (
         np.sin(900 * across)
         + np.sin(1490 * across + 3 * along)
         + np.sin(370 * across + 1.3 * along)
     )
-    joint = 1 - 0.35 * np.exp(-(((0.5 - np.abs(points[:, 1] / 0.16 % 1 - 0.5)) / 0.006) ** 2))
+    joint = 1 - 0.35 * np.exp(
+        -(((0.5 - np.abs(points[:, 1] / 0.16 % 1 - 0.5)) / 0.006) ** 2)
+    )
     return (1 + 0.014 * fine + 0.05 * np.sin(2.4 * board + 1)) * joint
 
 
@@ -198,7 +227,13 @@ def shot(
     far = np.clip(away, 0, 1)[:, None] ** 2
     sky[hit], lamp[hit] = light[0] * (1 - far) + 1.15 * SKY * far, light[1] * (1 - far)
     where[hit] = points
-    return Shot(*(x.reshape(height, width, 3) for x in (sky, lamp, where)), pose, focal, centre, r)
+    return Shot(
+        *(x.reshape(height, width, 3) for x in (sky, lamp, where)),
+        pose,
+        focal,
+        centre,
+        r,
+    )
 
 
 def unit(x: Array) -> Array:
@@ -236,7 +271,13 @@ def gadget() -> tuple[Array, Array]:
     return np.array(parts.vertices), np.array(parts.faces, np.int32)
 
 
-def scene(shot: Shot, colour: Colour, looks: list[Look], at: int, progress: float) -> Image.Image:
+def scene(
+    shot: Shot,
+    colour: Colour,
+    looks: list[Look],
+    at: int,
+    progress: float,
+) -> Image.Image:
     """The table: what views are worth, the way so far, and the camera on its way to look ``at``."""
     look = looks[at]
     before = looks[max(at - 1, 0)]
@@ -247,7 +288,8 @@ def scene(shot: Shot, colour: Colour, looks: list[Look], at: int, progress: floa
     hand = Stage(
         [
             (
-                (0.36 * vertices @ pose[:3, :3].T + pose[:3, 3]) * shot.radius + shot.centre,
+                (0.36 * vertices @ pose[:3, :3].T + pose[:3, 3]) * shot.radius
+                + shot.centre,
                 faces,
                 (0.05, 0.055, 0.065),
             )
@@ -256,24 +298,33 @@ def scene(shot: Shot, colour: Colour, looks: list[Look], at: int, progress: floa
     middle = pose[:3, 3] * shot.radius + shot.centre
     to_lamp = KEY / np.linalg.norm(KEY)
     off = middle - np.where(np.isfinite(shot.points), shot.points, 1e3)
-    near = np.linalg.norm(off - (off @ to_lamp)[..., None] * to_lamp, axis=2) < 0.5 * shot.radius
+    near = (
+        np.linalg.norm(off - (off @ to_lamp)[..., None] * to_lamp, axis=2)
+        < 0.5 * shot.radius
+    )
     lamp = shot.lamp.copy()
     rng = np.random.default_rng(0)
     jitter = 0.09 * rng.normal(size=(6, 1, 3))
-    lamp[near] *= 1 - hand.blocked(shot.points[near] + 1e-4, KEY + jitter).mean(0)[:, None]
+    lamp[near] *= (
+        1 - hand.blocked(shot.points[near] + 1e-4, KEY + jitter).mean(0)[:, None]
+    )
     picture = Image.fromarray(toned(shot.sky + lamp))
     draw = ImageDraw.Draw(picture, "RGBA")
     dots(draw, shot, before if progress < 1 else look, colour)
     stood = [great_circle(a.direction, b.direction) for a, b in pairwise(looks[:at])]
     path = (
-        np.concatenate([*stood, way[: round(24 * progress) + 1]])[::2] * REACH * shot.radius
+        np.concatenate([*stood, way[: round(24 * progress) + 1]])[::2]
+        * REACH
+        * shot.radius
         + shot.centre
     )
     draw.line([tuple(p) for p in shot.place(path)[0]], (*colour, 230), 5, "curve")
     for past in looks[: at + (progress == 1)]:
         circle(
             draw,
-            shot.place((past.direction * REACH * shot.radius + shot.centre)[None])[0][0],
+            shot.place((past.direction * REACH * shot.radius + shot.centre)[None])[0][
+                0
+            ],
             8,
             (*colour, 255),
         )
@@ -294,7 +345,11 @@ def scene(shot: Shot, colour: Colour, looks: list[Look], at: int, progress: floa
 
 
 def outlined(
-    picture: Image.Image, shot: Shot, vertices: Array, faces: Array, colour: Colour
+    picture: Image.Image,
+    shot: Shot,
+    vertices: Array,
+    faces: Array,
+    colour: Colour,
 ) -> None:
     """Draw the outline of a mesh, in the frame of the table, over a picture of the scene."""
     width, height = picture.size
@@ -320,7 +375,12 @@ def dots(draw: ImageDraw.ImageDraw, shot: Shot, look: Look, colour: Colour) -> N
     for k in np.argsort(-depth):
         if look.next_view is not None and places[k, 2] > 0:
             faint = 235 if depth[k] < back else 110
-            circle(draw, flat[k], 13 if k == look.next_view else 7, (*map(int, colours[k]), faint))
+            circle(
+                draw,
+                flat[k],
+                13 if k == look.next_view else 7,
+                (*map(int, colours[k]), faint),
+            )
             if k == look.next_view:
                 circle(draw, flat[k], 15, None, (*colour, 255), 4)
 
@@ -365,7 +425,8 @@ def pasted(picture: Image.Image, shot: Shot, hand: Stage, middle: Array) -> None
     light += 0.25 * shine[:, None]
     eye = shot.pose[:3, 3]
     behind = np.linalg.norm(
-        shot.points[y0:y1, x0:x1].reshape(-1, 3)[hit] - eye, axis=1
+        shot.points[y0:y1, x0:x1].reshape(-1, 3)[hit] - eye,
+        axis=1,
     ) < np.linalg.norm(points - eye, axis=1)
     pixels = np.asarray(picture).copy()
     part = pixels[y0:y1, x0:x1].reshape(-1, 3)
@@ -378,11 +439,23 @@ def pasted(picture: Image.Image, shot: Shot, hand: Stage, middle: Array) -> None
 def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
     weight = "bold" if bold else "normal"
     return ImageFont.truetype(
-        font_manager.findfont(font_manager.FontProperties("DejaVu Sans", weight=weight)), size
+        font_manager.findfont(
+            font_manager.FontProperties("DejaVu Sans", weight=weight)
+        ),
+        size,
     )
 
 
-def tag(draw: ImageDraw.ImageDraw, text: str, at: tuple[int, int], colour: Colour) -> None:
+def tag(
+    draw: ImageDraw.ImageDraw,
+    text: str,
+    at: tuple[int, int],
+    colour: Colour,
+) -> None:
     wide = draw.textlength(text, font(34, True)) / 2 + 30
-    draw.rounded_rectangle((at[0] - wide, at[1] - 30, at[0] + wide, at[1] + 30), 30, (*colour, 240))
+    draw.rounded_rectangle(
+        (at[0] - wide, at[1] - 30, at[0] + wide, at[1] + 30),
+        30,
+        (*colour, 240),
+    )
     draw.text(at, text, (255, 255, 255), font(34, True), anchor="mm")

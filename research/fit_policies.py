@@ -29,7 +29,11 @@ from nextview.training.card_fits import calibration_of
 from nextview.training.fitting_set import blind_walks, for_fitting
 
 Float = NDArray[np.float64]
-VARIANTS: tuple[tuple[str, Scope], ...] = (("", "global"), ("-local", "local"), ("-near", "global"))
+VARIANTS: tuple[tuple[str, Scope], ...] = (
+    ("", "global"),
+    ("-local", "local"),
+    ("-near", "global"),
+)
 KINDS = ("fixed-sequence", "class-table", "fixed-ring")
 NAMES = [
     f"{kind}{suffix}"
@@ -94,10 +98,23 @@ def fit_policies(
     table = Predictions.load(predictions)
     data = fitting_set(table, validation_share, split_seed)
     calibration = calibration_of(
-        data, np.random.default_rng([seed, 0]), walks=1 + 8000 // len(data)
+        data,
+        np.random.default_rng([seed, 0]),
+        walks=1 + 8000 // len(data),
     )
-    values = fit_class_table(data, max_views, shrinkage, calibration, np.random.default_rng(seed))
-    settings = {"length": length, "n_views": max_views, "shrinkage": shrinkage, "seed": seed}
+    values = fit_class_table(
+        data,
+        max_views,
+        shrinkage,
+        calibration,
+        np.random.default_rng(seed),
+    )
+    settings = {
+        "length": length,
+        "n_views": max_views,
+        "shrinkage": shrinkage,
+        "seed": seed,
+    }
     for suffix, scope in VARIANTS:
         settings["travel_weight"] = travel_weight if suffix == "-near" else 0.0
         card = PolicyCard(
@@ -129,7 +146,9 @@ def fitting_set(predictions: Predictions, validation: float, seed: int) -> Predi
     """
     for_fitting(predictions)
     if not 0 < validation <= 1:
-        raise PredictionsError(f"the validation part lies between 0 and 1, not {validation}")
+        raise PredictionsError(
+            f"the validation part lies between 0 and 1, not {validation}"
+        )
     _, kept = divide(predictions.labels, predictions.depth_entropy, validation, seed)
     if len(kept) == 0:
         raise PredictionsError("no object is left to fit to")
@@ -137,12 +156,17 @@ def fitting_set(predictions: Predictions, validation: float, seed: int) -> Predi
 
 
 def _tables(
-    data: Predictions, calibration: Calibration, card: PolicyCard, values: Float
+    data: Predictions,
+    calibration: Calibration,
+    card: PolicyCard,
+    values: Float,
 ) -> dict[str, dict[str, Any]]:
     """The tables of a scope and travel weight, by the kinds of their cards; ``values`` are those
     of the class table.
     """
-    length, n_views, paid = (card.settings[name] for name in ("length", "n_views", "travel_weight"))
+    length, n_views, paid = (
+        card.settings[name] for name in ("length", "n_views", "travel_weight")
+    )
     travel = data.sphere.travel[:: data.sphere.azimuths]  # from each ring to each cell
     ring, steps = fit_ring(data, card.scope, n_views, calibration)
     return {
@@ -155,12 +179,18 @@ def _tables(
 
 
 def log_belief(
-    data: Predictions, calibration: Calibration, total: NDArray[np.floating], n_views: int
+    data: Predictions,
+    calibration: Calibration,
+    total: NDArray[np.floating],
+    n_views: int,
 ) -> Float:
     """Logarithm of the belief in the true class, (N, ...), after so many views with that sum,
     (N, ..., D).
     """
-    return of_true_class(calibration.log_belief(total, n_views, len(data.classes)), data.labels)
+    return of_true_class(
+        calibration.log_belief(total, n_views, len(data.classes)),
+        data.labels,
+    )
 
 
 def fit_sequence(
@@ -182,12 +212,19 @@ def fit_sequence(
         total = data.log_evidence[:, view[:, path[0]]].astype(np.float64)
         for k in range(2, min(length, len(sphere) - 1) + 2):
             reachable = (
-                np.arange(len(sphere)) if scope == "global" else sphere.windows[path[-1]].ravel()
+                np.arange(len(sphere))
+                if scope == "global"
+                else sphere.windows[path[-1]].ravel()
             )
             free = np.setdiff1d(reachable, path)
             free = free if len(free) else np.setdiff1d(np.arange(len(sphere)), path)
             beliefs = [
-                log_belief(data, calibration, total + data.log_evidence[:, view[:, v]], k).mean(1)
+                log_belief(
+                    data,
+                    calibration,
+                    total + data.log_evidence[:, view[:, v]],
+                    k,
+                ).mean(1)
                 for v in free
             ]
             value = (
@@ -201,7 +238,10 @@ def fit_sequence(
 
 
 def fit_ring(
-    data: Predictions, scope: Scope, n_views: int, calibration: Calibration
+    data: Predictions,
+    scope: Scope,
+    n_views: int,
+    calibration: Calibration,
 ) -> tuple[int, int]:
     """The best ring to go to and the azimuth steps along it, over all starts, after 2 to
     ``n_views`` views.
@@ -216,7 +256,8 @@ def fit_ring(
         total = np.zeros(data.log_evidence.shape)
         sum_over_views = 0.0
         for k, views in enumerate(
-            blind_walks(sphere, policy, np.arange(len(sphere)), n_views, rng).T, 1
+            blind_walks(sphere, policy, np.arange(len(sphere)), n_views, rng).T,
+            1,
         ):
             total += data.log_evidence[:, views]
             if k > 1:
@@ -226,7 +267,10 @@ def fit_ring(
         return sum_over_views
 
     steps = range(1, sphere.azimuths // 2 + 1) if scope == "global" else (1,)
-    return max(((ring, step) for ring in range(sphere.rings) for step in steps), key=value)
+    return max(
+        ((ring, step) for ring in range(sphere.rings) for step in steps),
+        key=value,
+    )
 
 
 def fit_class_table(
@@ -253,7 +297,12 @@ def fit_class_table(
             current = walk[:, k - 1]
             total += data.log_evidence[np.arange(n), current]
             now = log_belief(data, calibration, total, k)
-            after = log_belief(data, calibration, total[:, None] + data.log_evidence, k + 1)
+            after = log_belief(
+                data,
+                calibration,
+                total[:, None] + data.log_evidence,
+                k + 1,
+            )
             free = np.ones((n, len(sphere)), bool)
             free[np.arange(n)[:, None], walk[:, :k]] = False
             believed = calibration.log_belief(total, k, c).argmax(1)
@@ -265,7 +314,10 @@ def fit_class_table(
     # A cell is met once in so many views of a walk: what one object weighs in the sums over all
     # walks.
     met = walks * (min(n_views, len(sphere)) - 1) / sphere.rings
-    return (gains + shrinkage * met * shared) / np.maximum(weight + shrinkage * met, 1e-12)
+    return (gains + shrinkage * met * shared) / np.maximum(
+        weight + shrinkage * met,
+        1e-12,
+    )
 
 
 if __name__ == "__main__":

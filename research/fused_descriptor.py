@@ -39,7 +39,11 @@ def fused_descriptor(view: MeasuredView) -> float:
     total = grey.sum()
     squares = grey @ grey
     variance = squares / n - (total / n) ** 2
-    nearer, farther = (np.einsum("hw,hw->", image[:, :-k], image[:, k:]) for k in (1, 2))
+    nearer, farther = (
+        np.einsum("hw,hw->", image[:, :-k], image[:, k:]) for k in (1, 2)
+    )
     vollath = nearer - farther
     # The entropy of 257 levels can pass 8 bits by a hair.
-    return float((4 * variance + min(bits(counts / n) / 8, 1) + max(vollath, 0) / squares) / 3)
+    return float(
+        (4 * variance + min(bits(counts / n) / 8, 1) + max(vollath, 0) / squares) / 3
+    )

@@ -46,9 +46,13 @@ def gradient_entropy(view: MeasuredView) -> float:
     # lies around it.
     outward = CELLS / 4 * np.sqrt(2 / np.maximum(1 + c, 1e-6))
     across, down = (
-        (slope * outward + CELLS / 2).astype(np.int64).clip(0, CELLS - 1) for slope in (a, b)
+        (slope * outward + CELLS / 2).astype(np.int64).clip(0, CELLS - 1)
+        for slope in (a, b)
     )
-    counts = np.bincount(across * CELLS + down, minlength=CELLS**2).reshape(CELLS, CELLS)
+    counts = np.bincount(across * CELLS + down, minlength=CELLS**2).reshape(
+        CELLS,
+        CELLS,
+    )
     blur, own = _blur()
     spread = irfft2(rfft2(counts) * blur)
     return max(bits(spread / spread.sum()) - own, 0.0)

@@ -23,7 +23,13 @@ import nextview
 from nextview.cli.exit_status import orderly_end
 from nextview.recognition.novelty import unit
 from nextview.things.approximate import NearestViews
-from nextview.things.memory import AZIMUTHS, TaughtRecogniser, by_ring, ring_shares, similarities
+from nextview.things.memory import (
+    AZIMUTHS,
+    TaughtRecogniser,
+    by_ring,
+    ring_shares,
+    similarities,
+)
 
 NOISE = 0.02  # standard deviation of what is added to each number of a mixed view
 BEST = 20  # of the views that are nearest to one, how many the index has to find
@@ -46,13 +52,19 @@ def grown(views: np.ndarray, poses: int, rng: np.random.Generator) -> np.ndarray
     while (missing := poses - sum(map(len, found))) > 0:
         a, b = rng.integers(len(views), size=(2, min(len(views), missing)))
         share = rng.uniform(0, 1, (len(a), 1, 1, 1)).astype(np.float32)
-        mixed = (1 - share) * views[a] + share * np.roll(views[b], rng.integers(AZIMUTHS), 2)
+        mixed = (1 - share) * views[a] + share * np.roll(
+            views[b],
+            rng.integers(AZIMUTHS),
+            2,
+        )
         found.append(unit(mixed + NOISE * rng.standard_normal(mixed.shape, np.float32)))
     return np.concatenate(found)
 
 
 def main(
-    things: tuple[int, ...] = (10, 100, 1_000, 10_000), views: int = 100, seed: int = 0
+    things: tuple[int, ...] = (10, 100, 1_000, 10_000),
+    views: int = 100,
+    seed: int = 0,
 ) -> None:
     """Print a table, a row for each number of things.
 
@@ -82,7 +94,9 @@ def main(
 
 
 def timed(
-    rings: np.ndarray, asked: Sequence[tuple[np.ndarray, np.ndarray]], by_index: bool
+    rings: np.ndarray,
+    asked: Sequence[tuple[np.ndarray, np.ndarray]],
+    by_index: bool,
 ) -> Iterator[str]:
     """The cells of a row: exactly, and with an index where there is to be one.
 

@@ -46,13 +46,17 @@ def object_figure(store: ViewStore, i: int) -> Figure:
     heights = [rows * (14 / columns / wide + 0.6), 2.2 * -(-len(names) // MAPS_ACROSS)]
     figure = PlainFigure(figsize=(14, sum(heights)), layout="constrained")
     split = f", {store.splits[i]} split" if store.splits[i] else ""
-    figure.suptitle(f"{store.names[i]}  ·  {store.classes[store.labels[i]]}{split}", fontsize=14)
+    figure.suptitle(
+        f"{store.names[i]}  ·  {store.classes[store.labels[i]]}{split}",
+        fontsize=14,
+    )
     top, bottom = np.asarray(figure.subfigures(2, 1, height_ratios=heights))
 
     left, right = top.subplots(rows, columns)
     step = -(-store.image(i).shape[-1] // CELL)
     image, depth = (
-        _mosaic(views[:, ::step, ::step], sphere) for views in (store.image(i), store.depth(i))
+        _mosaic(views[:, ::step, ::step], sphere)
+        for views in (store.image(i), store.depth(i))
     )
     left.imshow(image, cmap="gray", vmin=0, vmax=255)
     shown = right.imshow(np.ma.masked_equal(depth, 0), cmap="viridis_r")
@@ -83,10 +87,13 @@ def object_figure(store: ViewStore, i: int) -> Figure:
 def store_figure(store: ViewStore) -> Figure:
     """Objects of each class and split, and the mean depth entropy of the views."""
     figure = PlainFigure(
-        figsize=(14, max(5.5, 0.24 * len(store.classes) + 1.5)), layout="constrained"
+        figsize=(14, max(5.5, 0.24 * len(store.classes) + 1.5)),
+        layout="constrained",
     )
     figure.suptitle(store.path.name, fontsize=14)
-    left, right = np.asarray(figure.subfigures(1, 2, width_ratios=[1.5, 1], wspace=0.04))
+    left, right = np.asarray(
+        figure.subfigures(1, 2, width_ratios=[1.5, 1], wspace=0.04)
+    )
     _class_bars(left.subplots(), store)
     axes = right.subplots()
     axes.set_title("mean depth entropy of the views, bits", fontsize=11)
@@ -110,7 +117,9 @@ def summary(store: ViewStore) -> dict[str, str]:
         "not rendered yet": f"{len(store) - rendered - len(store.attributes.failures):,}",
         "views": f"{rendered * views:,}  ({views} of {side} x {side} each)",
         "byte-identical copies": f"{copies:,}  ({conflicting} with several labels)",
-        "size on disk": f"{size / 1e9:.2f} GB" if size > 1e9 else f"{size / 1e6:.1f} MB",
+        "size on disk": f"{size / 1e9:.2f} GB"
+        if size > 1e9
+        else f"{size / 1e6:.1f} MB",
         "median radius, m": ", ".join(
             f"{name} {radius:.2f}" for name, radius in median_radii(store).items()
         ),
@@ -142,7 +151,14 @@ def _class_bars(axes: Axes, store: ViewStore) -> None:
     for name, select, colour in [*parts, ("not rendered", ~done, "lightgrey")]:
         counts = np.bincount(labels[select], minlength=len(rows))
         if counts.any():
-            axes.barh(rows, counts, left=start, color=colour, label=name or "objects", height=0.72)
+            axes.barh(
+                rows,
+                counts,
+                left=start,
+                color=colour,
+                label=name or "objects",
+                height=0.72,
+            )
             start += counts
     for row, count in enumerate(start):
         axes.text(count, row, f" {int(count):,}", va="center", fontsize=9)
@@ -159,7 +175,9 @@ def _class_bars(axes: Axes, store: ViewStore) -> None:
 def _draw_map(axes: Axes, sphere: ViewSphere, values: NDArray[np.floating]) -> int:
     """Values of the views, (V,), by ring and azimuth; returns the view of the highest."""
     shown = axes.imshow(
-        values.reshape(sphere.rings, sphere.azimuths), origin="lower", aspect="auto"
+        values.reshape(sphere.rings, sphere.azimuths),
+        origin="lower",
+        aspect="auto",
     )
     axes.figure.colorbar(shown, ax=axes, pad=0.02)
     _ticks(axes, sphere)
@@ -170,17 +188,27 @@ def _mosaic(views: NDArray, sphere: ViewSphere) -> NDArray:
     """(V, H, W) to one image, the first ring lowest."""
     _, height, width = views.shape
     grid = views.reshape(sphere.rings, sphere.azimuths, height, width)[::-1]
-    return grid.transpose(0, 2, 1, 3).reshape(sphere.rings * height, sphere.azimuths * width)
+    return grid.transpose(0, 2, 1, 3).reshape(
+        sphere.rings * height,
+        sphere.azimuths * width,
+    )
 
 
-def _ticks(axes: Axes, sphere: ViewSphere, side: float = 1, downwards: bool = False) -> None:
+def _ticks(
+    axes: Axes,
+    sphere: ViewSphere,
+    side: float = 1,
+    downwards: bool = False,
+) -> None:
     """Azimuths and elevations, at the middle of cells of a side."""
     middle = side / 2 - 0.5
     every = 2 if sphere.azimuths > 6 else 1
     elevations = [f"{e:g}°" for e in sphere.elevations]
     azimuths = [f"{360 * k / sphere.azimuths:g}°" for k in range(sphere.azimuths)]
     axes.set_xticks(
-        (middle + side * np.arange(sphere.azimuths))[::every], azimuths[::every], fontsize=8
+        (middle + side * np.arange(sphere.azimuths))[::every],
+        azimuths[::every],
+        fontsize=8,
     )
     rows = elevations[::-1] if downwards else elevations
     axes.set_yticks(middle + side * np.arange(sphere.rings), rows, fontsize=8)
@@ -188,7 +216,11 @@ def _ticks(axes: Axes, sphere: ViewSphere, side: float = 1, downwards: bool = Fa
 
 
 def inspect(
-    store: Path, out: Path | None = None, /, object_name: str | None = None, overwrite: bool = False
+    store: Path,
+    out: Path | None = None,
+    /,
+    object_name: str | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Draw what a view store holds: classes, counts, failures; or one object from all sides.
 

@@ -48,27 +48,48 @@ def measure(
         raise DatasetError(
             f"{path}: was rendered through a sensor, whose depth does not tell which face is seen"
         )
-    lacking = [store.names[i] for i in np.flatnonzero(store.done) if store.names[i] not in files]
+    lacking = [
+        store.names[i]
+        for i in np.flatnonzero(store.done)
+        if store.names[i] not in files
+    ]
     if lacking:
         raise DatasetError(
             f"{meshes}: holds no mesh called {lacking[0]}, of which {path} has views"
         )
     views = partial(_mesh_views, files, max_faces)
-    yield from measures.measure(path, names, workers, scheduler, objects, overwrite, views)
+    yield from measures.measure(
+        path,
+        names,
+        workers,
+        scheduler,
+        objects,
+        overwrite,
+        views,
+    )
 
 
 def _mesh_views(
-    files: dict[str, Path], max_faces: int, store: ViewStore, i: int
+    files: dict[str, Path],
+    max_faces: int,
+    store: ViewStore,
+    i: int,
 ) -> Iterator[MeshView]:
     """Object i of a store, from all its views."""
     depths = store.read("depth", i)
     name = store.names[i]
     hashes = store.attributes.sha256
     if hashes and sha256_of(files[name]) != hashes[i]:
-        raise DatasetError(f"{files[name]}: is not the mesh that {store.path} was rendered from")
+        raise DatasetError(
+            f"{files[name]}: is not the mesh that {store.path} was rendered from"
+        )
     mesh = deformed(
         store,
-        load_mesh(files[name], max_faces=max_faces, largest_part=store.attributes.largest_part),
+        load_mesh(
+            files[name],
+            max_faces=max_faces,
+            largest_part=store.attributes.largest_part,
+        ),
         name,
     )
     camera = FaceCamera(mesh, depths.shape[-1], store.sphere.distance)
@@ -106,7 +127,16 @@ def main(
         overwrite: measure anew what is there.
     """
     select = some_objects(ViewStore.open(store), split, held_out, objects)
-    steps = measure(store, meshes, measures, workers, scheduler, select, overwrite, max_faces)
+    steps = measure(
+        store,
+        meshes,
+        measures,
+        workers,
+        scheduler,
+        select,
+        overwrite,
+        max_faces,
+    )
     before, total = follow(steps, f"measuring {store.name}")
     say_done(store, "measured", before, total)
 

@@ -71,7 +71,8 @@ AGREEMENT = {"best": "best view is the recogniser's", "best_near": "or next to i
 
 
 def correlations(
-    values: NDArray[np.floating], reference: NDArray[np.floating]
+    values: NDArray[np.floating],
+    reference: NDArray[np.floating],
 ) -> NDArray[np.float64]:
     """Spearman's rank correlation along the rows, (N,); 0 where one of the two is constant."""
     a, b = (rankdata(x, axis=1) for x in (values, reference))
@@ -83,10 +84,17 @@ def correlations(
 
 def of_true_class(p: Predictions) -> NDArray[np.float64]:
     """Log-probability of the true class in each view alone, (N, V)."""
-    return log_softmax(p.logits.astype(np.float64), axis=2)[np.arange(len(p)), :, p.labels]
+    return log_softmax(p.logits.astype(np.float64), axis=2)[
+        np.arange(len(p)),
+        :,
+        p.labels,
+    ]
 
 
-def agreement(p: Predictions, values: NDArray[np.floating]) -> dict[str, NDArray[np.float64]]:
+def agreement(
+    p: Predictions,
+    values: NDArray[np.floating],
+) -> dict[str, NDArray[np.float64]]:
     """Whether each object's best view by a measure is the recogniser's, or at most a cell away,
     (N,) each.
 
@@ -137,23 +145,43 @@ def study(
     reference = of_true_class(test)
     right: dict[tuple[str, int], NDArray[np.bool_]] = {}
 
-    def note(name: str, quantities: dict[str, NDArray[np.float64]], labels: bool = False) -> None:
+    def note(
+        name: str,
+        quantities: dict[str, NDArray[np.float64]],
+        labels: bool = False,
+    ) -> None:
         top = np.stack(list(quantities.values()), 1)
         groups = [("", np.ones(len(test), bool))]
         groups += (
-            [(test.classes[c], test.labels == c) for c in np.unique(test.labels)] if labels else []
+            [(test.classes[c], test.labels == c) for c in np.unique(test.labels)]
+            if labels
+            else []
         )
         for label, here in groups:
-            low, high = interval(ratio(top[here], np.ones_like(top[here]), weights[:, here]))
+            low, high = interval(
+                ratio(top[here], np.ones_like(top[here]), weights[:, here])
+            )
             for i, quantity in enumerate(quantities):
-                rows.append((name, label, quantity, top[here, i].mean(), low[i], high[i], np.nan))
+                rows.append(
+                    (
+                        name,
+                        label,
+                        quantity,
+                        top[here, i].mean(),
+                        low[i],
+                        high[i],
+                        np.nan,
+                    )
+                )
 
     for done, name in enumerate([RANDOM, *measures, *policies], 1):
         if name not in measures:
             entry = name
             valleys = None
         else:
-            values = true_measure(test, name) if name != CONFIDENCE else np.exp(reference)
+            values = (
+                true_measure(test, name) if name != CONFIDENCE else np.exp(reference)
+            )
             note(name, {"correlation": correlations(values, reference)}, labels=True)
             note(name, agreement(test, values))
             entry = f"true-{map_name(name)}"
@@ -167,8 +195,16 @@ def study(
                     *[np.nan] * 3,
                 )
             )
-        given = {} if valleys is None else {map_name(name): tuple(test.classes[c] for c in valleys)}
-        specs = make_specs(replace(test, valley_classes=given or test.valley_classes), runs, seed)
+        given = (
+            {}
+            if valleys is None
+            else {map_name(name): tuple(test.classes[c] for c in valleys)}
+        )
+        specs = make_specs(
+            replace(test, valley_classes=given or test.valley_classes),
+            runs,
+            seed,
+        )
         paths = replay(entry, specs, max(n_views), seed)
         for k in n_views:
             right[name, k] = (paths.answers[:, k - 1] == specs.labels).reshape(runs, -1)
@@ -208,17 +244,29 @@ def readable(table: pd.DataFrame, n_views: tuple[int, ...]) -> pd.DataFrame:
     for name in [RANDOM, *names]:
         r = found.get((name, "correlation"))
         cells = [
-            name.replace("_", " ") if r else Path(name).stem if name.endswith(".json") else name
+            name.replace("_", " ")
+            if r
+            else Path(name).stem
+            if name.endswith(".json")
+            else name
         ]
         if r is None:
             cells += [""] * 3
         else:
             cells.append(f"{r.value:.2f} ({r.low:.2f} to {r.high:.2f})")
-            cells += [f"{100 * found[name, quantity].value:.0f} %" for quantity in AGREEMENT]
-        cells.append(", ".join(f"{found[name, f'accuracy_{k}'].value:.3f}" for k in n_views))
-        over = [found[name, f"over_random_{k}"] for k in n_views] if name != RANDOM else []
+            cells += [
+                f"{100 * found[name, quantity].value:.0f} %" for quantity in AGREEMENT
+            ]
+        cells.append(
+            ", ".join(f"{found[name, f'accuracy_{k}'].value:.3f}" for k in n_views)
+        )
+        over = (
+            [found[name, f"over_random_{k}"] for k in n_views] if name != RANDOM else []
+        )
         cells.append(", ".join(map(points, over)))
-        cells.append(", ".join(f"{found[name, f'travel_{k}'].value:.2f}" for k in n_views))
+        cells.append(
+            ", ".join(f"{found[name, f'travel_{k}'].value:.2f}" for k in n_views)
+        )
         cells.append("" if r is None else found[name, "valleys"].label or "none")
         rows.append(cells)
     return pd.DataFrame(rows, columns=head)
@@ -233,7 +281,9 @@ def markdown(readable: pd.DataFrame) -> str:
 
 def points(row: Any) -> str:
     """A difference of shares in points, with its interval; a star where it is significant."""
-    value, low, high = (f"{round(100 * x, 1) + 0.0:+.1f}" for x in (row.value, row.low, row.high))
+    value, low, high = (
+        f"{round(100 * x, 1) + 0.0:+.1f}" for x in (row.value, row.low, row.high)
+    )
     return f"{value}{'*' * (row.p_holm < 0.05)} ({low} to {high})"
 
 
@@ -246,7 +296,9 @@ def ordered(table: pd.DataFrame) -> list[str]:
 def others(table: pd.DataFrame) -> list[str]:
     """The policies that are beside the measures, as they were named."""
     return [
-        name for name in table["measure"].unique() if name != RANDOM and name not in ordered(table)
+        name
+        for name in table["measure"].unique()
+        if name != RANDOM and name not in ordered(table)
     ]
 
 
@@ -254,12 +306,17 @@ def figure(table: pd.DataFrame, n_views: tuple[int, ...]) -> Figure:
     """Correlation overall, by class, and what the policies gain, one row a measure."""
     names = ordered(table)
     classes = [
-        label for label in table[table["quantity"] == "correlation"]["label"].unique() if label
+        label
+        for label in table[table["quantity"] == "correlation"]["label"].unique()
+        if label
     ]
     with matplotlib.rc_context(FIGURE_STYLE):
         made = PlainFigure((13, 0.34 * len(names) + 1.9), layout="constrained")
         left, middle, right = made.subplots(
-            1, 3, sharey=True, width_ratios=[1, 0.11 * len(classes) + 0.6, 1]
+            1,
+            3,
+            sharey=True,
+            width_ratios=[1, 0.11 * len(classes) + 0.6, 1],
         )
     y = np.arange(len(names))
 
@@ -275,15 +332,30 @@ def figure(table: pd.DataFrame, n_views: tuple[int, ...]) -> Figure:
     left.plot(overall["value"], y, "o", color=INK, markersize=5)
     left.axvline(0, color=INK, linewidth=0.8)
     left.set_yticks(y, [name.replace("_", " ") for name in names])
-    left.set_xlabel("rank correlation with the log-probability\nof the true class, mean of objects")
+    left.set_xlabel(
+        "rank correlation with the log-probability\nof the true class, mean of objects"
+    )
 
     of_class = table[(table["quantity"] == "correlation") & (table["label"] != "")]
-    cells = of_class.pivot(index="measure", columns="label", values="value").loc[names, classes]
+    cells = of_class.pivot(index="measure", columns="label", values="value").loc[
+        names,
+        classes,
+    ]
     reach = max(
-        float(np.abs(cells.drop(index=CONFIDENCE, errors="ignore").to_numpy()).max(initial=0)), 1e-9
+        float(
+            np.abs(cells.drop(index=CONFIDENCE, errors="ignore").to_numpy()).max(
+                initial=0
+            )
+        ),
+        1e-9,
     )
     shown = middle.imshow(
-        cells, cmap="RdBu_r", vmin=-reach, vmax=reach, aspect="auto", origin="lower"
+        cells,
+        cmap="RdBu_r",
+        vmin=-reach,
+        vmax=reach,
+        aspect="auto",
+        origin="lower",
     )
     for (i, j), value in np.ndenumerate(cells.to_numpy()):
         faint = abs(value) > 0.6 * reach
@@ -297,7 +369,10 @@ def figure(table: pd.DataFrame, n_views: tuple[int, ...]) -> Figure:
             color="white" if faint else INK,
         )
     middle.set_xticks(
-        range(len(classes)), [name.replace("_", " ") for name in classes], rotation=45, ha="right"
+        range(len(classes)),
+        [name.replace("_", " ") for name in classes],
+        rotation=45,
+        ha="right",
     )
     middle.grid(False)
     middle.set_xlabel("the same, by class")
@@ -309,7 +384,14 @@ def figure(table: pd.DataFrame, n_views: tuple[int, ...]) -> Figure:
         over = numbers(f"over_random_{k}")
         at = y + 0.22 * (len(n_views) - 1) / 2 - 0.22 * step
         right.hlines(at, 100 * over["low"], 100 * over["high"], color=colour)
-        right.plot(100 * over["value"], at, "o", color=colour, markersize=4, label=f"{k} views")
+        right.plot(
+            100 * over["value"],
+            at,
+            "o",
+            color=colour,
+            markersize=4,
+            label=f"{k} views",
+        )
     right.axvline(0, color=INK, linewidth=0.8)
     right.set_xlabel(
         "accuracy of the policy that climbs the true map,\npoints over a random view of the window"
@@ -319,14 +401,25 @@ def figure(table: pd.DataFrame, n_views: tuple[int, ...]) -> Figure:
 
 
 def predicted(
-    out: Path, store: Path, models: str, split: Split, workers: int | None
+    out: Path,
+    store: Path,
+    models: str,
+    split: Split,
+    workers: int | None,
 ) -> Predictions:
     """What models say of a split of a store; of the training split only of what they held out."""
     if not out.exists():
         recogniser = find_card(find_models(models).recogniser)
         held_out = None if split == "test" else recogniser
         steps = predicting.predict(
-            store, out, recogniser, {}, split, held_out, size=False, workers=workers
+            store,
+            out,
+            recogniser,
+            {},
+            split,
+            held_out,
+            size=False,
+            workers=workers,
         )
         follow(steps, f"predicting {out.name}")
     return Predictions.load(out)
@@ -406,7 +499,8 @@ def main(
     comparing = study(*tables, names, policies, views, runs, samples, seed, numbers)
     track(comparing, 1 + len(names) + len(policies), "comparing measures")
     table = pd.DataFrame(
-        numbers, columns=["measure", "label", "quantity", "value", "low", "high", "p"]
+        numbers,
+        columns=["measure", "label", "quantity", "value", "low", "high", "p"],
     )
     table["p_holm"] = holm(table["p"].to_numpy())
     drawn = figure(table, views)

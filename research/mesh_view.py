@@ -49,7 +49,12 @@ class Surface:
     def normals(self) -> NDArray[np.float64]:
         """Unit normals of the faces, (F, 3) float64; 0 of a face without area."""
         length = 2 * self.areas[:, None]
-        return np.divide(self._cross, length, out=np.zeros_like(self._cross), where=length > 0)
+        return np.divide(
+            self._cross,
+            length,
+            out=np.zeros_like(self._cross),
+            where=length > 0,
+        )
 
 
 @dataclass(frozen=True)
@@ -84,12 +89,22 @@ class FaceCamera:
     ``distance`` are as there.
     """
 
-    def __init__(self, mesh: Mesh, size: int = 224, distance: float = CAMERA_DISTANCE) -> None:
+    def __init__(
+        self,
+        mesh: Mesh,
+        size: int = 224,
+        distance: float = CAMERA_DISTANCE,
+    ) -> None:
         self.surface = Surface(mesh.vertices, mesh.faces)
         self.intrinsics = pinhole(size, distance)
         self._scene = embree_scene([(mesh.vertices, mesh.faces)])
-        focal, centre = self.intrinsics[0, [0, 2]]  # in single precision, as in ``SimulatedCamera``
-        across = (np.arange(size, dtype=np.float32) + np.float32(0.5 - centre)) / np.float32(focal)
+        focal, centre = self.intrinsics[
+            0,
+            [0, 2],
+        ]  # in single precision, as in ``SimulatedCamera``
+        across = (
+            np.arange(size, dtype=np.float32) + np.float32(0.5 - centre)
+        ) / np.float32(focal)
         x, y = np.meshgrid(across, across)
         self._rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
 
@@ -97,9 +112,19 @@ class FaceCamera:
         """What a measure is handed of the depth image, (H, W), object radii, from a pose, (4,
         4), object frame.
         """
-        return MeshView(depth, pose, self.intrinsics, self.surface, self.face_ids(pose, depth))
+        return MeshView(
+            depth,
+            pose,
+            self.intrinsics,
+            self.surface,
+            self.face_ids(pose, depth),
+        )
 
-    def face_ids(self, pose: NDArray[np.float64], depth: NDArray[np.floating]) -> NDArray[np.int32]:
+    def face_ids(
+        self,
+        pose: NDArray[np.float64],
+        depth: NDArray[np.floating],
+    ) -> NDArray[np.int32]:
         """Which face of the mesh each pixel shows, (H, W) int32, -1 for none; arguments as of
         ``view``.
 
@@ -142,8 +167,12 @@ def _fill(found: NDArray[np.int32], z: NDArray[np.float32], step: int) -> None:
 
     The inverse depth of a plane changes evenly over the picture.
     """
-    reach = (found.shape[1] - 1) // (2 * step) * 2 * step  # the last column that was asked
-    left, middle, right = (slice(begin, begin + reach, 2 * step) for begin in (0, step, 2 * step))
+    reach = (
+        (found.shape[1] - 1) // (2 * step) * 2 * step
+    )  # the last column that was asked
+    left, middle, right = (
+        slice(begin, begin + reach, 2 * step) for begin in (0, step, 2 * step)
+    )
     one = found[:, left]
     before = z[:, left]
     after = z[:, right]
@@ -154,9 +183,13 @@ def _fill(found: NDArray[np.int32], z: NDArray[np.float32], step: int) -> None:
 
 
 def view_of(
-    mesh: Mesh, pose: NDArray[np.float64], size: int = 224, distance: float = CAMERA_DISTANCE
+    mesh: Mesh,
+    pose: NDArray[np.float64],
+    size: int = 224,
+    distance: float = CAMERA_DISTANCE,
 ) -> MeshView:
     """What a measure is handed of a mesh, seen from a pose, (4, 4), object frame, object radii."""
     return FaceCamera(mesh, size, distance).view(
-        pose, SimulatedCamera(mesh, size, distance).observe(pose).depth
+        pose,
+        SimulatedCamera(mesh, size, distance).observe(pose).depth,
     )

@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.errors import UsageError
-from nextview.sensing.expected_visibility import FREE, OCCLUDER, UNSEEN, Occupancy, VoxelGrid
+from nextview.sensing.expected_visibility import (
+    FREE,
+    OCCLUDER,
+    UNSEEN,
+    Occupancy,
+    VoxelGrid,
+)
 
 Float = NDArray[np.float32]
 TOGETHER = 100_000
@@ -21,7 +27,9 @@ TOGETHER = 100_000
 
 
 def new_volume(
-    occupancy: Occupancy, positions: NDArray[np.floating], region: NDArray[np.bool_] | None = None
+    occupancy: Occupancy,
+    positions: NDArray[np.floating],
+    region: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64]:
     """Unseen volume that no occupied voxel hides from each position: the volumetric information
     gain.
@@ -52,13 +60,20 @@ def new_volume(
         u, v, z = eyes.project(asked)
         frame = _Frame.around(u, v)
         reach = eyes.hidden(blockers, frame) + np.float32(grid.pitch)
-        pixels = _pixels(v - frame.top, u - frame.left, np.arange(len(u))[:, None], frame.shape)
+        pixels = _pixels(
+            v - frame.top,
+            u - frame.left,
+            np.arange(len(u))[:, None],
+            frame.shape,
+        )
         found += map(np.count_nonzero, z <= reach.take(pixels))
     return np.array(found or [0] * len(positions)) * grid.pitch**3
 
 
 def new_surface(
-    occupancy: Occupancy, positions: NDArray[np.floating], region: NDArray[np.bool_] | None = None
+    occupancy: Occupancy,
+    positions: NDArray[np.floating],
+    region: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64]:
     """Area of the picture in which the border of unseen space shows, where new surface may come to
     light.
@@ -102,7 +117,9 @@ def region_of(grid: VoxelGrid, region: NDArray[np.bool_] | None) -> NDArray[np.b
     if region is None:
         return grid.within(grid.half)
     if region.shape != (grid.n,) * 3 or region.dtype != bool:
-        raise UsageError(f"a region is an array of {(grid.n,) * 3} truths, one for each voxel")
+        raise UsageError(
+            f"a region is an array of {(grid.n,) * 3} truths, one for each voxel"
+        )
     return region
 
 
@@ -121,7 +138,9 @@ def _enclosed(solid: NDArray[np.bool_]) -> NDArray[np.bool_]:
         padded[inner, :-2, inner],
         padded[inner, 2:, inner],
     ]
-    return np.logical_and.reduce([*sides, padded[inner, inner, :-2], padded[inner, inner, 2:]])
+    return np.logical_and.reduce(
+        [*sides, padded[inner, inner, :-2], padded[inner, inner, 2:]]
+    )
 
 
 @dataclass(frozen=True)
@@ -147,7 +166,8 @@ class _Frame:
         """
         left, top = (c.min(1, keepdims=True) - 1 for c in (u, v))
         rows, columns = (
-            (c.max(1, keepdims=True) - c0).astype(np.int64) + 2 for c, c0 in ((v, top), (u, left))
+            (c.max(1, keepdims=True) - c0).astype(np.int64) + 2
+            for c, c0 in ((v, top), (u, left))
         )
         return cls(left, top, rows, columns, (int(rows.max()), int(columns.max())))
 
@@ -226,7 +246,11 @@ class _Eyes:
             here = (width * z >= wide) & (width * z < 2 * wide)
             i = v[here] / np.float32(width)
             j = u[here] / np.float32(width)
-            np.minimum(found, _drawn(j, i, z[here], picture[here], shape, width), out=found)
+            np.minimum(
+                found,
+                _drawn(j, i, z[here], picture[here], shape, width),
+                out=found,
+            )
             width *= 2
         return found
 
@@ -261,7 +285,11 @@ def _drawn(
     rows, columns = (side // width + 3 for side in shape[1:])
     inside = (i >= 0) & (i < rows - 1) & (j >= 0) & (j < columns - 1)
     nearest = np.full((shape[0], rows, columns), np.inf, np.float32)
-    np.minimum.at(nearest.reshape(-1), _pixels(i, j, picture, (rows, columns))[inside], z[inside])
+    np.minimum.at(
+        nearest.reshape(-1),
+        _pixels(i, j, picture, (rows, columns))[inside],
+        z[inside],
+    )
     nearest = np.minimum(nearest[:, :-1], nearest[:, 1:])
     nearest = np.minimum(nearest[:, :, :-1], nearest[:, :, 1:])
     if width > 1:
@@ -270,7 +298,10 @@ def _drawn(
 
 
 def _pixels(
-    i: Float, j: Float, picture: NDArray[np.int64], shape: tuple[int, int]
+    i: Float,
+    j: Float,
+    picture: NDArray[np.int64],
+    shape: tuple[int, int],
 ) -> NDArray[np.int64]:
     """Indices of rows and columns of pictures of a shape that lie in memory one after the other."""
     rows, columns = shape
@@ -282,7 +313,10 @@ def _pixels(
 
 
 def _eyes(
-    asked: Float, blockers: Float, positions: NDArray[np.floating], pitch: float
+    asked: Float,
+    blockers: Float,
+    positions: NDArray[np.floating],
+    pitch: float,
 ) -> Iterator[_Eyes]:
     """Cameras at some positions, (V, 3), that look at the middle of points, (3, P); none if there
     are no points.

@@ -59,7 +59,10 @@ def shared_points(
     cloud = points.reshape(-1, 3)
     share = np.zeros((v, v), np.float32)
     for other in range(v):
-        p = np.pad(depth[other], 1)  # the largest depth of each pixel and the four beside it
+        p = np.pad(
+            depth[other],
+            1,
+        )  # the largest depth of each pixel and the four beside it
         reach = np.maximum.reduce(
             [depth[other], p[:-2, 1:-1], p[2:, 1:-1], p[1:-1, :-2], p[1:-1, 2:]]
         )
@@ -80,26 +83,49 @@ def shared_points(
 
 def _overlap(path: Path, i: int) -> NDArray[np.float32]:
     store = opened(path)
-    return shared_points(store.points(i), store.depth(i), store.sphere.poses, store.intrinsics)
+    return shared_points(
+        store.points(i),
+        store.depth(i),
+        store.sphere.poses,
+        store.intrinsics,
+    )
 
 
-def overlap_figure(maps: NDArray[np.floating], sphere: ViewSphere, title: str) -> Figure:
+def overlap_figure(
+    maps: NDArray[np.floating],
+    sphere: ViewSphere,
+    title: str,
+) -> Figure:
     """The map of every view, laid out as the views are (thesis, figure 14).
 
     ``maps`` are (V, V) from 0 to 1; row = the view, column = the other view.
     """
     rings = sphere.rings
     azimuths = sphere.azimuths
-    figure = PlainFigure(figsize=(1.65 * azimuths + 1.2, 1.15 * rings + 1.3), layout="constrained")
+    figure = PlainFigure(
+        figsize=(1.65 * azimuths + 1.2, 1.15 * rings + 1.3),
+        layout="constrained",
+    )
     figure.suptitle(title, fontsize=13)
     panels = figure.subplots(rings, azimuths, squeeze=False)
     for view in range(len(sphere)):
         ring, azimuth = divmod(view, azimuths)
         axes = panels[rings - 1 - ring, azimuth]
         shown = axes.imshow(
-            maps[view].reshape(rings, azimuths), origin="lower", vmin=0, vmax=1, aspect="auto"
+            maps[view].reshape(rings, azimuths),
+            origin="lower",
+            vmin=0,
+            vmax=1,
+            aspect="auto",
         )
-        axes.plot(azimuth, ring, "o", color="white", markeredgecolor="black", markersize=5)
+        axes.plot(
+            azimuth,
+            ring,
+            "o",
+            color="white",
+            markeredgecolor="black",
+            markersize=5,
+        )
         axes.set(xticks=[], yticks=[])
         if ring == 0:
             axes.set_xlabel(f"{sphere.angles(view)[1]:g}°")
@@ -108,7 +134,11 @@ def overlap_figure(maps: NDArray[np.floating], sphere: ViewSphere, title: str) -
     figure.supxlabel("azimuth", fontsize=11)
     figure.supylabel("elevation", fontsize=11)
     figure.colorbar(
-        shown, ax=panels, label="share of the view's points, scaled", shrink=0.8, pad=0.01
+        shown,
+        ax=panels,
+        label="share of the view's points, scaled",
+        shrink=0.8,
+        pad=0.01,
     )
     return figure
 
@@ -141,21 +171,30 @@ def overlap(
     for path in (arrays, picture):
         check_new(path, overwrite)
     if label is not None and label not in views.classes:
-        raise DatasetError(f"{store}: has no class {label!r}; there are {', '.join(views.classes)}")
+        raise DatasetError(
+            f"{store}: has no class {label!r}; there are {', '.join(views.classes)}"
+        )
     select = np.flatnonzero(
-        views.done & (True if label is None else views.labels == views.classes.index(label))
+        views.done
+        & (True if label is None else views.labels == views.classes.index(label))
     )
     if len(select) == 0:
         raise DatasetError(
-            f"{store}: holds no rendered object" + (f" of the class {label!r}" if label else "")
+            f"{store}: holds no rendered object"
+            + (f" of the class {label!r}" if label else "")
         )
     share, maps = np.zeros((2, len(views.sphere), len(views.sphere)))
 
     def sums() -> Iterator[int]:
         work = partial(_overlap, store.absolute())
-        for count, (i, found) in enumerate(each(work, select.tolist(), workers, scheduler), 1):
+        for count, (i, found) in enumerate(
+            each(work, select.tolist(), workers, scheduler),
+            1,
+        ):
             if isinstance(found, WorkerDied):
-                raise DatasetError(f"{store}: {views.names[i]} cannot be computed: {found}")
+                raise DatasetError(
+                    f"{store}: {views.names[i]} cannot be computed: {found}"
+                )
             share[:] += found / len(select)
             maps[:] += overlap_maps(found) / len(select)
             yield count
@@ -167,7 +206,11 @@ def overlap(
     with new_file(arrays, overwrite) as part:
         np.savez(part, share=share, maps=maps, objects=len(select))
     with new_file(picture, overwrite) as part:
-        overlap_figure(maps, views.sphere, title).savefig(part, dpi=150, facecolor="white")
+        overlap_figure(maps, views.sphere, title).savefig(
+            part,
+            dpi=150,
+            facecolor="white",
+        )
     console.print(f"{arrays}\n{picture}")
 
 

@@ -69,7 +69,14 @@ def plan(
                 " those that need the depth that was seen and nothing else"
             )
     arrays = [f"plans/{name}" for name in names]
-    yield from keep(path, arrays, partial(_plan, names), workers, scheduler, objects=objects)
+    yield from keep(
+        path,
+        arrays,
+        partial(_plan, names),
+        workers,
+        scheduler,
+        objects=objects,
+    )
 
 
 def _plan(names: tuple[str, ...], store: ViewStore, i: int) -> Made:
@@ -78,13 +85,21 @@ def _plan(names: tuple[str, ...], store: ViewStore, i: int) -> Made:
     scenes = None if sight is None else scene_views(store, i)
     views = [
         Observation(
-            depth, pose, store.intrinsics, scene=None if scenes is None else scenes.scene_view(view)
+            depth,
+            pose,
+            store.intrinsics,
+            scene=None if scenes is None else scenes.scene_view(view),
         )
-        for view, (depth, pose) in enumerate(zip(store.depth(i), sphere.poses, strict=True))
+        for view, (depth, pose) in enumerate(
+            zip(store.depth(i), sphere.poses, strict=True)
+        )
     ]
 
     def observe(episodes: NDArray[np.int64], at: NDArray[np.int64]) -> Evidence:
-        return Evidence(np.zeros((len(at), 2)), observations=[views[view] for view in at])
+        return Evidence(
+            np.zeros((len(at), 2)),
+            observations=[views[view] for view in at],
+        )
 
     found = {}
     for name in names:
@@ -93,7 +108,13 @@ def _plan(names: tuple[str, ...], store: ViewStore, i: int) -> Made:
         constrain, _ = sight_of(sight, np.zeros(len(sphere), np.int64))
         rng = np.random.default_rng(0)
         episodes = run_episodes(
-            observe, sphere, make_policy(name, sphere), starts, length, rng, constrain=constrain
+            observe,
+            sphere,
+            make_policy(name, sphere),
+            starts,
+            length,
+            rng,
+            constrain=constrain,
         )
         found[f"plans/{name}"] = episodes.outcome.views.astype(np.float32)
     return found

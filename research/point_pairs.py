@@ -54,7 +54,9 @@ Float = NDArray[np.float64]
 Cloud = NDArray[np.float32]  # points and unit normals, (N, 6), metres
 
 MODEL_POINTS = 2500  # on each surface, before the detector thins them
-SCENE_SIDE = 48  # rows and columns of pixels that are chosen over the outline of what is seen
+SCENE_SIDE = (
+    48  # rows and columns of pixels that are chosen over the outline of what is seen
+)
 NEIGHBOURS = 12  # points that a normal is found from
 SAMPLING_STEP = 0.09  # of the samples, sides of the box around the model
 DISTANCE_STEP = 0.05  # of distances between points, in diameters
@@ -65,7 +67,9 @@ STEPS = 10  # of a refinement
 FEWEST = 6  # points near a surface that a step needs
 DAMPING = 1e-6
 FARTHEST = 0.01  # metres: what is farther from a thing counts as so far
-SOFTNESS = 0.0005  # metres of mean distance that make a thing less likely by a factor of e
+SOFTNESS = (
+    0.0005  # metres of mean distance that make a thing less likely by a factor of e
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +111,9 @@ class PointPairs:
         Args:
             observations: the views, in one object frame, of known scale.
         """
-        seen = np.concatenate([scene_cloud(observation) for observation in observations])
+        seen = np.concatenate(
+            [scene_cloud(observation) for observation in observations]
+        )
         matches = [self._match(thing, seen) for thing in range(len(self.classes))]
         distances = np.array([match.distance for match in matches])
         likelihood = np.exp(-(distances - distances.min()) / SOFTNESS)
@@ -133,7 +139,9 @@ class PointPairs:
             return Match(FARTHEST, np.eye(4))
 
         surface = self._surfaces[thing]
-        matches = [surface.refined(pose, seen[:, :3].astype(np.float64)) for pose in poses]
+        matches = [
+            surface.refined(pose, seen[:, :3].astype(np.float64)) for pose in poses
+        ]
         return min(matches, key=lambda match: match.distance)
 
 
@@ -175,7 +183,11 @@ class TangentPlanes:
         distance = np.where(near, np.minimum(np.abs(height), FARTHEST), FARTHEST)
         return Match(float(distance.mean()), pose)
 
-    def _beside(self, pose: Float, seen: Float) -> tuple[Float, Float, Float, NDArray[np.bool_]]:
+    def _beside(
+        self,
+        pose: Float,
+        seen: Float,
+    ) -> tuple[Float, Float, Float, NDArray[np.bool_]]:
         """What was seen in the frame of the surface, how far it is off the nearest plane, the
         normal of that, and whether it is near.
         """
@@ -189,7 +201,9 @@ class TangentPlanes:
 def model_cloud(surface: Surface) -> Cloud:
     """Points that are spread evenly over a surface, with its normals."""
     rng = np.random.default_rng(0)
-    corners = surface.vertices[surface.faces[surface.triangles_by_area(MODEL_POINTS, rng)]]
+    corners = surface.vertices[
+        surface.faces[surface.triangles_by_area(MODEL_POINTS, rng)]
+    ]
     shares = rng.dirichlet(np.ones(3), MODEL_POINTS)
     points = (shares[..., None] * corners).sum(1)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -249,7 +263,10 @@ def compared(
     posed = None
     if named:
         surface = taught.surfaces[episode.thing]
-        posed = add_s(surface, taught.points[episode.thing], found.poses[0].pose, episode) < 0.1
+        posed = (
+            add_s(surface, taught.points[episode.thing], found.poses[0].pose, episode)
+            < 0.1
+        )
 
     ours = judged(things, taught, some, episode, 1)
     own_posed = None if ours.add_s is None else ours.add_s < 0.1
@@ -278,7 +295,9 @@ def table(results: Sequence[Compared]) -> Iterator[str]:
     yield "|---|---|---|---|"
     for row, name in enumerate(("point pairs", "nextview")):
         seconds = [result.seconds[row] for result in results]
-        posed = [result.posed[row] for result in results if result.posed[row] is not None]
+        posed = [
+            result.posed[row] for result in results if result.posed[row] is not None
+        ]
         cells = (
             name,
             f"{np.mean([result.right[row] for result in results]):.3f}",
@@ -315,7 +334,9 @@ def main(
     strange = sorted(set(things) - set(taught.names))
     if strange:
         raise UsageError(f"{models}: knows nothing called {strange[0]}")
-    some = np.array([k for k, name in enumerate(taught.names) if not things or name in things])
+    some = np.array(
+        [k for k, name in enumerate(taught.names) if not things or name in things]
+    )
 
     begun = time.process_time()
     pairs = PointPairs([taught.surfaces[k] for k in some])
@@ -330,7 +351,9 @@ def main(
             episode = shown(taught, known, int(thing), draw, setting)
             results.append(compared(pairs, known, taught, some, episode))
 
-    print(f"{len(results)} frames of {len(some)} things; point pairs learned in {learned:.0f} s")
+    print(
+        f"{len(results)} frames of {len(some)} things; point pairs learned in {learned:.0f} s"
+    )
     print(*table(results), sep="\n")
 
 

@@ -29,25 +29,38 @@ def main(folder: tyro.conf.Positional[Path], scans: tyro.conf.Positional[Path]) 
     rows = []
     for path in sorted(folder.glob("*.depth.png")):
         depth = np.asarray(Image.open(path)).astype(np.float32) / 1000
-        labels = np.asarray(Image.open(path.with_name(path.name.replace("depth", "labels"))))
+        labels = np.asarray(
+            Image.open(path.with_name(path.name.replace("depth", "labels")))
+        )
         whole = Frame(depth, INTRINSICS, np.eye(4))
         for number, name in enumerate(names[1:], 1):
             shown = (labels == number) & (depth > 0)
             if shown.sum() < LEAST:
                 continue
             pointed = ObservedObject(
-                up=None, point=np.median(whole.positions(*np.nonzero(shown)), 0)
+                up=None,
+                point=np.median(whole.positions(*np.nonzero(shown)), 0),
             )
             pointed.add(whole)
             found = pointed.sightings[0].mask
             session = system.session(start=0, object=ObservedObject(up=None))
-            view = session.update(Frame(depth, INTRINSICS, np.eye(4), mask=labels == number))
+            view = session.update(
+                Frame(depth, INTRINSICS, np.eye(4), mask=labels == number)
+            )
             best = [system.classes[c] for c in np.argsort(-view.belief)[:3]]
             true = nextview.load_mesh(scans / f"{name}.ply", unit="m").metres
-            radii = pointed.object_frame.radius / true, session.object.object_frame.radius / true
+            radii = (
+                pointed.object_frame.radius / true,
+                session.object.object_frame.radius / true,
+            )
             overlap = (found & shown).sum() / (found | shown).sum()
             rows.append(
-                (overlap, *(abs(r - 1) < NEAR for r in radii), name == best[0], name in best)
+                (
+                    overlap,
+                    *(abs(r - 1) < NEAR for r in radii),
+                    name == best[0],
+                    name in best,
+                )
             )
             print(
                 f"{name}: overlap {overlap:.2f}, radius {radii[0]:.2f} by point, {radii[1]:.2f} by"

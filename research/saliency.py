@@ -39,7 +39,9 @@ def mesh_saliency(view: MeshView) -> float:
     Returns:
         Object radii; 0 on a sphere, or where nothing is seen.
     """
-    return float((saliency_of(bent(view.surface))[view.pixels[0]] * seen_area(view)).sum())
+    return float(
+        (saliency_of(bent(view.surface))[view.pixels[0]] * seen_area(view)).sum()
+    )
 
 
 def saliency_of(surface: BentSurface) -> NDArray[np.float64]:
@@ -55,19 +57,27 @@ def _saliency(surface: BentSurface) -> NDArray[np.float64]:
     around = np.bincount(fine.corners.ravel(), np.repeat(fine.areas, 3), places) / 3
     # Half of each edge's curvature to each of its ends; each edge stands in two faces.
     at_ends = (fine.lengths * fine.bends) / 8
-    bend = np.bincount(fine.corners.ravel(), (at_ends + np.roll(at_ends, 1, 1)).ravel(), places)
+    bend = np.bincount(
+        fine.corners.ravel(),
+        (at_ends + np.roll(at_ends, 1, 1)).ravel(),
+        places,
+    )
     position = np.zeros((places, 3))
     position[fine.corners.ravel()] = fine.vertices[fine.faces.ravel()]
     group = _groups(position)
     area = np.asarray(np.bincount(group, around), np.float64)
-    middle = np.stack([np.bincount(group, around * position[:, k]) for k in range(3)], 1)
+    middle = np.stack(
+        [np.bincount(group, around * position[:, k]) for k in range(3)],
+        1,
+    )
     middle = np.where(
         area[:, None] > 0,
         middle / np.maximum(area, 1e-30)[:, None],
         10 + np.arange(len(area))[:, None],
     )
     curvature = np.asarray(
-        np.where(area > 0, np.bincount(group, bend) / np.maximum(area, 1e-30), 0), np.float64
+        np.where(area > 0, np.bincount(group, bend) / np.maximum(area, 1e-30), 0),
+        np.float64,
     )
     salient = _salient(np.asarray(middle, np.float64), area, curvature)
     of_fine = salient[group][fine.corners].mean(1)
@@ -77,7 +87,9 @@ def _saliency(surface: BentSurface) -> NDArray[np.float64]:
 
 
 def _salient(
-    points: NDArray[np.float64], area: NDArray[np.float64], curvature: NDArray[np.float64]
+    points: NDArray[np.float64],
+    area: NDArray[np.float64],
+    curvature: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Saliency of points, (n,): over all scales, how the averages of their curvature at two widths
     differ.
@@ -99,7 +111,9 @@ def _salient(
 
 
 def _averages(
-    points: NDArray[np.float64], area: NDArray[np.float64], curvature: NDArray[np.float64]
+    points: NDArray[np.float64],
+    area: NDArray[np.float64],
+    curvature: NDArray[np.float64],
 ) -> dict[int, NDArray[np.float64]]:
     """Average curvature around each point, weighted by area and a Gaussian, (n,), by the
     Gaussian's width in units.
@@ -112,7 +126,9 @@ def _averages(
     # points near each other: less to remember
     for block in np.array_split(tree.indices, -(-len(points) // BLOCK)):
         pairs = cKDTree(points[block]).sparse_distance_matrix(
-            tree, 2 * widths[0] * UNIT, output_type="coo_matrix"
+            tree,
+            2 * widths[0] * UNIT,
+            output_type="coo_matrix",
         )
         # the pairs of a point with itself are among them
         i = pairs.row
@@ -132,7 +148,12 @@ def _averages(
             weight = (np.exp(square * (-1 / (2 * sigma**2))) - np.exp(-2)) * own
             total = np.bincount(i, weight, len(block))
             whole = np.bincount(i, weight * bend, len(block))
-            found[width][block] = np.divide(whole, total, out=np.zeros(len(block)), where=total > 0)
+            found[width][block] = np.divide(
+                whole,
+                total,
+                out=np.zeros(len(block)),
+                where=total > 0,
+            )
     return found
 
 
@@ -162,7 +183,8 @@ def _cut(surface: BentSurface) -> tuple[BentSurface, NDArray[np.int64]]:
     loose = BentSurface(vertices, np.arange(len(vertices)).reshape(-1, 3))
     # Corners in one place are one, but not of parts that only touch: their cuts meet by chance.
     key = loose.places.ravel() * (int(surface.parts.max()) + 1) + np.repeat(
-        surface.parts[parent], 3
+        surface.parts[parent],
+        3,
     )
     _, first, index = np.unique(key, return_index=True, return_inverse=True)
     return BentSurface(vertices[first], index.reshape(-1, 3)), parent
@@ -174,4 +196,6 @@ def _groups(points: NDArray[np.float64]) -> NDArray[np.int64]:
     """
     if len(points) <= MANY:
         return np.arange(len(points))
-    return np.unique(np.floor(points / CELL), axis=0, return_inverse=True)[1].reshape(-1)
+    return np.unique(np.floor(points / CELL), axis=0, return_inverse=True)[1].reshape(
+        -1
+    )

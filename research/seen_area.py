@@ -29,10 +29,15 @@ def seen_area(view: MeshView) -> NDArray[np.float64]:
         z = view.depths[hits]
         corners = view.surface.vertices[view.surface.faces[faces, 0]]
         apart = np.zeros(int(faces[-1]) + 1 if len(faces) else 0)
-        apart[faces] = np.abs(((corners - view.pose[:3, 3]) * view.surface.normals[faces]).sum(1))
+        apart[faces] = np.abs(
+            ((corners - view.pose[:3, 3]) * view.surface.normals[faces]).sum(1)
+        )
         focal = view.intrinsics[0, 0] * view.intrinsics[1, 1]
         patches = z**2 / (focal * np.maximum(apart[ids] / z, GRAZING))
-        view.__dict__["seen_area"] = np.asarray(np.bincount(ids, patches)[faces], np.float64)
+        view.__dict__["seen_area"] = np.asarray(
+            np.bincount(ids, patches)[faces],
+            np.float64,
+        )
     return view.__dict__["seen_area"]
 
 

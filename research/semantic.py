@@ -51,10 +51,14 @@ def base_avoidance(view: MeshView) -> float:
         return 0.0
     normals = surface.normals[faces]
     # A face's own normal may point either way; what counts is the side that the camera is on.
-    towards = ((view.pose[:3, 3] - surface.vertices[surface.faces[faces]].mean(1)) * normals).sum(1)
+    towards = (
+        (view.pose[:3, 3] - surface.vertices[surface.faces[faces]].mean(1)) * normals
+    ).sum(1)
     down = -normals[:, 2] * np.sign(towards)
     heights = surface.vertices[:, 2]
     low = heights.min()
     high = heights.max()
-    base = (down > DOWN) & (heights[surface.faces[faces]].max(1) < low + BASE * (high - low))
+    base = (down > DOWN) & (
+        heights[surface.faces[faces]].max(1) < low + BASE * (high - low)
+    )
     return float(1 - pixels[base].sum() / pixels.sum())

@@ -62,11 +62,15 @@ def silhouette_entropy(view: MeasuredView) -> float:
         return 0.0
     arm = ARM * max(view.depth.shape)
     seen = np.pad(view.seen, 1).astype(np.float64)
-    outlines: Any = contour_generator(z=seen, line_type=LineType.ChunkCombinedOffset).lines(0.5)
+    outlines: Any = contour_generator(
+        z=seen,
+        line_type=LineType.ChunkCombinedOffset,
+    ).lines(0.5)
     (points,), (offsets,) = outlines
     turns = _turns(points, offsets.astype(np.int64), arm)
     counts = np.bincount(
-        np.rint((turns / (2 * np.pi) + 0.5) * CELLS).astype(np.int64) % CELLS, minlength=CELLS
+        np.rint((turns / (2 * np.pi) + 0.5) * CELLS).astype(np.int64) % CELLS,
+        minlength=CELLS,
     )
     blur, own = _blur()
     spread = irfft(rfft(counts) * blur)
@@ -85,7 +89,9 @@ def _blur() -> tuple[NDArray[np.complex128], float]:
 
 
 def _turns(
-    points: NDArray[np.float64], offsets: NDArray[np.int64], arm: float
+    points: NDArray[np.float64],
+    offsets: NDArray[np.int64],
+    arm: float,
 ) -> NDArray[np.float64]:
     """Signed turns along closed outlines, (n,) radians, at every pixel's length of them.
 
@@ -101,7 +107,11 @@ def _turns(
     of = np.repeat(np.arange(len(n)), n)
     i = np.arange(len(of)) - first[of]
     at = begin[of] + i * (length / n)[of]
-    places = np.interp(at, along, points[:, 0]) + 1j * np.interp(at, along, points[:, 1])
+    places = np.interp(at, along, points[:, 0]) + 1j * np.interp(
+        at,
+        along,
+        points[:, 1],
+    )
     # Nothing is smaller than a few pixels: on a short outline the arms are a quarter of it.
     k = np.maximum(np.minimum(n // 4, round(arm)), 1)[of]
     ahead, behind = (places[first[of] + (i + way) % n[of]] for way in (k, -k))

@@ -82,7 +82,9 @@ def systems(models: str) -> dict[str, nextview.System]:
         "gain, in cells": gain,
         "random": nextview.load(models, policy="random-all", threads=1),
     }
-    return made | {"nearest": replace(gain, policy=Nearest(gain.sphere), policy_name="nearest")}
+    return made | {
+        "nearest": replace(gain, policy=Nearest(gain.sphere), policy_name="nearest")
+    }
 
 
 def begin(mesh: nextview.Mesh, settings: Settings, which: tuple[int, int]) -> Arm:
@@ -92,22 +94,37 @@ def begin(mesh: nextview.Mesh, settings: Settings, which: tuple[int, int]) -> Ar
     joints = None
     while joints is None:
         joints = first_joints(
-            arm, np.radians(rng.uniform(10, 60)), rng.uniform(0, 2 * np.pi), DISTANCE
+            arm,
+            np.radians(rng.uniform(10, 60)),
+            rng.uniform(0, 2 * np.pi),
+            DISTANCE,
         )
     arm.joints = joints
     return arm
 
 
-def episode(arm: Arm, system: nextview.System, name: str, label: str, seed: int) -> dict[str, Any]:
+def episode(
+    arm: Arm,
+    system: nextview.System,
+    name: str,
+    label: str,
+    seed: int,
+) -> dict[str, Any]:
     """One episode: after each view the seconds moved so far, and whether the class believed most
     is right.
     """
-    session = system.session(object=ObservedObject(life_size=False), distance=DISTANCE, seed=seed)
+    session = system.session(
+        object=ObservedObject(life_size=False),
+        distance=DISTANCE,
+        seed=seed,
+    )
     right = []
     moved = []
 
     def looked() -> None:
-        right.append(session.models.classes[int(session.views[-1].belief.argmax())] == label)
+        right.append(
+            session.models.classes[int(session.views[-1].belief.argmax())] == label
+        )
         moved.append(arm.seconds)
 
     result = arm.run(session, looked, costs=name != "gain, in cells")
@@ -124,9 +141,14 @@ def episode(arm: Arm, system: nextview.System, name: str, label: str, seed: int)
     }
 
 
-def run(settings: Settings, done: dict[tuple[str, int, str], dict[str, Any]]) -> Iterator[int]:
+def run(
+    settings: Settings,
+    done: dict[tuple[str, int, str], dict[str, Any]],
+) -> Iterator[int]:
     """Append what is missing; yields how many episodes are done."""
-    entries = [entry for entry in list_dataset(settings.dataset) if entry.split == "test"]
+    entries = [
+        entry for entry in list_dataset(settings.dataset) if entry.split == "test"
+    ]
     entries = entries[:: len(entries) // settings.objects][: settings.objects]
     by_policy = systems(settings.models)
     count = 0
@@ -134,17 +156,35 @@ def run(settings: Settings, done: dict[tuple[str, int, str], dict[str, Any]]) ->
         for start in range(settings.runs):
             for i, entry in enumerate(entries):
                 asked = [(entry.path.stem, start, name) for name in POLICIES]
-                ended = next((done[each] for each in asked if each in done), {"views": 0})
+                ended = next(
+                    (done[each] for each in asked if each in done),
+                    {"views": 0},
+                )
                 for name in (
-                    each for *_, each in asked if (entry.path.stem, start, each) not in done
+                    each
+                    for *_, each in asked
+                    if (entry.path.stem, start, each) not in done
                 ):
                     # the first view is the same for all, and no policy chose it
                     if ended["views"] != 1:
-                        arm = begin(nextview.load_mesh(entry.path), settings, (i, start))
-                        ended = episode(
-                            arm, by_policy[name], name, entry.label, settings.seed + start
+                        arm = begin(
+                            nextview.load_mesh(entry.path),
+                            settings,
+                            (i, start),
                         )
-                    row = {"object": entry.path.stem, "start": start, **ended, "policy": name}
+                        ended = episode(
+                            arm,
+                            by_policy[name],
+                            name,
+                            entry.label,
+                            settings.seed + start,
+                        )
+                    row = {
+                        "object": entry.path.stem,
+                        "start": start,
+                        **ended,
+                        "policy": name,
+                    }
                     file.write(json.dumps(row) + "\n")
                 count += len(POLICIES)
                 yield count
@@ -162,7 +202,13 @@ def table(rows: list[dict[str, Any]], samples: int = 2000) -> Iterator[str]:
         """The mean of each object, (objects,)."""
         return np.array(
             [
-                np.mean([r[what] for r in rows if r["policy"] == policy and r["object"] == name])
+                np.mean(
+                    [
+                        r[what]
+                        for r in rows
+                        if r["policy"] == policy and r["object"] == name
+                    ]
+                )
                 for name in objects
             ]
         )
@@ -174,7 +220,11 @@ def table(rows: list[dict[str, Any]], samples: int = 2000) -> Iterator[str]:
     yield "| policy | right | views | seconds of motion | until right | until right, less gain's |"
     yield "|---|---|---|---|---|---|"
     for policy in POLICIES:
-        less = "" if policy == "gain" else shown(of(policy, "until") - of("gain", "until"), 2)
+        less = (
+            ""
+            if policy == "gain"
+            else shown(of(policy, "until") - of("gain", "until"), 2)
+        )
         cells = [
             shown(of(policy, "right"), 3),
             shown(of(policy, "views"), 2),
@@ -191,9 +241,15 @@ def main(settings: Settings) -> None:
         else []
     )
     done = {(row["object"], row["start"], row["policy"]): row for row in rows}
-    track(run(settings, done), settings.objects * settings.runs * len(POLICIES), "recognising")
+    track(
+        run(settings, done),
+        settings.objects * settings.runs * len(POLICIES),
+        "recognising",
+    )
     rows = [
-        row for row in map(json.loads, settings.episodes.open()) if row["start"] < settings.runs
+        row
+        for row in map(json.loads, settings.episodes.open())
+        if row["start"] < settings.runs
     ]
     print("\n".join(table(rows)))
     longest = max(row["moved"] for row in rows)

@@ -106,7 +106,11 @@ class BatchedVecEnv(VecEnv):
     def __init__(self, env: TaskVectorEnv) -> None:
         self._env = env
         self._actions = np.zeros(0, np.int64)
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        super().__init__(
+            env.num_envs,
+            env.single_observation_space,
+            env.single_action_space,
+        )
 
     def reset(self) -> NDArray[np.float32]:
         """First observations, (envs, D)."""
@@ -120,7 +124,12 @@ class BatchedVecEnv(VecEnv):
 
     def step_wait(
         self,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+    ) -> tuple[
+        NDArray[np.float32],
+        NDArray[np.float32],
+        NDArray[np.bool_],
+        list[dict[str, Any]],
+    ]:
         """Observations, rewards, ends and infos."""
         observation, reward, ended, _, info = self._env.step(self._actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -143,7 +152,11 @@ class BatchedVecEnv(VecEnv):
         setattr(self._env, attr_name, value)
 
     def env_method(
-        self, method_name: str, *args: Any, indices: Any = None, **options: Any
+        self,
+        method_name: str,
+        *args: Any,
+        indices: Any = None,
+        **options: Any,
     ) -> list[Any]:
         """Call a method of the environment, for each."""
         return [getattr(self._env, method_name)(*args, **options)] * len(

@@ -39,7 +39,12 @@ from nextview.files import sha256_of
 from nextview.geometry.mesh import load_mesh, make_mesh
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.recognition.inference import FEATURES_OUTPUT, OnnxFile, open_onnx
-from nextview.recognition.model_card import BUNDLED_MODELS, RECOGNISER, find_card, read_card
+from nextview.recognition.model_card import (
+    BUNDLED_MODELS,
+    RECOGNISER,
+    find_card,
+    read_card,
+)
 from nextview.recognition.network_input import from_observations
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
@@ -77,7 +82,11 @@ def networks(lite: Path) -> tuple[OnnxFile, OnnxFile]:
     return open_onnx(card.path, card.sha256, 1), open_onnx(lite, sha256_of(lite), 1)
 
 
-def look(lite: Path, mesh: Path, seed: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+def look(
+    lite: Path,
+    mesh: Path,
+    seed: int,
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Clean features (V, D), those through two sensors (2, V, D), where all is seen (V,), and
     elevations (V,).
     """
@@ -90,7 +99,8 @@ def look(lite: Path, mesh: Path, seed: int) -> tuple[NDArray, NDArray, NDArray, 
             else thing.vertices
         )
         thing = make_mesh(
-            vertices @ np.array(LYING[rng.integers(2)]).T * rng.choice([-1, 1]), thing.faces
+            vertices @ np.array(LYING[rng.integers(2)]).T * rng.choice([-1, 1]),
+            thing.faces,
         )
     elevation = np.arcsin(rng.uniform(-0.05, HIGHEST, VIEWS))
     azimuth = rng.uniform(0, 2 * np.pi, VIEWS)
@@ -98,14 +108,20 @@ def look(lite: Path, mesh: Path, seed: int) -> tuple[NDArray, NDArray, NDArray, 
     clean = SimulatedCamera(thing)
     seen = [[clean.observe(pose) for pose in poses]]
     for sensor in ("wrist", rng.choice(["wrist", "mix"])):
-        cameras = [SensedCamera(thing, str(sensor), child) for child in rng.spawn(VIEWS // SETUP)]
+        cameras = [
+            SensedCamera(thing, str(sensor), child)
+            for child in rng.spawn(VIEWS // SETUP)
+        ]
         seen.append([cameras[k // SETUP].observe(pose) for k, pose in enumerate(poses)])
     recogniser, session = networks(lite)
     takes = find_card(RECOGNISER).input
     found = []
     for views in seen:
         inputs = {"input": from_observations(takes, views)}
-        own = [recogniser.run([FEATURES_OUTPUT], inputs)[0], session.run(None, inputs)[0]]
+        own = [
+            recogniser.run([FEATURES_OUTPUT], inputs)[0],
+            session.run(None, inputs)[0],
+        ]
         found.append(np.concatenate(own, 1))
     shown = np.array([[view.seen for view in views] for views in seen[1:]]).all(0)
     return found[0], np.stack(found[1:]), shown, elevation
@@ -123,11 +139,18 @@ def discriminant(clean: NDArray, sensed: NDArray, middle: NDArray) -> NDArray:
     within = same.T @ same / len(same) / 2
     values, axes = np.linalg.eigh(within + 0.1 * np.trace(total) / d * np.eye(d))
     white = axes / np.sqrt(values)
-    return (white @ np.linalg.eigh(white.T @ total @ white)[1][:, ::-1][:, :DIM]).astype(np.float32)
+    return (
+        white @ np.linalg.eigh(white.T @ total @ white)[1][:, ::-1][:, :DIM]
+    ).astype(np.float32)
 
 
 def train(
-    clean: NDArray, sensed: NDArray, seen: NDArray, elevation: NDArray, steps: int, seed: int
+    clean: NDArray,
+    sensed: NDArray,
+    seen: NDArray,
+    elevation: NDArray,
+    steps: int,
+    seed: int,
 ) -> tuple[NDArray, NDArray]:
     """The middle of the features, (D,), and the projection, (D, DIM)."""
     rng = np.random.default_rng(seed)
@@ -138,7 +161,9 @@ def train(
     rate = 0.02 * float(first.abs().mean())
     optimiser = torch.optim.Adam([{"params": [projection]}, {"params": [scale]}])
     schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, max_lr=[rate, 1e-2], total_steps=steps
+        optimiser,
+        max_lr=[rate, 1e-2],
+        total_steps=steps,
     )
     own = torch.tensor(clean - middle)
     through = torch.tensor(sensed - middle)
@@ -147,10 +172,16 @@ def train(
         return F.normalize(x @ projection, dim=1)
 
     for _ in range(steps):
-        objects = np.repeat(rng.choice(len(clean), min(96, len(clean)), replace=False), 6)
-        views = np.concatenate([rng.permutation(VIEWS)[:6] for _ in range(len(objects) // 6)])
+        objects = np.repeat(
+            rng.choice(len(clean), min(96, len(clean)), replace=False),
+            6,
+        )
+        views = np.concatenate(
+            [rng.permutation(VIEWS)[:6] for _ in range(len(objects) // 6)]
+        )
         memory = F.normalize(
-            project(own[objects, views]) + project(through[objects, 1, views]), dim=1
+            project(own[objects, views]) + project(through[objects, 1, views]),
+            dim=1,
         )
         logits = project(through[objects, 0, views]) @ memory.T * scale.exp()
         e = torch.tensor(elevation[objects, views])
@@ -182,7 +213,8 @@ def joined(lite: Path, middle: NDArray, projection: NDArray, out: Path) -> None:
     nodes = [node for graph in graphs for node in graph.graph.node]
     for node in nodes:
         node.input[:] = [
-            "input" if name in ("pair_input", "lite_input") else name for name in node.input
+            "input" if name in ("pair_input", "lite_input") else name
+            for name in node.input
         ]
     constants = [numpy_helper.from_array(middle.astype(np.float32), "middle")]
     constants += [numpy_helper.from_array(projection.astype(np.float16), "small")]
@@ -200,7 +232,8 @@ def joined(lite: Path, middle: NDArray, projection: NDArray, out: Path) -> None:
         ("Div", ["projected", "longer"], "embedding", {}),
     ]
     nodes += [
-        helper.make_node(kind, inputs, [output], **more) for kind, inputs, output, more in made
+        helper.make_node(kind, inputs, [output], **more)
+        for kind, inputs, output, more in made
     ]
     ends = (
         ("input", TensorProto.UINT8, ["batch", 4, 112, 112]),
@@ -210,14 +243,21 @@ def joined(lite: Path, middle: NDArray, projection: NDArray, out: Path) -> None:
     weights = [w for graph in graphs for w in graph.graph.initializer] + constants
     graph = helper.make_graph(nodes, "features", given, gives, weights)
     model = helper.make_model(
-        graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=graphs[0].ir_version
+        graph,
+        opset_imports=[helper.make_opsetid("", 18)],
+        ir_version=graphs[0].ir_version,
     )
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, out)
 
 
 def main(
-    dataset: Path, checkpoint: Path, out: Path, things: int = 600, steps: int = 1200, seed: int = 0
+    dataset: Path,
+    checkpoint: Path,
+    out: Path,
+    things: int = 600,
+    steps: int = 1200,
+    seed: int = 0,
 ) -> None:
     """Make features.onnx in a folder from the training meshes that the bundled recogniser was
     trained on.
@@ -234,14 +274,24 @@ def main(
     )
     held_out = set(read_card(BUNDLED_MODELS / f"{RECOGNISER}.json").held_out)
     meshes = [
-        e.path for e in list_dataset(dataset) if e.split == "train" and e.name not in held_out
+        e.path
+        for e in list_dataset(dataset)
+        if e.split == "train" and e.name not in held_out
     ]
-    chosen = [meshes[i] for i in np.random.default_rng(seed).permutation(len(meshes))[:things]]
+    chosen = [
+        meshes[i] for i in np.random.default_rng(seed).permutation(len(meshes))[:things]
+    ]
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
         found = list(pool.map(look, [lite] * len(chosen), chosen, range(len(chosen))))
-    arrays = [np.stack([np.asarray(each[k], np.float32) for each in found]) for k in (0, 1, 3)]
+    arrays = [
+        np.stack([np.asarray(each[k], np.float32) for each in found]) for k in (0, 1, 3)
+    ]
     seen = np.stack([each[2] for each in found])
-    joined(lite, *train(arrays[0], arrays[1], seen, arrays[2], steps, seed), out / "features.onnx")
+    joined(
+        lite,
+        *train(arrays[0], arrays[1], seen, arrays[2], steps, seed),
+        out / "features.onnx",
+    )
     lite.unlink()
 
 

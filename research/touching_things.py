@@ -31,7 +31,12 @@ SMALLEST = 0.03
 LIMITS = (0.4, 2.5)
 
 
-def beside(target: Path, other: Path, ratio: float, rng: np.random.Generator) -> Placement:
+def beside(
+    target: Path,
+    other: Path,
+    ratio: float,
+    rng: np.random.Generator,
+) -> Placement:
     """The other thing where it just touches the target, in a drawn direction."""
     towards, azimuth = rng.uniform(0, 2 * np.pi, 2)
     mesh = cached_mesh(target)
@@ -47,13 +52,19 @@ def beside(target: Path, other: Path, ratio: float, rng: np.random.Generator) ->
 
     for _ in range(25):
         middle = (near + far) / 2
-        clear = separation(outline, place(cached_mesh(other), at(middle), floor).footprint) > GAP
+        clear = (
+            separation(outline, place(cached_mesh(other), at(middle), floor).footprint)
+            > GAP
+        )
         near, far = (near, middle) if clear else (middle, far)
     return at(far)
 
 
 def main(
-    scans: tyro.conf.Positional[Path], scenes: int = 30, named: Named = "point", seed: int = 5
+    scans: tyro.conf.Positional[Path],
+    scenes: int = 30,
+    named: Named = "point",
+    seed: int = 5,
 ) -> None:
     system = nextview.load(models="ycb")
     found = []
@@ -66,21 +77,39 @@ def main(
     for k in range(scenes):
         rng = np.random.default_rng([seed, k])
         target, other = (files[i] for i in rng.choice(len(files), 2, replace=False))
-        placed = beside(target, other, float(np.clip(sizes[other] / sizes[target], *LIMITS)), rng)
+        placed = beside(
+            target,
+            other,
+            float(np.clip(sizes[other] / sizes[target], *LIMITS)),
+            rng,
+        )
         layout = SceneLayout(
-            f"pair-{k}", "pair", k, Placement(target.name, mesh_hash(target)), (placed,)
+            f"pair-{k}",
+            "pair",
+            k,
+            Placement(target.name, mesh_hash(target)),
+            (placed,),
         )
         camera = RobotCamera(build_scene(layout, scans), "wrist", named=named)
         session = system.session_with(
-            camera, int(np.random.default_rng(k).integers(len(system.sphere)))
+            camera,
+            int(np.random.default_rng(k).integers(len(system.sphere))),
         )
         session.reachable = camera.reachable
         result = session.run(camera)
         right = result.most_like == target.stem
-        found.append((right and not result.unknown, result.unknown, result.confident and not right))
+        found.append(
+            (
+                right and not result.unknown,
+                result.unknown,
+                result.confident and not right,
+            )
+        )
         print(f"{target.stem} beside {other.stem}: {result}")
     print(
-        "{:.3f} named right, {:.3f} unknown, {:.3f} wrong and confident".format(*np.mean(found, 0))
+        "{:.3f} named right, {:.3f} unknown, {:.3f} wrong and confident".format(
+            *np.mean(found, 0)
+        )
     )
 
 

@@ -90,7 +90,9 @@ def train_agent(
     for path in (card, card.with_suffix(".onnx")):
         check_new(path)
     table = Predictions.load(predictions).of_split("train").deduplicate()
-    judging = hold_out(table.labels, table.depth_entropy, recipe.holdout, recipe.seed)[0]
+    judging = hold_out(table.labels, table.depth_entropy, recipe.holdout, recipe.seed)[
+        0
+    ]
     learning = np.setdiff1d(np.arange(len(table)), judging)
     rules = Rules(
         recipe.inputs,
@@ -100,7 +102,10 @@ def train_agent(
         view_price=recipe.view_price,
         travel_price=recipe.travel_price,
     )
-    env = TaskVectorEnv(replayed(table.of_objects(learning), "train", True, rules), recipe.envs)
+    env = TaskVectorEnv(
+        replayed(table.of_objects(learning), "train", True, rules),
+        recipe.envs,
+    )
     judges = ReplayTable(for_fitting(table).of_objects(judging))
     steps, policy, value = _best(env, judges, recipe, track)
     about = PolicyCard(
@@ -123,7 +128,10 @@ def train_agent(
 
 
 def _best(
-    env: TaskVectorEnv, judges: ReplayTable, recipe: AgentRecipe, track: TrackProgress
+    env: TaskVectorEnv,
+    judges: ReplayTable,
+    recipe: AgentRecipe,
+    track: TrackProgress,
 ) -> tuple[int, Gain, Value]:
     """The agent that was best on the objects held out, after how many steps, and what it
     reaches.
@@ -135,7 +143,14 @@ def _best(
         for k, layers in enumerate(learn(model, recipe), 1):
             agent = _agent(env, layers, recipe)
             rng = np.random.default_rng([recipe.seed, 2])
-            value = judge(judges, agent, recipe.max_views, recipe.objective, rng, rounds=4)
+            value = judge(
+                judges,
+                agent,
+                recipe.max_views,
+                recipe.objective,
+                rng,
+                rounds=4,
+            )
             score = float(value.mean.mean() - recipe.travel_price * value.travel[-1])
             if not found or score > found[-1][0]:
                 found.append((score, model.num_timesteps, agent, value))
@@ -155,15 +170,38 @@ def _agent(env: TaskVectorEnv, layers: Layers, recipe: AgentRecipe) -> Gain:
         for parts in zip(*layers, strict=True)
     )
     score = Score(
-        Perceptrons(weights, [bias[None] for bias in biases], np.arange(width), np.arange(v))
+        Perceptrons(
+            weights,
+            [bias[None] for bias in biases],
+            np.arange(width),
+            np.arange(v),
+        )
     )
-    return Gain(task.sphere, len(task.classes), score, recipe.inputs, frame=recipe.frame)
+    return Gain(
+        task.sphere,
+        len(task.classes),
+        score,
+        recipe.inputs,
+        frame=recipe.frame,
+    )
 
 
-def _states(judges: ReplayTable, agent: Gain, recipe: AgentRecipe) -> NDArray[np.float32]:
+def _states(
+    judges: ReplayTable,
+    agent: Gain,
+    recipe: AgentRecipe,
+) -> NDArray[np.float32]:
     """States that the agent meets, to compare its file with."""
-    met = rollout(judges, agent, recipe.max_views - 1, np.random.default_rng([recipe.seed, 3]))
-    seen = [features(agent.sphere, moment.state, agent.inputs, agent.frame) for moment in met]
+    met = rollout(
+        judges,
+        agent,
+        recipe.max_views - 1,
+        np.random.default_rng([recipe.seed, 3]),
+    )
+    seen = [
+        features(agent.sphere, moment.state, agent.inputs, agent.frame)
+        for moment in met
+    ]
     return np.concatenate(seen).astype(np.float32)
 
 
@@ -203,5 +241,6 @@ def mvselect(
 if __name__ == "__main__":
     with orderly_end("run the same command again"):
         tyro.extras.subcommand_cli_from_dict(
-            {"ppo": main, "mvselect": mvselect}, description=__doc__
+            {"ppo": main, "mvselect": mvselect},
+            description=__doc__,
         )

@@ -32,7 +32,14 @@ from nextview.data.progress import TrackProgress, silently
 from nextview.data.store import ViewStore
 from nextview.errors import ResultsError, UsageError
 from nextview.files import new_file
-from nextview.session.style import ACCENT, BLUE, legend, new_figure, percent_axis, to_png
+from nextview.session.style import (
+    ACCENT,
+    BLUE,
+    legend,
+    new_figure,
+    percent_axis,
+    to_png,
+)
 from nextview.training.export import run_network
 from nextview.training.inputs import PackedViews, load_inputs
 from nextview.training.recipes import THESIS_RECOGNISER, Hardware, RecogniserRecipe
@@ -83,7 +90,8 @@ def train_grid(
     cells = {
         (depth, batch): published
         for (depth, batch), published in published_cells(
-            tuple(views.classes), len(views.sphere)
+            tuple(views.classes),
+            len(views.sphere),
         ).items()
         if depth in (depths or (depth,)) and batch in (batches or (batch,))
     }
@@ -99,9 +107,15 @@ def train_grid(
         rows: list[dict[str, Any]] = []
         for (run, own), published in zip(recipes.items(), cells.values(), strict=True):
             cell = {"depth": own.layers, "batch_size": own.batch} | _scores(
-                run, store, views, own, track
+                run,
+                store,
+                views,
+                own,
+                track,
             )
-            rows += [cell | {"published": accuracy} for accuracy in (published or (None,))]
+            rows += [
+                cell | {"published": accuracy} for accuracy in (published or (None,))
+            ]
         with new_file(out / TABLE, True) as part, part.open("w", newline="") as file:
             table = csv.DictWriter(file, list(rows[0]))
             table.writeheader()
@@ -120,14 +134,22 @@ def read_grid(table: Path) -> list[dict[str, Any]]:
         with table.open(newline="") as file:
             rows = list(csv.DictReader(file))
         return [
-            {name: int(x) if name in whole else float(x) if x else None for name, x in row.items()}
+            {
+                name: int(x) if name in whole else float(x) if x else None
+                for name, x in row.items()
+            }
             for row in rows
         ]
     except (ValueError, TypeError, csv.Error):
-        raise ResultsError(f"{table}: is no table that research.train_grid has written") from None
+        raise ResultsError(
+            f"{table}: is no table that research.train_grid has written"
+        ) from None
 
 
-def published_cells(classes: tuple[str, ...], views: int) -> dict[tuple[int, int], list[float]]:
+def published_cells(
+    classes: tuple[str, ...],
+    views: int,
+) -> dict[tuple[int, int], list[float]]:
     """Depth and batch size of the networks of table 6, with their published accuracies; two are
     given for one of them.
 
@@ -142,13 +164,17 @@ def published_cells(classes: tuple[str, ...], views: int) -> dict[tuple[int, int
         cells.setdefault((_depth(model), batch), []).append(accuracy)
     if not cells:
         cells = {
-            (_depth(row["model"]), int(row["batch_size"])): [] for row in read_rows("table6_resnet")
+            (_depth(row["model"]), int(row["batch_size"])): []
+            for row in read_rows("table6_resnet")
         }
     return dict(sorted(cells.items()))
 
 
 def count_right(
-    network: nn.Module, inputs: PackedViews, objects: NDArray[np.int64], labels: NDArray[np.int64]
+    network: nn.Module,
+    inputs: PackedViews,
+    objects: NDArray[np.int64],
+    labels: NDArray[np.int64],
 ) -> Iterator[int]:
     """How many single views of each object are named right, on a GPU where there is one.
 
@@ -170,7 +196,11 @@ def count_right(
 
 
 def _scores(
-    run: Path, store: Path, views: ViewStore, recipe: RecogniserRecipe, track: TrackProgress
+    run: Path,
+    store: Path,
+    views: ViewStore,
+    recipe: RecogniserRecipe,
+    track: TrackProgress,
 ) -> dict[str, float]:
     """Accuracy from one view of the test split, over objects and over classes, kept in the run's
     folder.
@@ -185,7 +215,10 @@ def _scores(
 
     def judged() -> Iterator[int]:
         for count in count_right(
-            network, load_inputs(store, recipe.size, recipe.input), objects, labels
+            network,
+            load_inputs(store, recipe.size, recipe.input),
+            objects,
+            labels,
         ):
             right.append(count)
             yield len(right)
@@ -198,7 +231,8 @@ def _scores(
     scores = {
         "accuracy": round(float(share.mean()), 4),
         "class_accuracy": round(
-            float(np.mean([share[own == label].mean() for label in np.unique(own)])), 4
+            float(np.mean([share[own == label].mean() for label in np.unique(own)])),
+            4,
         ),
         "validation_class_accuracy": round(validated, 4),
     }
@@ -218,16 +252,30 @@ def grid_figure(rows: Sequence[dict[str, Any]]) -> Figure:
     line = {network: y for y, network in enumerate(networks)}
     figure, axes = new_figure(4.6, 0.9 + 0.3 * len(networks))
     ours = {line[row["depth"], row["batch_size"]]: row["accuracy"] for row in rows}
-    axes.plot(list(ours.values()), list(ours), "o", color=BLUE, markersize=6, label="ours")
+    axes.plot(
+        list(ours.values()),
+        list(ours),
+        "o",
+        color=BLUE,
+        markersize=6,
+        label="ours",
+    )
     published = [
         (row["published"], line[row["depth"], row["batch_size"]])
         for row in rows
         if row["published"]
     ]
     if published:
-        axes.plot(*zip(*published, strict=True), "D", color=ACCENT, markersize=5, label="published")
+        axes.plot(
+            *zip(*published, strict=True),
+            "D",
+            color=ACCENT,
+            markersize=5,
+            label="published",
+        )
     axes.set_yticks(
-        range(len(networks)), [f"ResNet-{depth}, batch {batch}" for depth, batch in networks]
+        range(len(networks)),
+        [f"ResNet-{depth}, batch {batch}" for depth, batch in networks],
     )
     axes.set_ylim(len(networks) - 0.5, -0.5)
     axes.tick_params(axis="y", length=0)
@@ -265,7 +313,13 @@ def main(
         hardware: on what.
     """
     table = train_grid(
-        store, out, recipe, depths=depths, batches=batches, hardware=hardware, track=progress
+        store,
+        out,
+        recipe,
+        depths=depths,
+        batches=batches,
+        hardware=hardware,
+        track=progress,
     )
     if is_first():
         draw_curves(sorted(out.glob("resnet*-batch*")))

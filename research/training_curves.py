@@ -17,7 +17,14 @@ from matplotlib.ticker import MaxNLocator
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import ResultsError
 from nextview.files import new_file
-from nextview.session.style import ACCENT, FIGURE_STYLE, INK, LIGHT_BLUE, PlainFigure, to_png
+from nextview.session.style import (
+    ACCENT,
+    FIGURE_STYLE,
+    INK,
+    LIGHT_BLUE,
+    PlainFigure,
+    to_png,
+)
 
 SELECTED = {"class_accuracy": max, "validation_mse": min}
 """By which score, and which way, the kept epoch was chosen: the first that a log has."""
@@ -46,7 +53,9 @@ def training_curves(log: dict[str, list[float]]) -> Figure:
     with matplotlib.rc_context(FIGURE_STYLE):
         figure = PlainFigure((4.6, 0.4 + 1.5 * len(panels)), layout="constrained")
         for axes, name in zip(
-            figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0], panels, strict=True
+            figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0],
+            panels,
+            strict=True,
         ):
             for line, colour in ((name, LIGHT_BLUE), (f"{VALIDATION}{name}", ACCENT)):
                 if line in log:

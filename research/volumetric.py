@@ -18,7 +18,10 @@ from nextview.policies.base import EpisodeState, travel_from
 from nextview.sensing.expected_visibility import Occupancy, SeenScene, VoxelGrid
 from research.new_volume import new_surface, new_volume
 
-Gain = Callable[[Occupancy, NDArray[np.floating], NDArray[np.bool_]], NDArray[np.float64]]
+Gain = Callable[
+    [Occupancy, NDArray[np.floating], NDArray[np.bool_]],
+    NDArray[np.float64],
+]
 """What each of some positions, (V, 3), would bring into view of a region, (n, n, n) bool: (V,)."""
 GRID = VoxelGrid(64)
 """Around the object's unit sphere."""
@@ -42,7 +45,9 @@ def occupancy_of(observations: Sequence[Observation], grid: VoxelGrid) -> Occupa
         grid = replace(grid, half=SCENE_SIZE * grid.half)
     told = [_told(seen, grid) for seen in observations]
     return (
-        reduce(Occupancy.and_also, told) if told else Occupancy.unseen(grid, _ball(grid, grid.half))
+        reduce(Occupancy.and_also, told)
+        if told
+        else Occupancy.unseen(grid, _ball(grid, grid.half))
     )
 
 
@@ -55,7 +60,9 @@ def _told(seen: Observation, grid: VoxelGrid) -> Occupancy:
     if seen.scene is not None:
         return SeenScene.unseen(grid).seen(seen.scene).occupancy
     return Occupancy.unseen(grid, _ball(grid, grid.half)).seen(
-        seen.depth, seen.pose, seen.intrinsics
+        seen.depth,
+        seen.pose,
+        seen.intrinsics,
     )
 
 
@@ -107,10 +114,18 @@ class Volumetric:
         for key, views in zip(sets, state.observations, strict=True):
             if key not in found:
                 known = occupancy_of(views, self.grid)
-                found[key] = self.gain(known, positions, _ball(known.grid, self.grid.half))
+                found[key] = self.gain(
+                    known,
+                    positions,
+                    _ball(known.grid, self.grid.half),
+                )
         return np.stack([found[key] for key in sets])
 
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> NDArray[np.int64]:
+    def next_views(
+        self,
+        state: EpisodeState,
+        rng: np.random.Generator,
+    ) -> NDArray[np.int64]:
         """See ``Policy.next_views``."""
         values = self.view_values(state) - 1e-9 * travel_from(self.sphere, state)
         return np.where(state.free, values, -np.inf).argmax(1)

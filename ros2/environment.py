@@ -56,7 +56,9 @@ BUILD = (
 )
 TESTS = ("hypothesis", "onnx", "pytest", "pytest-xdist", "rosbags")
 # of the machine that built the wheels, in their CMake files
-BUILT_WITH = re.compile(r"/opt/python/[^;\"]*?/(?:lib/python3\.11/site-packages/(numpy/)|include/)")
+BUILT_WITH = re.compile(
+    r"/opt/python/[^;\"]*?/(?:lib/python3\.11/site-packages/(numpy/)|include/)"
+)
 
 
 def install(environment: Path) -> None:
@@ -67,7 +69,9 @@ def install(environment: Path) -> None:
     pinned = ["-c", ROOT / "constraints.txt"]
     run(*pip, *RUN, *BUILD)
     run(*pip, *pinned, *TESTS, "-e", ROOT)
-    (packages_of(environment) / "nextview_ros.pth").write_text(f"{ROOT / 'ros2/nextview_ros'}\n")
+    (packages_of(environment) / "nextview_ros.pth").write_text(
+        f"{ROOT / 'ros2/nextview_ros'}\n"
+    )
 
 
 def mend_paths(environment: Path) -> None:
@@ -95,7 +99,16 @@ def build(environment: Path, package: Path) -> None:
         where = ["-S", package, "-B", made, f"-DCMAKE_INSTALL_PREFIX={prefix}"]
         where += [f"-DCMAKE_PREFIX_PATH={prefix}", "-DBUILD_TESTING=OFF"]
         run("cmake", *where, f"-DPython3_EXECUTABLE={python_of(prefix)}", env=variables)
-        run("cmake", "--build", made, "--parallel", "2", "--target", "install", env=variables)
+        run(
+            "cmake",
+            "--build",
+            made,
+            "--parallel",
+            "2",
+            "--target",
+            "install",
+            env=variables,
+        )
 
 
 def python_of(environment: Path) -> Path:
@@ -110,15 +123,24 @@ def packages_of(environment: Path) -> Path:
 
 def run(*command: object, **options: object) -> None:
     """Run a command; its output is shown if it fails."""
-    done = subprocess.run([*map(str, command)], capture_output=True, text=True, **options)
+    done = subprocess.run(
+        [*map(str, command)],
+        capture_output=True,
+        text=True,
+        **options,
+    )
     if done.returncode:
-        raise SystemExit(f"{done.stdout[-3000:]}{done.stderr[-3000:]}\nfailed: {command[0]}")
+        raise SystemExit(
+            f"{done.stdout[-3000:]}{done.stderr[-3000:]}\nfailed: {command[0]}"
+        )
 
 
 def main() -> None:
     """Make the environment."""
     if sys.version_info[:2] != PYTHON:
-        raise SystemExit("the wheels of rclpy are for Python 3.11: run this script with it")
+        raise SystemExit(
+            "the wheels of rclpy are for Python 3.11: run this script with it"
+        )
     if len(sys.argv) < 2:
         raise SystemExit(__doc__)
     environment = Path(sys.argv[1])

@@ -32,8 +32,14 @@ settings.load_profile("nextview")
 def pytest_collection_modifyitems(items):
     for item in items if os.environ.get("NEXTVIEW_TESTS") != "all" else ():
         if item.get_closest_marker("long"):
-            item.add_marker(pytest.mark.skip(reason="takes minutes: NEXTVIEW_TESTS=all runs it"))
-    items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
+            item.add_marker(
+                pytest.mark.skip(reason="takes minutes: NEXTVIEW_TESTS=all runs it")
+            )
+    items.sort(
+        key=lambda item: (
+            LONG.index(item.path.name) if item.path.name in LONG else len(LONG)
+        )
+    )
 
 
 @pytest.fixture(scope="session")
@@ -71,7 +77,10 @@ def scans(shared) -> Path:
 def taught(shared, scans) -> Path:
     """The models that know them."""
     return (
-        shared("taught", lambda folder: learn(scans, folder / "mine", upright=True, workers=0))
+        shared(
+            "taught",
+            lambda folder: learn(scans, folder / "mine", upright=True, workers=0),
+        )
         / "mine"
     )
 
@@ -126,7 +135,12 @@ def models(shared) -> Path:
     """
 
     def make(folder: Path) -> None:
-        card = pipeline.make_recogniser(folder, pipeline.FURNITURE, size=32, azimuth_bins=8)
+        card = pipeline.make_recogniser(
+            folder,
+            pipeline.FURNITURE,
+            size=32,
+            azimuth_bins=8,
+        )
         calibration = {"temperature": 0.8, "correlation": 0.3, "bin_correlation": 0.2}
         held_out = [f"{label}_{k}" for label in pipeline.FURNITURE for k in (2, 3)]
         pipeline.change_card(card, calibration=calibration, held_out=held_out)
@@ -150,8 +164,18 @@ def predictions(shared, views, models) -> Path:
     from nextview.recognition.model_card import read_card
 
     def make(folder: Path) -> None:
-        recogniser, lem = (read_card(models / name) for name in ("tiny.json", "tiny-lem.json"))
-        list(predict(views, folder / "predictions.npz", recogniser, {"lem": lem}, workers=0))
+        recogniser, lem = (
+            read_card(models / name) for name in ("tiny.json", "tiny-lem.json")
+        )
+        list(
+            predict(
+                views,
+                folder / "predictions.npz",
+                recogniser,
+                {"lem": lem},
+                workers=0,
+            )
+        )
 
     return shared("predictions", make) / "predictions.npz"
 
@@ -171,7 +195,11 @@ def results(shared) -> Path:
             folder / "p.npz"
         )
         pipeline.benchmark(
-            folder / "p.npz", folder / "out", thresholds=(0.7, 0.9), runs=3, samples=200
+            folder / "p.npz",
+            folder / "out",
+            thresholds=(0.7, 0.9),
+            runs=3,
+            samples=200,
         )
 
     return shared("results", make)
@@ -198,6 +226,15 @@ def cluttered_views(shared, cluttered, furniture) -> Path:
     options = RenderOptions(meshes=furniture)
 
     def make(folder: Path) -> None:
-        list(render(cluttered, folder / "views.zarr", pipeline.SPHERE, 48, options, workers=0))
+        list(
+            render(
+                cluttered,
+                folder / "views.zarr",
+                pipeline.SPHERE,
+                48,
+                options,
+                workers=0,
+            )
+        )
 
     return shared("cluttered_views", make) / "views.zarr"

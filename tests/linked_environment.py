@@ -31,7 +31,10 @@ def empty_environment(folder: Path) -> tuple[Path, Path]:
     return python, packages
 
 
-def asked_for(requirements: Iterable[tuple[str, str]], found: Found | None = None) -> Found:
+def asked_for(
+    requirements: Iterable[tuple[str, str]],
+    found: Found | None = None,
+) -> Found:
     """The installed distributions that requirements need, theirs included.
 
     Args:
@@ -44,7 +47,9 @@ def asked_for(requirements: Iterable[tuple[str, str]], found: Found | None = Non
     found = {} if found is None else found
     for text, extra in requirements:
         needed = Requirement(text)
-        if needed.name in OWN or (needed.marker and not needed.marker.evaluate({"extra": extra})):
+        if needed.name in OWN or (
+            needed.marker and not needed.marker.evaluate({"extra": extra})
+        ):
             continue
         installed = distribution(needed.name)
         for wanted in ("", *needed.extras):
@@ -77,7 +82,9 @@ def link(installed: Distribution, packages: Path) -> None:
 
 
 def installation(
-    folder: Path, extras: Iterable[str] = (), research: Iterable[str] | None = None
+    folder: Path,
+    extras: Iterable[str] = (),
+    research: Iterable[str] | None = None,
 ) -> Path:
     """Make an environment in which this clone is installed, with its command; returns its Python.
 
@@ -103,7 +110,8 @@ def installation(
         about = f"{name.replace('-', '_')}-{distribution(name).version}.dist-info"
         (packages / about).symlink_to(distribution(name).locate_file(about))
     (packages / "this_clone.pth").write_text(
-        "".join(f"{path}\n" for path in paths), encoding="utf-8"
+        "".join(f"{path}\n" for path in paths),
+        encoding="utf-8",
     )
 
     command = python.parent / "nextview"
@@ -118,7 +126,12 @@ def _requirements(project: Path, extras: Iterable[str]) -> list[tuple[str, str]]
     asked = [Requirement(text) for text in table["dependencies"]]
     for extra in extras:
         asked += map(Requirement, table["optional-dependencies"][extra])
-    own = {extra for needed in asked if needed.name == "nextview" for extra in needed.extras}
+    own = {
+        extra
+        for needed in asked
+        if needed.name == "nextview"
+        for extra in needed.extras
+    }
     return [(str(needed), "") for needed in asked] + (
         _requirements(ROOT / "pyproject.toml", own) if own else []
     )

@@ -55,7 +55,12 @@ def refused(capsys, *arguments) -> str:
 
 
 def run_python(code: str, **options) -> subprocess.CompletedProcess:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, **options)
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        **options,
+    )
 
 
 # Meshes
@@ -88,7 +93,10 @@ def write_furniture(folder: Path, train: int = 4, test: int = 2, seed: int = 0) 
                 for box in SAMPLE_MESHES[label]()
             ]
             split = "train" if k < train else "test"
-            write_off(folder / label / split / f"{label}_{k}.off", boxes_mesh(boxes, label))
+            write_off(
+                folder / label / split / f"{label}_{k}.off",
+                boxes_mesh(boxes, label),
+            )
     return folder
 
 
@@ -96,10 +104,17 @@ def write_furniture(folder: Path, train: int = 4, test: int = 2, seed: int = 0) 
 
 
 def make_recogniser(
-    folder: Path, classes: list[str], size: int = 16, seed: int = 0, azimuth_bins: int = 0
+    folder: Path,
+    classes: list[str],
+    size: int = 16,
+    seed: int = 0,
+    azimuth_bins: int = 0,
 ) -> Path:
     """A recogniser whose answers are random linear maps of each channel's mean over the image."""
-    weights = np.random.default_rng(seed).normal(size=(4, len(classes))).astype(np.float32) / 16
+    weights = (
+        np.random.default_rng(seed).normal(size=(4, len(classes))).astype(np.float32)
+        / 16
+    )
     weights -= weights.mean(0)
     nodes = [
         helper.make_node("Cast", ["input"], ["real"], to=TensorProto.FLOAT),
@@ -108,8 +123,16 @@ def make_recogniser(
     ]
     shape = ["batch", 4, size, size]
     inputs = [helper.make_tensor_value_info("input", TensorProto.UINT8, shape)]
-    outputs = [helper.make_tensor_value_info("logits", TensorProto.FLOAT, ["batch", len(classes)])]
-    outputs += [helper.make_tensor_value_info("features", TensorProto.FLOAT, ["batch", 4])]
+    outputs = [
+        helper.make_tensor_value_info(
+            "logits",
+            TensorProto.FLOAT,
+            ["batch", len(classes)],
+        )
+    ]
+    outputs += [
+        helper.make_tensor_value_info("features", TensorProto.FLOAT, ["batch", 4])
+    ]
     constants = {"weights": weights, "image": np.array([2, 3])}
     card: dict = {
         "kind": "recogniser",
@@ -123,19 +146,27 @@ def make_recogniser(
             helper.make_node("LogSoftmax", ["shaped"], [BINS_OUTPUT], axis=2),
         ]
         shape = ["batch", len(classes), azimuth_bins]
-        outputs += [helper.make_tensor_value_info(BINS_OUTPUT, TensorProto.FLOAT, shape)]
+        outputs += [
+            helper.make_tensor_value_info(BINS_OUTPUT, TensorProto.FLOAT, shape)
+        ]
         side_weights = (
             np.random.default_rng(seed + 1)
             .normal(size=(4, len(classes) * azimuth_bins))
             .astype(np.float32)
         )
-        constants |= {"side_weights": side_weights / 16, "side_shape": np.array([-1, *shape[1:]])}
+        constants |= {
+            "side_weights": side_weights / 16,
+            "side_shape": np.array([-1, *shape[1:]]),
+        }
         card["azimuth_bins"] = azimuth_bins
     return _save(folder / "tiny.json", nodes, inputs, outputs, constants, card)
 
 
 def make_map_network(
-    folder: Path, name: str = "lem", rings: int = 5, valleys: tuple[str, ...] = ()
+    folder: Path,
+    name: str = "lem",
+    rings: int = 5,
+    valleys: tuple[str, ...] = (),
 ) -> Path:
     """A map network whose cells are a random linear map of the cloud's middle."""
     weights = np.random.default_rng(1).normal(size=(3, 3 * rings)).astype(np.float32)
@@ -144,26 +175,50 @@ def make_map_network(
         helper.make_node("MatMul", ["middle", "weights"], ["flat"]),
         helper.make_node("Reshape", ["flat", "shape"], ["map"]),
     ]
-    inputs = [helper.make_tensor_value_info("cloud", TensorProto.FLOAT, ["batch", "points", 3])]
-    outputs = [helper.make_tensor_value_info("map", TensorProto.FLOAT, ["batch", rings, 3])]
-    constants = {"weights": weights, "points": np.array([1]), "shape": np.array([-1, rings, 3])}
+    inputs = [
+        helper.make_tensor_value_info(
+            "cloud",
+            TensorProto.FLOAT,
+            ["batch", "points", 3],
+        )
+    ]
+    outputs = [
+        helper.make_tensor_value_info("map", TensorProto.FLOAT, ["batch", rings, 3])
+    ]
+    constants = {
+        "weights": weights,
+        "points": np.array([1]),
+        "shape": np.array([-1, rings, 3]),
+    }
     card = {"kind": name, "measure": measure_of(name), "valley_classes": list(valleys)}
     card |= {"input": {"kind": "cloud"}, "output": "window"}
     return _save(folder / f"tiny-{name}.json", nodes, inputs, outputs, constants, card)
 
 
 def _save(
-    path: Path, nodes: list, inputs: list, outputs: list, constants: dict, card: dict
+    path: Path,
+    nodes: list,
+    inputs: list,
+    outputs: list,
+    constants: dict,
+    card: dict,
 ) -> Path:
     initial = [
-        numpy_helper.from_array(np.asarray(values), name) for name, values in constants.items()
+        numpy_helper.from_array(np.asarray(values), name)
+        for name, values in constants.items()
     ]
     graph = helper.make_graph(nodes, "tiny", inputs, outputs, initial)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    model = helper.make_model(
+        graph,
+        opset_imports=[helper.make_opsetid("", 18)],
+        ir_version=9,
+    )
     weights = path.with_suffix(".onnx")
     onnx.save(model, weights)
     sha256 = hashlib.sha256(weights.read_bytes()).hexdigest()
-    path.write_text(json.dumps({"schema": 2, "name": path.stem, "sha256": sha256, **card}))
+    path.write_text(
+        json.dumps({"schema": 2, "name": path.stem, "sha256": sha256, **card})
+    )
     return path
 
 
@@ -192,7 +247,14 @@ def some_predictions(n: int = 6, seed: int = 0) -> Predictions:
     )
 
 
-def train_predictions(logits, labels, sphere, classes, azimuth_bins=None, **fields) -> Predictions:
+def train_predictions(
+    logits,
+    labels,
+    sphere,
+    classes,
+    azimuth_bins=None,
+    **fields,
+) -> Predictions:
     """Predictions of objects of the training split of which nothing but this is known."""
     n, v, _ = logits.shape
     entropy, splits, conflicting = (
@@ -224,7 +286,9 @@ def scene_predictions(store: Path, classes: Sequence[str]) -> Predictions:
     opened, rng = ViewStore.open(store), np.random.default_rng(0)
     shows = opened.measure("visible_share") > 0.3
     logits = np.where(
-        shows[..., None], 2 * rng.normal(size=(len(opened), 40, len(classes))), 0
+        shows[..., None],
+        2 * rng.normal(size=(len(opened), 40, len(classes))),
+        0,
     ).astype(np.float32)
     return replace(
         some_predictions(len(opened)),
@@ -245,7 +309,14 @@ def benchmark(predictions: Path, out: Path, **settings):
     return run_benchmark(predictions, out, BenchmarkSettings(**settings))
 
 
-def store_of(path: Path, names, labels, sphere: ViewSphere, size: int = 16, **arrays) -> ViewStore:
+def store_of(
+    path: Path,
+    names,
+    labels,
+    sphere: ViewSphere,
+    size: int = 16,
+    **arrays,
+) -> ViewStore:
     """A store whose objects are rendered, if only these arrays of it hold anything:
     depth_entropy, image.
     """
@@ -280,15 +351,22 @@ def rays(intrinsics, shape) -> np.ndarray:
 
 
 def cast(
-    meshes: Sequence[trimesh.Trimesh], pose, intrinsics=INTRINSICS, shape=SHAPE
+    meshes: Sequence[trimesh.Trimesh],
+    pose,
+    intrinsics=INTRINSICS,
+    shape=SHAPE,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Depth (H, W) float32, 0 = nothing, and which mesh is seen, -1 for none."""
     scene = EmbreeScene()
     for mesh in meshes:
         TriangleMesh(
-            scene, mesh.vertices.astype(np.float32), np.ascontiguousarray(mesh.faces, np.int32)
+            scene,
+            mesh.vertices.astype(np.float32),
+            np.ascontiguousarray(mesh.faces, np.int32),
         )
-    directions = (rays(intrinsics, shape).reshape(-1, 3) @ pose[:3, :3].T).astype(np.float32)
+    directions = (rays(intrinsics, shape).reshape(-1, 3) @ pose[:3, :3].T).astype(
+        np.float32
+    )
     origins = np.tile(np.asarray(pose)[:3, 3].astype(np.float32), (len(directions), 1))
     hits = scene.run(origins, directions, output=1)
     hit = hits["primID"] >= 0
@@ -300,20 +378,29 @@ def ball_depth(pose, intrinsics, size, radius=1.0, centre=(0, 0, 0)) -> np.ndarr
     """Depth image of a ball, (size, size): the smaller root of a quadratic equation, 0 where
     there is none.
     """
-    d, o = rays(intrinsics, (size, size)) @ pose[:3, :3].T, pose[:3, 3] - np.array(centre)
+    d, o = (
+        rays(intrinsics, (size, size)) @ pose[:3, :3].T,
+        pose[:3, 3] - np.array(centre),
+    )
     a, b, c = (d * d).sum(-1), d @ o, o @ o - radius**2
     inside = b * b - a * c
     return np.where(inside > 0, (-b - np.sqrt(np.maximum(inside, 0))) / a, 0)
 
 
 def pose_at(
-    elevation, azimuth, distance, target=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0)
+    elevation,
+    azimuth,
+    distance,
+    target=(0.0, 0.0, 0.0),
+    turn=(0.0, 0.0, 0.0),
 ) -> np.ndarray:
     """A camera (degrees, metres) that looks at a target and is then turned about its own axes,
     degrees.
     """
     pose = look_at_origin(np.radians(elevation), np.radians(azimuth), distance)
-    pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
+    pose[:3, :3] = (
+        pose[:3, :3] @ Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
+    )
     pose[:3, 3] += target
     return pose
 
@@ -321,4 +408,8 @@ def pose_at(
 def of_depth(depth, distance=3.0) -> MeasuredView:
     """What a measure is handed where the depth alone is known, from straight ahead."""
     depth = np.asarray(depth)
-    return MeasuredView(depth, look_at_origin(0, 0, distance), pinhole(max(depth.shape), distance))
+    return MeasuredView(
+        depth,
+        look_at_origin(0, 0, distance),
+        pinhole(max(depth.shape), distance),
+    )

@@ -27,15 +27,25 @@ def message(kind, **fields):
 
 
 def header(frame, time=12.5):
-    stamp = message("builtin_interfaces/msg/Time", sec=int(time), nanosec=round(1e9 * (time % 1)))
+    stamp = message(
+        "builtin_interfaces/msg/Time",
+        sec=int(time),
+        nanosec=round(1e9 * (time % 1)),
+    )
     return message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
 
 def image_message(depth, encoding, big=False, padding=0, **more):
     """A depth image; with rows that are longer than needed, and of either byte order."""
-    kind = np.dtype({"16UC1": "u2", "32FC1": "f4"}[encoding]).newbyteorder(">" if big else "<")
+    kind = np.dtype({"16UC1": "u2", "32FC1": "f4"}[encoding]).newbyteorder(
+        ">" if big else "<"
+    )
     rows = np.ascontiguousarray(depth, kind).view(np.uint8)
-    rows = np.pad(rows.reshape(len(depth), -1), ((0, 0), (0, padding)), constant_values=7)
+    rows = np.pad(
+        rows.reshape(len(depth), -1),
+        ((0, 0), (0, padding)),
+        constant_values=7,
+    )
     fields = {
         "height": depth.shape[0],
         "width": depth.shape[1],
@@ -80,11 +90,20 @@ def info_message(k=K, shape=SHAPE, d=(), p=None, **more):
 def transform_message(pose, child="optical", time=12.5, parent="world"):
     x, y, z, w = map(float, Rotation.from_matrix(pose[:3, :3]).as_quat())
     translation = message(
-        "geometry_msgs/msg/Vector3", **dict(zip("xyz", map(float, pose[:3, 3]), strict=True))
+        "geometry_msgs/msg/Vector3",
+        **dict(zip("xyz", map(float, pose[:3, 3]), strict=True)),
     )
     rotation = message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
-    transform = message("geometry_msgs/msg/Transform", translation=translation, rotation=rotation)
-    fields = {"header": header(parent, time), "child_frame_id": child, "transform": transform}
+    transform = message(
+        "geometry_msgs/msg/Transform",
+        translation=translation,
+        rotation=rotation,
+    )
+    fields = {
+        "header": header(parent, time),
+        "child_frame_id": child,
+        "transform": transform,
+    }
     return message("geometry_msgs/msg/TransformStamped", **fields)
 
 

@@ -25,7 +25,10 @@ def meshes_of(names: Sequence[str]) -> dict[str, Mesh]:
 
 
 def camera_over(
-    meshes: Sequence[Mesh], seed: int = 5, sensor: str = "stereo", gap: float = 0.08
+    meshes: Sequence[Mesh],
+    seed: int = 5,
+    sensor: str = "stereo",
+    gap: float = 0.08,
 ) -> TableCamera:
     """A camera over a table on which some things are put down at random."""
     rng = np.random.default_rng(seed)
@@ -34,7 +37,9 @@ def camera_over(
 
 def view(degrees: float, elevation: float = 50.0, distance: float = 0.65) -> np.ndarray:
     """The pose of a camera that looks at the table's centre, (4, 4)."""
-    return poses_around(np.radians([degrees]), np.radians(elevation), distance, CENTRE)[0]
+    return poses_around(np.radians([degrees]), np.radians(elevation), distance, CENTRE)[
+        0
+    ]
 
 
 def without(table: SimulatedTable, name: str) -> SimulatedTable:

@@ -53,7 +53,11 @@ def with_holes(scan: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def shell(scan: trimesh.Trimesh) -> trimesh.Trimesh:
     """What a scanner above a table saw of it: nothing of what points down."""
-    return trimesh.Trimesh(scan.vertices, scan.faces[scan.face_normals[:, 2] > -0.5], process=False)
+    return trimesh.Trimesh(
+        scan.vertices,
+        scan.faces[scan.face_normals[:, 2] > -0.5],
+        process=False,
+    )
 
 
 def double_walled(scan: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -63,7 +67,10 @@ def double_walled(scan: trimesh.Trimesh) -> trimesh.Trimesh:
     return trimesh.util.concatenate([scan, within])
 
 
-@pytest.mark.parametrize("fault", [inverted, half_inverted, with_holes, shell, double_walled])
+@pytest.mark.parametrize(
+    "fault",
+    [inverted, half_inverted, with_holes, shell, double_walled],
+)
 @pytest.mark.parametrize("thing", [0, 1])
 def test_a_scan_with_faults_is_recognised(thing, fault):
     intact = (l_block(), cup(True))
@@ -105,7 +112,11 @@ def test_what_the_border_of_the_picture_cuts_is_right_or_not_sure(thing, share):
     assert not wrong_and_sure
     if share < 0.2:
         assert found.belief.argmax() == thing
-        degrees, _ = off_by(found.poses[0], true_pose(things[thing], YAW), things[thing].centre)
+        degrees, _ = off_by(
+            found.poses[0],
+            true_pose(things[thing], YAW),
+            things[thing].centre,
+        )
         assert degrees < 3
 
 
@@ -121,4 +132,7 @@ def test_things_of_one_shape_share_the_belief_and_are_both_named(tmp_path):
     assert not result.confident
     # Each is remembered with noise of its own, so features prefer one of them a little.
     assert 0.5 <= result.confidence < 0.9
-    assert {candidate.thing for candidate in result.pose_candidates} == {"left", "right"}
+    assert {candidate.thing for candidate in result.pose_candidates} == {
+        "left",
+        "right",
+    }

@@ -33,7 +33,10 @@ def test_belief_is_the_softmax_of_the_sum(values):
     belief = fuse(values)
     assert belief.dtype == np.float64
     np.testing.assert_allclose(
-        belief, softmax(values.astype(np.float64).sum(-2), axis=-1), rtol=1e-12, atol=1e-300
+        belief,
+        softmax(values.astype(np.float64).sum(-2), axis=-1),
+        rtol=1e-12,
+        atol=1e-300,
     )
     np.testing.assert_allclose(belief.sum(-1), 1)
 
@@ -52,7 +55,11 @@ def test_calibrated_belief_is_the_posterior_of_equally_correlated_looks(correlat
         noise = spread**2 * ((1 - correlation) * np.eye(n_views) + correlation)
         seen = rng.multivariate_normal(np.ones(n_views), noise, size=6)
         likelihood = np.stack(
-            [multivariate_normal(np.full(n_views, m), noise).logpdf(seen) for m in (-1, 1)], -1
+            [
+                multivariate_normal(np.full(n_views, m), noise).logpdf(seen)
+                for m in (-1, 1)
+            ],
+            -1,
         )
         of_each = np.stack([-((seen - m) ** 2) / (2 * spread**2) for m in (-1, 1)], -1)
         belief = fuse(of_each, Calibration(1.0, correlation).temperature_after(n_views))
@@ -83,7 +90,10 @@ def test_what_was_not_calibrated_is_not_promised():
 
 @given(st.floats(0.5, 0.999), st.floats(0, 2), st.integers(1, 8), st.integers(0, 2**32))
 def test_with_a_decline_of_its_correlation_a_calibrated_belief_stops_where_the_plain_sum_does(
-    threshold_at, c, n_views, seed
+    threshold_at,
+    c,
+    n_views,
+    seed,
 ):
     # Of two classes, where the peak of the belief is one to one with the difference of the logits.
     logits = np.random.default_rng(seed).normal(size=(50, n_views, 2))
@@ -91,7 +101,8 @@ def test_with_a_decline_of_its_correlation_a_calibrated_belief_stops_where_the_p
     belief = fuse(logits, Calibration(1.0, c).temperature_after(n_views)).max(-1)
     near = np.abs(belief - Stopping(threshold_at, 8, c).threshold_at(n_views)) < 1e-9
     np.testing.assert_array_equal(
-        (belief >= Stopping(threshold_at, 8, c).threshold_at(n_views)) | near, plain | near
+        (belief >= Stopping(threshold_at, 8, c).threshold_at(n_views)) | near,
+        plain | near,
     )
 
 
@@ -100,17 +111,25 @@ def test_what_is_said_of_sides_is_said_of_where_side_0_points():
     azimuth = np.pi * np.array([0.0, 0.5, -1.0])
     pointing = reorient(azimuth_bins, azimuth)
     for observation, step in enumerate((0, 2, -4)):
-        for side in range(8):  # from azimuth a side s is seen if azimuth bin 0 points to a - s
+        for side in range(
+            8
+        ):  # from azimuth a side s is seen if azimuth bin 0 points to a - s
             np.testing.assert_array_equal(
-                pointing[observation, :, (step - side) % 8], azimuth_bins[observation, :, side]
+                pointing[observation, :, (step - side) % 8],
+                azimuth_bins[observation, :, side],
             )
     np.testing.assert_array_equal(reorient(pointing, azimuth), azimuth_bins)
 
 
 def test_between_two_steps_what_is_said_of_sides_is_interpolated():
     azimuth_bins = np.random.default_rng(0).normal(size=(1, 3, 4))
-    between = reorient(azimuth_bins, np.array([0.75 * np.pi]))  # one and a half of four steps
-    beside = [np.exp(reorient(azimuth_bins, np.array([step * np.pi]))) for step in (0.5, 1.0)]
+    between = reorient(
+        azimuth_bins,
+        np.array([0.75 * np.pi]),
+    )  # one and a half of four steps
+    beside = [
+        np.exp(reorient(azimuth_bins, np.array([step * np.pi]))) for step in (0.5, 1.0)
+    ]
     np.testing.assert_allclose(np.exp(between), sum(beside) / 2)
 
 
@@ -127,7 +146,9 @@ def test_looks_that_agree_on_the_side_are_believed_as_bayes_would(n_views):
     """
     logits, azimuth_bins, azimuth = some_views(n_views)
     belief = Calibration(0.7, 0.0, bin_correlation=0.0).belief(
-        log_evidence_of(logits, azimuth_bins, azimuth * STEP).sum(0), n_views, 3
+        log_evidence_of(logits, azimuth_bins, azimuth * STEP).sum(0),
+        n_views,
+        3,
     )
     joint = np.zeros((3, 8))
     for c in range(3):
@@ -144,7 +165,8 @@ def test_where_sides_shall_not_count_the_sum_of_logits_is_believed():
     total = log_evidence_of(logits, azimuth_bins, azimuth * STEP).sum(0)
     for calibration in (Calibration(), Calibration(0.7, 0.5)):
         np.testing.assert_allclose(
-            calibration.belief(total, 3, 3), fuse(logits, calibration.temperature_after(3))
+            calibration.belief(total, 3, 3),
+            fuse(logits, calibration.temperature_after(3)),
         )
     np.testing.assert_array_equal(log_evidence_of(logits, None, azimuth * STEP), logits)
     with pytest.raises(ValueError, match="not a finite number"):
@@ -152,7 +174,11 @@ def test_where_sides_shall_not_count_the_sum_of_logits_is_believed():
 
 
 def test_what_makes_no_sense_is_refused():
-    for make, value in ((Stopping, 1.01), (fuse, np.array([[0.0, np.nan]])), (Calibration, 0.0)):
+    for make, value in (
+        (Stopping, 1.01),
+        (fuse, np.array([[0.0, np.nan]])),
+        (Calibration, 0.0),
+    ):
         with pytest.raises(NextviewError):
             make(value)
 
@@ -161,5 +187,7 @@ def test_sizes_between_two_radii_are_interpolated_and_unknown_ones_say_nothing()
     evidence = SizeEvidence((1.0, 4.0), ((0.0, 2.0), (1.0, 1.0)), 0.5)
     found = evidence.logits(np.array([1.0, 2.0, 4.0, 100.0, 0.001, np.nan]))
     np.testing.assert_allclose(
-        found, [[0, 0.5], [0.5, 0.5], [1, 0.5], [1, 0.5], [0, 0.5], [0, 0]], atol=1e-6
+        found,
+        [[0, 0.5], [0.5, 0.5], [1, 0.5], [1, 0.5], [0, 0.5], [0, 0]],
+        atol=1e-6,
     )

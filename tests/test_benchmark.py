@@ -33,7 +33,9 @@ def predictions(results):
 
 def test_every_episode_is_a_row_and_is_what_it_says(results, predictions):
     rows = pd.read_parquet(results / "out" / "episodes.parquet")
-    assert len(rows) == 3 * 40 * rows[["policy", "threshold"]].drop_duplicates().shape[0]
+    assert (
+        len(rows) == 3 * 40 * rows[["policy", "threshold"]].drop_duplicates().shape[0]
+    )
     row_of = {name: i for i, name in enumerate(predictions.names)}
     for row in rows.sample(200, random_state=0).itertuples():
         i, views = row_of[row.object], list(row.views)
@@ -44,12 +46,18 @@ def test_every_episode_is_a_row_and_is_what_it_says(results, predictions):
         assert row.answer == predictions.classes[belief.argmax()]
         assert row.confidence == pytest.approx(belief.max())
         legs = list(pairwise(views))
-        assert row.travel == pytest.approx(sum(predictions.sphere.travel[leg] for leg in legs))
-        assert row.arc == pytest.approx(sum(predictions.sphere.arc[leg] for leg in legs))
+        assert row.travel == pytest.approx(
+            sum(predictions.sphere.travel[leg] for leg in legs)
+        )
+        assert row.arc == pytest.approx(
+            sum(predictions.sphere.arc[leg] for leg in legs)
+        )
         if np.isnan(row.threshold):
             assert row.stop == "fixed views"
         else:
-            assert row.stop == ("confident" if belief.max() >= row.threshold else "views ran out")
+            assert row.stop == (
+                "confident" if belief.max() >= row.threshold else "views ran out"
+            )
             before = [
                 np.exp(predictions.logits[i, views[:k]].astype(float).sum(0))
                 for k in range(1, len(views))
@@ -60,11 +68,16 @@ def test_every_episode_is_a_row_and_is_what_it_says(results, predictions):
 def test_the_summary_is_what_pandas_makes_of_the_episodes(results, predictions):
     rows = pd.read_parquet(results / "out" / "episodes.parquet")
     rows["right"] = rows["answer"].astype(str) == rows["label"].astype(str)
-    rows["clean"] = ~rows["object"].isin(np.array(predictions.names)[predictions.conflicting])
+    rows["clean"] = ~rows["object"].isin(
+        np.array(predictions.names)[predictions.conflicting]
+    )
     summary = pd.read_csv(results / "out" / "summary.csv").set_index(
         ["policy", "threshold", "measure"]
     )["value"]
-    for (policy, threshold), cell in rows.groupby(["policy", "threshold"], observed=True):
+    for (policy, threshold), cell in rows.groupby(
+        ["policy", "threshold"],
+        observed=True,
+    ):
         moved, sure = cell[cell.n_views > 1], cell[cell.stop == "confident"]
         by_class = cell.groupby("label", observed=True)
         wanted = {
@@ -75,16 +88,22 @@ def test_the_summary_is_what_pandas_makes_of_the_episodes(results, predictions):
             "n_views": cell.n_views.mean(),
             "travel_all": cell.travel.mean(),
             "travel_moved": moved.travel.mean(),
-            "class_travel_moved": moved.groupby("label", observed=True).travel.mean().mean(),
+            "class_travel_moved": moved.groupby("label", observed=True)
+            .travel.mean()
+            .mean(),
             "arc_all": cell.arc.mean(),
             "confident": len(sure) / len(cell),
             "confident_accuracy": sure.right.mean(),
             "calibration_error": calibration_error(
-                cell.confidence.to_numpy(), cell.right.to_numpy()
+                cell.confidence.to_numpy(),
+                cell.right.to_numpy(),
             ),
         }
         for measure, value in wanted.items():
-            assert summary[policy, threshold, measure] == pytest.approx(value, nan_ok=True), (
+            assert summary[policy, threshold, measure] == pytest.approx(
+                value,
+                nan_ok=True,
+            ), (
                 policy,
                 measure,
             )
@@ -116,16 +135,26 @@ def test_python_and_the_command_give_the_same_numbers(predictions, tmp_path):
     stopping = Stopping.of(p.calibration, 0.7, max_views=5)
     assert stopping.threshold_decay == 0.5
     for name in ("random", "lem", "spread"):
-        paths, rows = replay(name, specs, stopping.max_views, seed=0), found.episodes(name, 0.7)
+        paths, rows = (
+            replay(name, specs, stopping.max_views, seed=0),
+            found.episodes(name, 0.7),
+        )
         ends = truncate(paths, stopping)
         for column in ("n_views", "confidence", "travel", "arc"):
             np.testing.assert_array_equal(getattr(ends, column), rows[column])
-        np.testing.assert_array_equal(np.array(p.classes)[ends.answer], rows["answer"].astype(str))
+        np.testing.assert_array_equal(
+            np.array(p.classes)[ends.answer],
+            rows["answer"].astype(str),
+        )
         # a threshold that stays
         assert truncate(paths, Stopping(0.7)).n_views.mean() > ends.n_views.mean()
 
 
-def test_a_stopping_rule_of_ones_own_decides_in_the_command(predictions, tmp_path, capsys):
+def test_a_stopping_rule_of_ones_own_decides_in_the_command(
+    predictions,
+    tmp_path,
+    capsys,
+):
     predictions.save(tmp_path / "p.npz")
     main(
         [
@@ -150,15 +179,24 @@ def test_a_stopping_rule_of_ones_own_decides_in_the_command(predictions, tmp_pat
     )
     ends = truncate(replay("lem", specs, 5, 0, beliefs=True), rule)
     np.testing.assert_array_equal(
-        ends.n_views, load(tmp_path / "out").episodes("lem", 0.6)["n_views"]
+        ends.n_views,
+        load(tmp_path / "out").episodes("lem", 0.6)["n_views"],
     )
     assert len(set(ends.n_views)) > 1
-    wrong = ("benchmark", tmp_path / "p.npz", tmp_path / "no", "--stopping", "test_replay:nothing")
+    wrong = (
+        "benchmark",
+        tmp_path / "p.npz",
+        tmp_path / "no",
+        "--stopping",
+        "test_replay:nothing",
+    )
     assert "stopping rule test_replay:nothing cannot be made" in refused(capsys, *wrong)
 
 
 def test_a_policy_of_ones_own_runs_beside_the_reference_and_one_that_fails_takes_nothing_from_it(
-    results, tmp_path, capsys
+    results,
+    tmp_path,
+    capsys,
 ):
     names = ("test_replay:Asked", "test_replay:Raises", "lcm", "best-99")
     sentences = refused(
@@ -178,10 +216,14 @@ def test_a_policy_of_ones_own_runs_beside_the_reference_and_one_that_fails_takes
 
 
 def test_a_risk_is_run_at_its_threshold_and_the_calibration_can_be_left_out(
-    results, predictions, tmp_path
+    results,
+    predictions,
+    tmp_path,
 ):
     bounds = RiskBounds((0.6, 0.8), tuple((0.2, 0.1) for _ in range(5)), 0.1)
-    replace(predictions, calibration=Calibration(0.7, 0.5, bounds)).save(tmp_path / "c.npz")
+    replace(predictions, calibration=Calibration(0.7, 0.5, bounds)).save(
+        tmp_path / "c.npz"
+    )
     settings = {"policies": ("random",), "thresholds": (0.9,), "runs": 2, "samples": 20}
     benchmark(tmp_path / "c.npz", tmp_path / "risk", risks=(0.15,), **settings)
     found = load(tmp_path / "risk")
@@ -197,7 +239,8 @@ def test_a_risk_is_run_at_its_threshold_and_the_calibration_can_be_left_out(
     benchmark(tmp_path / "c.npz", tmp_path / "plain", uncalibrated=True, **settings)
     benchmark(results / "p.npz", tmp_path / "as published", **settings)
     plain, published = (
-        load(tmp_path / name).episodes("random", 0.9) for name in ("plain", "as published")
+        load(tmp_path / name).episodes("random", 0.9)
+        for name in ("plain", "as published")
     )
     pd.testing.assert_frame_equal(plain, published)
 
@@ -219,7 +262,9 @@ def test_training_objects_are_never_mixed_with_test_objects(predictions, tmp_pat
 
 
 def test_the_page_of_the_reproduction_says_what_the_tables_say(results, tmp_path):
-    page = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "reproduction.py"))["page"]
+    page = runpy.run_path(
+        str(Path(__file__).parents[1] / "benchmarks" / "reproduction.py")
+    )["page"]
     text = page(results / "p.npz", samples=200)
     benchmark(results / "p.npz", tmp_path / "full", samples=200)
     summary = pd.read_csv(tmp_path / "full" / "summary.csv").set_index(
@@ -235,33 +280,46 @@ def test_the_page_of_the_reproduction_says_what_the_tables_say(results, tmp_path
             if line.startswith(f"| {name} |")
         )
         for cell, measure in zip(
-            row.split("|")[2:], ["accuracy", "clean_accuracy", "n_views"], strict=False
+            row.split("|")[2:],
+            ["accuracy", "clean_accuracy", "n_views"],
+            strict=False,
         ):
-            assert float(cell.split()[0]) == pytest.approx(summary[name, 0.97, measure], abs=0.0051)
+            assert float(cell.split()[0]) == pytest.approx(
+                summary[name, 0.97, measure],
+                abs=0.0051,
+            )
         test = tests.loc[(name, 0.97, "accuracy")]
         assert (
-            f"{100 * test.difference:+.1f} ({100 * test.low:+.1f} to {100 * test.high:+.1f}" in text
+            f"{100 * test.difference:+.1f} ({100 * test.low:+.1f} to {100 * test.high:+.1f}"
+            in text
         )
     assert "LCM from a predicted map; no such network" in text
 
 
 @pytest.mark.parametrize(
-    ("policy", "column"), [("oracle-valley", "LEM10"), ("furthest", "furthest")]
+    ("policy", "column"),
+    [("oracle-valley", "LEM10"), ("furthest", "furthest")],
 )
 def test_the_published_tables_agree_with_each_other(policy, column):
     # Table 5 prints the class averages of tables 8 and 9.
     table5 = read_table("table5_nbv_modelnet10")
     assert published(policy, 0.99, "class_accuracy", TEN) == pytest.approx(
-        table5["class_accuracy"][column], abs=2e-4
+        table5["class_accuracy"][column],
+        abs=2e-4,
     )
     assert published(policy, 0.99, "class_travel_moved", TEN) == pytest.approx(
-        table5["class_travel"][column], abs=2e-4
+        table5["class_travel"][column],
+        abs=2e-4,
     )
-    assert published(policy, 0.99, "accuracy", TEN) == table5["instance_accuracy"][column]
+    assert (
+        published(policy, 0.99, "accuracy", TEN) == table5["instance_accuracy"][column]
+    )
 
 
 def test_it_is_printed_with_a_sentence_where_nothing_differs_and_a_warning_where_objects_are_few(
-    results, tmp_path, capsys
+    results,
+    tmp_path,
+    capsys,
 ):
     run = ["--policies", "lem", "oracle-gain", "--runs", "3", "--samples", "200"]
     main(["benchmark", str(results / "p.npz"), str(tmp_path / "board"), *run])
@@ -276,21 +334,36 @@ def test_it_is_printed_with_a_sentence_where_nothing_differs_and_a_warning_where
     lem = of.loc["lem", "accuracy"]
     assert f"lem {lem.value:.3f} ({lem.low:.3f}-{lem.high:.3f})" in shown
     assert "< 0.001 *" in next(line for line in lines if "oracle-gain" in line)
-    assert "No policy that a robot could follow differs significantly from random" in shown
+    assert (
+        "No policy that a robot could follow differs significantly from random" in shown
+    )
     assert "Too few objects to tell: there are 40" in shown
 
 
-def test_measured_error_rates_stand_beside_the_promised_ones(predictions, tmp_path, capsys):
+def test_measured_error_rates_stand_beside_the_promised_ones(
+    predictions,
+    tmp_path,
+    capsys,
+):
     bounds = RiskBounds((0.7, 0.8), ((0.2, 0.1),) * 5, 0.1)
-    replace(predictions, calibration=Calibration(1.0, 0.0, bounds)).save(tmp_path / "r.npz")
+    replace(predictions, calibration=Calibration(1.0, 0.0, bounds)).save(
+        tmp_path / "r.npz"
+    )
     policies, rates = ("random", "lem", "oracle-gain"), tmp_path / "rates"
     found = benchmark(
-        tmp_path / "r.npz", rates, policies=policies, risks=(0.1, 0.2), runs=4, samples=50
+        tmp_path / "r.npz",
+        rates,
+        policies=policies,
+        risks=(0.1, 0.2),
+        runs=4,
+        samples=50,
     )
     rows = pd.read_parquet(rates / "episodes.parquet")
     risks = found.tables.risks
     assert set(zip(risks.policy, risks.risk, risks.threshold, strict=True)) == {
-        (name, *promise) for name in ("random", "lem") for promise in ((0.1, 0.8), (0.2, 0.7))
+        (name, *promise)
+        for name in ("random", "lem")
+        for promise in ((0.1, 0.8), (0.2, 0.7))
     }
     for row in risks.itertuples():
         cell = rows[(rows.policy == row.policy) & (rows.threshold == row.threshold)]
@@ -300,7 +373,9 @@ def test_measured_error_rates_stand_beside_the_promised_ones(predictions, tmp_pa
         )
         assert row.confident == pytest.approx(len(stopped) / len(cell))
         assert row.low <= row.error <= row.high
-    assert any(promise.broken for promise in promised_risks(found.tables))  # the logits are noise
+    assert any(
+        promise.broken for promise in promised_risks(found.tables)
+    )  # the logits are noise
     assert capsys.readouterr().out == ""  # the library prints nothing
     report(rates)
     assert "Promised error rates" in (rates / "report.html").read_text()

@@ -89,7 +89,10 @@ WRITERS = {"bop": write_bop, "tum": write_tum, "7scenes": write_seven}
 def test_pose_intrinsics_and_depth_are_those_of_the_layout(layout, tmp_path):
     """A camera that looks down from 2 m: worked out by hand for each."""
     capture = read_capture(WRITERS[layout](tmp_path))
-    assert capture.layout == {"bop": "BOP", "tum": "TUM RGB-D", "7scenes": "7-Scenes"}[layout]
+    assert (
+        capture.layout
+        == {"bop": "BOP", "tum": "TUM RGB-D", "7scenes": "7-Scenes"}[layout]
+    )
     (captured,) = capture.frames
     np.testing.assert_allclose(captured.pose, DOWN, atol=1e-9)
     frame = captured.read()
@@ -99,7 +102,9 @@ def test_pose_intrinsics_and_depth_are_those_of_the_layout(layout, tmp_path):
     # 0.1 of the depth.
     expected = (np.array([3 - 7.5, 4 - 5.5]) / [500, 510] * 2) * [1, -1] + [0.25, -0.5]
     np.testing.assert_allclose(
-        frame.positions(np.array([4]), np.array([3]))[0], [*expected, 0], atol=1e-6
+        frame.positions(np.array([4]), np.array([3]))[0],
+        [*expected, 0],
+        atol=1e-6,
     )
 
 
@@ -125,7 +130,9 @@ def test_captured_from_the_viewpoints_it_is_the_same_as_looking(captured, system
     those of the mesh.
     """
     camera = CapturedCamera(
-        read_capture(captured), up=(0, 0, 1), box=read_box(captured / "box.json")
+        read_capture(captured),
+        up=(0, 0, 1),
+        box=read_box(captured / "box.json"),
     )
     found, looked = (
         system.recognise(camera, start=4),
@@ -143,7 +150,11 @@ def test_captured_from_the_viewpoints_it_is_the_same_as_looking(captured, system
     )
     np.testing.assert_allclose(centre, [0, 0, height], atol=1e-9)
     for view in found.views:
-        np.testing.assert_allclose(view.observation.pose, TWELVE.poses[view.index], atol=1e-6)
+        np.testing.assert_allclose(
+            view.observation.pose,
+            TWELVE.poses[view.index],
+            atol=1e-6,
+        )
 
 
 def test_the_object_is_found_without_a_box(captured, system):
@@ -167,7 +178,10 @@ def test_every_request_gets_the_nearest_view_that_is_left(captured):
     capture = read_capture(captured)
     box = read_box(captured / "box.json")
     camera = CapturedCamera(capture, box=box)
-    asked = look_at_origin(np.radians([50, 30, 70, 10]), np.radians([130, 128, 131, 310]))
+    asked = look_at_origin(
+        np.radians([50, 30, 70, 10]),
+        np.radians([130, 128, 131, 310]),
+    )
     left = dict(enumerate(capture.frames))
     for pose in asked:
         camera.observe(pose)
@@ -240,7 +254,8 @@ def seen(count=9, moved=0.0, turned=0.0, evenly=False, thing=None):
         turn = Rotation.from_rotvec(rng.normal(0, turned, 3), degrees=True).as_matrix()
         there = pose[:3, 3] + rng.normal(0, moved, 3)
         depth, which = caster.cast(
-            there, rays @ np.ascontiguousarray((pose[:3, :3] @ turn).T, np.float32)
+            there,
+            rays @ np.ascontiguousarray((pose[:3, :3] @ turn).T, np.float32),
         )
         depths.append(np.where(which < 0, 0, depth).reshape(120, 160))
     return depths, poses
@@ -261,20 +276,36 @@ def write_frames(folder, layout, depths, poses, step=1.0, unit=1.0, swapped=Fals
     if swapped and layout != "tum":
         stored[:, :3, :3] = reordered(stored[:, :3, :3])
     stored[:, :3, 3] *= unit * (1000 if layout == "bop" else 1)
-    k, cameras, times, lines = SMALL_K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), {}, [], []
+    k, cameras, times, lines = (
+        SMALL_K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]),
+        {},
+        [],
+        [],
+    )
     for i, (depth, pose) in enumerate(zip(depths, stored, strict=True)):
         name = {
             "bop": f"depth/{i:06d}.png",
             "tum": f"depth/{i}.png",
             "7scenes": f"frame-{i:06d}.depth.png",
         }[layout]
-        write_png(folder / name, np.minimum(np.rint(depth / (step * STEPS[layout])), 65534))
+        write_png(
+            folder / name,
+            np.minimum(np.rint(depth / (step * STEPS[layout])), 65534),
+        )
         if layout == "bop":
-            there = {"cam_R_w2c": pose[:3, :3].ravel().tolist(), "cam_t_w2c": pose[:3, 3].tolist()}
+            there = {
+                "cam_R_w2c": pose[:3, :3].ravel().tolist(),
+                "cam_t_w2c": pose[:3, 3].tolist(),
+            }
             cameras[str(i)] = {"cam_K": k.ravel().tolist(), "depth_scale": 1.0, **there}
         elif layout == "tum":
-            quaternion = np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), int(swapped))
-            lines.append(" ".join(f"{value:.6f}" for value in (i, *pose[:3, 3], *quaternion)))
+            quaternion = np.roll(
+                Rotation.from_matrix(pose[:3, :3]).as_quat(),
+                int(swapped),
+            )
+            lines.append(
+                " ".join(f"{value:.6f}" for value in (i, *pose[:3, 3], *quaternion))
+            )
             times.append(f"{i} {name}")
         else:
             np.savetxt(folder / f"frame-{i:06d}.pose.txt", pose)
@@ -299,13 +330,33 @@ MISTAKES = {
     "quaternions": (lambda p: p, {"swapped": True}, "in the order w, x, y, z"),
     "inverse": (np.linalg.inv, {}, "the poses are inverse"),
     "unit": (lambda p: p, {"unit": UNITS}, "the translations are in m"),
-    "five times too large": (lambda p: p, {"step": 0.2}, "the depth is 5 times too large"),
-    "four times too large": (lambda p: p, {"step": 0.25}, "the depth is 4 times too large"),
-    "five times too small": (lambda p: p, {"step": 5}, "the depth is 5 times too small"),
+    "five times too large": (
+        lambda p: p,
+        {"step": 0.2},
+        "the depth is 5 times too large",
+    ),
+    "four times too large": (
+        lambda p: p,
+        {"step": 0.25},
+        "the depth is 4 times too large",
+    ),
+    "five times too small": (
+        lambda p: p,
+        {"step": 5},
+        "the depth is 5 times too small",
+    ),
     "late": (lambda p: np.concatenate([p[:1], p[:-1]]), {}, "one frame late"),
     "early": (lambda p: np.concatenate([p[1:], p[-1:]]), {}, "one frame early"),
-    "two late": (lambda p: np.concatenate([p[:2], p[:-2]]), {}, "the poses are 2 frames late"),
-    "two early": (lambda p: np.concatenate([p[2:], p[-2:]]), {}, "the poses are 2 frames early"),
+    "two late": (
+        lambda p: np.concatenate([p[:2], p[:-2]]),
+        {},
+        "the poses are 2 frames late",
+    ),
+    "two early": (
+        lambda p: np.concatenate([p[2:], p[-2:]]),
+        {},
+        "the poses are 2 frames early",
+    ),
     "axes": (lambda p: p @ OPENGL, {}, "those of OpenGL"),
     "inverse, and axes": (lambda p: np.linalg.inv(p @ OPENGL), {}, "are inverse"),
 }
@@ -317,7 +368,8 @@ def test_a_mistake_in_all_poses_is_named(what, layout, nine, tmp_path):
     depths, poses = nine
     change, options, said = MISTAKES[what]
     options = {
-        name: value[layout] if isinstance(value, dict) else value for name, value in options.items()
+        name: value[layout] if isinstance(value, dict) else value
+        for name, value in options.items()
     }
     write_frames(tmp_path, layout, depths, change(poses), **options)
     with pytest.raises(DatasetError, match=said):
@@ -326,7 +378,8 @@ def test_a_mistake_in_all_poses_is_named(what, layout, nine, tmp_path):
 
 @pytest.mark.parametrize("layout", WRITERS)
 @pytest.mark.parametrize(
-    ("count", "moved", "turned"), [(9, 0, 0), (9, 0.004, 0.5), (5, 0.004, 0.5), (2, 0, 0)]
+    ("count", "moved", "turned"),
+    [(9, 0, 0), (9, 0.004, 0.5), (5, 0.004, 0.5), (2, 0, 0)],
 )
 def test_right_frames_pass(layout, count, moved, turned, tmp_path):
     write_frames(tmp_path, layout, *seen(count, moved, turned))
@@ -375,9 +428,18 @@ def bumped(poses):
 
 
 PARTS = {
-    "one image lost": (late_from(12, 1), "from frame 000012 on the poses are one frame late"),
-    "one image lost early": (late_from(4, 1), "from frame 000004 on the poses are one frame late"),
-    "two images lost": (late_from(9, 2), "from frame 000009 on the poses are 2 frames late"),
+    "one image lost": (
+        late_from(12, 1),
+        "from frame 000012 on the poses are one frame late",
+    ),
+    "one image lost early": (
+        late_from(4, 1),
+        "from frame 000004 on the poses are one frame late",
+    ),
+    "two images lost": (
+        late_from(9, 2),
+        "from frame 000009 on the poses are 2 frames late",
+    ),
     "one pose lost": (
         late_from(12, -1),
         "from frame 00001. to 00002. the poses are one frame early",
@@ -444,7 +506,11 @@ def test_of_a_can_on_a_table_nothing_is_said(change, tmp_path):
     """Whatever it is turned by, it looks the same."""
     can = trimesh.creation.cylinder(0.15, 0.4, sections=180)
     can.apply_translation([0, 0, 0.2])
-    depths, poses = seen(24, evenly=True, thing=(can.vertices, can.faces.astype(np.int32)))
+    depths, poses = seen(
+        24,
+        evenly=True,
+        thing=(can.vertices, can.faces.astype(np.int32)),
+    )
     write_frames(tmp_path, "7scenes", depths, change(poses))
     assert check_capture(read_capture(tmp_path))[1] == {}
 
@@ -454,7 +520,11 @@ def test_a_thing_that_looks_the_same_from_all_sides_contradicts_nothing(tmp_path
     poses = seen(5)[1]
     y, x = np.mgrid[:120, :160]
     across = np.hypot((x + 0.5 - 80) / 131.25, (y + 0.5 - 60) / 131.25)
-    depth = np.where(across < 0.18, 1 - 0.2 * np.sqrt(np.maximum(0, 1 - (across / 0.2) ** 2)), 0)
+    depth = np.where(
+        across < 0.18,
+        1 - 0.2 * np.sqrt(np.maximum(0, 1 - (across / 0.2) ** 2)),
+        0,
+    )
     write_frames(tmp_path, "7scenes", [depth] * 5, np.roll(poses, 1, axis=0))
     assert check_capture(read_capture(tmp_path))[1] == {}
 
@@ -487,7 +557,11 @@ ONE_BAD = {
 
 
 @pytest.mark.parametrize("what", ONE_BAD)
-def test_one_bad_frame_is_left_out_and_named_and_several_are_refused(what, nine, tmp_path):
+def test_one_bad_frame_is_left_out_and_named_and_several_are_refused(
+    what,
+    nine,
+    tmp_path,
+):
     harm, said = ONE_BAD[what]
     write_frames(tmp_path, "7scenes", *nine)
     harm(tmp_path)
@@ -499,7 +573,10 @@ def test_one_bad_frame_is_left_out_and_named_and_several_are_refused(what, nine,
         CapturedCamera(read_capture(tmp_path))
 
 
-def test_learn_names_the_frames_that_it_leaves_out_and_refuses_wrong_poses(nine, tmp_path):
+def test_learn_names_the_frames_that_it_leaves_out_and_refuses_wrong_poses(
+    nine,
+    tmp_path,
+):
     depths, poses = nine
     for name in ("chair", "stool"):
         write_frames(tmp_path / "things" / name, "7scenes", depths, poses)
@@ -545,12 +622,37 @@ DAMAGE = {
         lambda p: p.write_bytes(p.read_bytes()[:-40]),
         "damaged",
     ),
-    "a link to an image elsewhere": ("7scenes", DEPTH, link_out, "link out of this folder"),
-    "a link to a list elsewhere": ("tum", TRAJECTORY, link_out, "link out of this folder"),
-    "a link to a folder elsewhere": ("bop", "depth", link_out, "link out of this folder"),
-    "8 bits": ("tum", "depth/a.png", lambda p: write_png(p, depth_image(90), np.uint8), "16 bits"),
+    "a link to an image elsewhere": (
+        "7scenes",
+        DEPTH,
+        link_out,
+        "link out of this folder",
+    ),
+    "a link to a list elsewhere": (
+        "tum",
+        TRAJECTORY,
+        link_out,
+        "link out of this folder",
+    ),
+    "a link to a folder elsewhere": (
+        "bop",
+        "depth",
+        link_out,
+        "link out of this folder",
+    ),
+    "8 bits": (
+        "tum",
+        "depth/a.png",
+        lambda p: write_png(p, depth_image(90), np.uint8),
+        "16 bits",
+    ),
     "no JSON": ("bop", CAMERAS, put("{"), "not the cameras"),
-    "no scale": ("bop", CAMERAS, edited(lambda v: v.update(depth_scale=0)), "depth_scale"),
+    "no scale": (
+        "bop",
+        CAMERAS,
+        edited(lambda v: v.update(depth_scale=0)),
+        "depth_scale",
+    ),
     "no translation": ("bop", CAMERAS, edited(lambda v: v.pop("cam_t_w2c")), "cam_t"),
     "no rotation": (
         "bop",
@@ -562,7 +664,12 @@ DAMAGE = {
     "an empty trajectory": ("tum", TRAJECTORY, put("# t\n"), "lists nothing"),
     "no quaternion": ("tum", TRAJECTORY, put("10 0 0 0 0 0 0 0\n"), "quaternion"),
     "another clock": ("tum", TRAJECTORY, put("99 0 0 0 0 0 0 1\n"), "one clock"),
-    "an image elsewhere": ("tum", "depth.txt", put("10 /etc/passwd\n"), "no file of this folder"),
+    "an image elsewhere": (
+        "tum",
+        "depth.txt",
+        put("10 /etc/passwd\n"),
+        "no file of this folder",
+    ),
     "no intrinsics": ("tum", "camera-intrinsics.txt", Path.unlink, "--intrinsics"),
 }
 

@@ -47,7 +47,9 @@ def test_every_command_explains_itself(name, capsys):
     assert shown.startswith(f"usage: nextview {name} ")
     assert "(required)" in shown or name == "demo" or name == "explore"
     assert not [
-        line for line in shown.splitlines() if re.search(r"--[\w-]+ \S+\s+\(default", line)
+        line
+        for line in shown.splitlines()
+        if re.search(r"--[\w-]+ \S+\s+\(default", line)
     ], "no help"
 
 
@@ -110,7 +112,8 @@ def test_an_option_takes_the_same_in_every_command():
 
 
 @pytest.mark.parametrize(
-    ("words", "meant"), [("recognize", "recognise"), ("train recognizer", "train recogniser")]
+    ("words", "meant"),
+    [("recognize", "recognise"), ("train recognizer", "train recogniser")],
 )
 def test_a_misspelt_command_is_guessed(words, meant, capsys):
     assert ended(capsys, *words.split()) == (
@@ -181,21 +184,34 @@ def test_ctrl_c_ends_other_commands_in_one_line(monkeypatch, capsys):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("nextview.cli.listing.bundled_cards", stop)
-    assert ended(capsys, "list", "models") == (130, "nextview: stopped; nothing was written\n")
+    assert ended(capsys, "list", "models") == (
+        130,
+        "nextview: stopped; nothing was written\n",
+    )
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
 @pytest.mark.parametrize(
     ("where", "words", "status", "said"),
     [
-        (">/dev/full", "list models", 1, "standard output cannot be written (No space left on"),
+        (
+            ">/dev/full",
+            "list models",
+            1,
+            "standard output cannot be written (No space left on",
+        ),
         (">&-", "list models", 0, ""),
         (">&-", "recognise none.off", 2, "none.off: no such file"),
         ("2>&-", "recognise none.off", 2, ""),
         ("2>/dev/full", "recognise none.off", 2, ""),
     ],
 )
-def test_where_an_output_is_full_or_closed_the_status_still_tells(where, words, status, said):
+def test_where_an_output_is_full_or_closed_the_status_still_tells(
+    where,
+    words,
+    status,
+    said,
+):
     line = ["bash", "-c", f'"$@" {where}', "bash", *COMMAND, *words.split()]
     done = subprocess.run(line, capture_output=True, text=True)
     assert (done.returncode, done.stdout, said in done.stderr) == (status, "", True)
@@ -250,7 +266,10 @@ PathFinder.find_spec = staticmethod(find)
         ("import nextview.benchmark.environments", "envs"),
         ("from nextview.benchmark.run import run_benchmark", "benchmark"),
         ("from nextview.benchmark.report import report", "benchmark"),
-        ("from nextview.benchmark.evaluation_page import write_evaluation", "benchmark"),
+        (
+            "from nextview.benchmark.evaluation_page import write_evaluation",
+            "benchmark",
+        ),
         ("from nextview.viewers.page import Page", "explore"),
         ("from nextview.training.recogniser_training import train_recogniser", "train"),
         ("from nextview.training.export import export_map", "train"),
@@ -267,7 +286,8 @@ PathFinder.find_spec = staticmethod(find)
 def test_python_without_an_extra_names_it_too(code, extra):
     caught = "    print(error)\nelse:\n    raise SystemExit('nothing was raised')"
     body = (
-        f"import nextview\ntry:\n    {code}\nexcept nextview.MissingExtraError as error:\n{caught}"
+        f"import nextview\ntry:\n    {code}\nexcept "
+        f"nextview.MissingExtraError as error:\n{caught}"
     )
     done = run_python(HIDDEN + body)
     assert done.returncode == 0, done.stderr
@@ -282,12 +302,14 @@ def test_a_module_that_is_no_extra_is_no_missing_extra():
 
 
 @pytest.mark.parametrize(
-    "name", ["train recogniser", "train gain", "export map", "evaluate", "benchmark", "report"]
+    "name",
+    ["train recogniser", "train gain", "export map", "evaluate", "benchmark", "report"],
 )
 def test_help_needs_no_extra(name):
     """The packages are hidden from the search of installed ones."""
     done = run_python(
-        HIDDEN + f"from nextview.cli.main import main; main({[*name.split(), '--help']!r})"
+        HIDDEN
+        + f"from nextview.cli.main import main; main({[*name.split(), '--help']!r})"
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(f"usage: nextview {name} ")
@@ -335,7 +357,12 @@ def test_bash_completes_commands_and_options(words, offered, completions_for_bas
         f" ]*\\).*/\\1/'); COMP_WORDS=(nextview {words}); COMP_CWORD=$((${{#COMP_WORDS[@]}}-1));"
         " $f; echo ${COMPREPLY[@]}"
     )
-    done = subprocess.run(["bash", "-c", ask], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        ["bash", "-c", ask],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert set(done.stdout.split()) == offered
 
 
@@ -359,7 +386,9 @@ def test_where_there_is_no_terminal_a_line_tells_how_far_it_is(monkeypatch):
     progress.track(range(1, 7), 6, "rendering v.zarr")
     lines = file.getvalue().splitlines()
     assert lines
-    assert all(re.fullmatch(r"rendering v.zarr: \d of 6 after \d+ s", line) for line in lines)
+    assert all(
+        re.fullmatch(r"rendering v.zarr: \d of 6 after \d+ s", line) for line in lines
+    )
 
 
 def test_render_says_at_once_what_sizes_the_networks_take(furniture, tmp_path, capsys):
@@ -376,7 +405,8 @@ def test_render_says_at_once_what_sizes_the_networks_take(furniture, tmp_path, c
         main([*command, "--split", "test", "--workers", "0"])
         words = " ".join(capsys.readouterr().err.split())
         assert (
-            "networks take images whose side is a multiple of 112 pixels, such as 224" in words
+            "networks take images whose side is a multiple of 112 pixels, such as 224"
+            in words
         ) == said
 
 
@@ -388,6 +418,11 @@ def test_predictions_are_summed_up():
     # a quarter of the views names another class
     logits[:, : v // 4] = 1.5 * np.roll(truth, 1, axis=1)[:, None]
     p = replace(
-        p, logits=logits, splits=np.array(["test"] * n), models={"recogniser": ("tiny", "0" * 64)}
+        p,
+        logits=logits,
+        splits=np.array(["test"] * n),
+        models={"recogniser": ("tiny", "0" * 64)},
     )
-    assert summed_up(p) == [f"{n} test objects: right from one view 0.750, from all {v} 1.000"]
+    assert summed_up(p) == [
+        f"{n} test objects: right from one view 0.750, from all {v} 1.000"
+    ]

@@ -16,7 +16,11 @@ from nextview.recognition.network_input import cloud_input
 POSES = ViewSphere.named("40").poses
 
 
-def unprojected(depth: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+def unprojected(
+    depth: np.ndarray,
+    pose: np.ndarray,
+    intrinsics: np.ndarray,
+) -> np.ndarray:
     """The point under every pixel, one after the other, object frame, (H, W, 3)."""
     points = np.zeros((*depth.shape, 3))
     for row, column in np.ndindex(depth.shape):
@@ -25,7 +29,11 @@ def unprojected(depth: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray) -> 
     return points
 
 
-def pixels_of(points: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+def pixels_of(
+    points: np.ndarray,
+    pose: np.ndarray,
+    intrinsics: np.ndarray,
+) -> np.ndarray:
     """(row, column) in which each point appears."""
     seen = (points - pose[:3, 3]) @ pose[:3, :3] @ intrinsics.T
     return np.floor(seen[:, 1::-1] / seen[:, 2:]).astype(int)
@@ -48,7 +56,9 @@ def test_every_point_is_under_a_visible_pixel(share, view):
     row, column = pixels_of(points, POSES[view], intrinsics).T
     assert (depth[row, column] > 0).all()
     np.testing.assert_allclose(
-        points, unprojected(depth, POSES[view], intrinsics)[row, column], atol=1e-6
+        points,
+        unprojected(depth, POSES[view], intrinsics)[row, column],
+        atol=1e-6,
     )
 
 
@@ -62,7 +72,11 @@ def test_pixels_are_drawn_without_replacement_and_repeat_evenly_when_few(visible
     if not visible:
         assert (points == 0).all()
         return
-    drawn, times = np.unique(pixels_of(points, POSES[10], intrinsics), axis=0, return_counts=True)
+    drawn, times = np.unique(
+        pixels_of(points, POSES[10], intrinsics),
+        axis=0,
+        return_counts=True,
+    )
     assert len(drawn) == min(visible, CLOUD_POINTS)
     assert np.ptp(times) <= 1
 
@@ -72,7 +86,9 @@ def test_every_visible_pixel_has_the_same_chance():
     drawn = np.zeros((4, 4))
     for seed in range(60):
         row, column = pixels_of(
-            visible_points(depth, POSES[0], intrinsics, seed), POSES[0], intrinsics
+            visible_points(depth, POSES[0], intrinsics, seed),
+            POSES[0],
+            intrinsics,
         ).T
         np.add.at(drawn, (row // 12, column // 12), 1)
     # Without replacement the counts vary less than in chisquare's model: a p-value near 0 would
@@ -85,12 +101,19 @@ def test_every_visible_pixel_has_the_same_chance():
 
 def test_clouds_are_scaled_by_their_own_global_extent():
     points = np.random.default_rng(0).uniform(-1, 1, (5, 100, 3)).astype(np.float32)
-    poses = look_at_origin(np.linspace(0, 1, 5), np.zeros(5))  # at azimuth 0 nothing is turned
+    poses = look_at_origin(
+        np.linspace(0, 1, 5),
+        np.zeros(5),
+    )  # at azimuth 0 nothing is turned
     clouds = cloud_input(points, poses)
     assert (clouds.shape, clouds.dtype) == ((5, 100, 3), np.float32)
     for cloud, raw in zip(clouds, points, strict=True):
         assert (cloud.min(), cloud.max()) == (0, 1)
-        np.testing.assert_allclose(cloud, np.interp(raw, [raw.min(), raw.max()], [0, 1]), atol=1e-5)
+        np.testing.assert_allclose(
+            cloud,
+            np.interp(raw, [raw.min(), raw.max()], [0, 1]),
+            atol=1e-5,
+        )
 
 
 @settings(deadline=None)
@@ -100,7 +123,10 @@ def test_turning_object_and_camera_together_changes_nothing(azimuth, elevation):
     c, s = np.cos(azimuth), np.sin(azimuth)
     turned = points @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
     ahead = cloud_input(points.astype(np.float32), look_at_origin([elevation], [0.0]))
-    found = cloud_input(turned.astype(np.float32), look_at_origin([elevation], [azimuth]))
+    found = cloud_input(
+        turned.astype(np.float32),
+        look_at_origin([elevation], [azimuth]),
+    )
     np.testing.assert_allclose(found, ahead, atol=1e-5)
 
 
@@ -110,5 +136,8 @@ def test_the_camera_stands_at_azimuth_zero():
     for azimuth in np.linspace(0, 6, 7):
         pose = look_at_origin(0.0, azimuth)
         towards, right, up = -pose[:3, 2], pose[:3, 0], -pose[:3, 1]
-        cloud = cloud_input(np.stack([towards, right, up])[None].astype(np.float32), pose[None])[0]
+        cloud = cloud_input(
+            np.stack([towards, right, up])[None].astype(np.float32),
+            pose[None],
+        )[0]
         assert cloud.argmax(0).tolist() == [0, 1, 2]

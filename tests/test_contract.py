@@ -119,14 +119,21 @@ def other_episodes():
         yield f"table, {viewpoints}", _recognise, ("table", options, {"seed": 5})
     yield "table, risk", _recognise, ("table", {"risk": 0.05}, {"start": 33})
     yield "table, kinect", _recognise, ("table", {}, {"sensor": "kinect", "seed": 1})
-    yield "chair, stereo", _recognise, ("chair", {}, {"sensor": "stereo:0.5", "seed": 2})
+    yield (
+        "chair, stereo",
+        _recognise,
+        ("chair", {}, {"sensor": "stereo:0.5", "seed": 2}),
+    )
     yield "chair, arm over a table", _arm, ("chair",)
     yield "monitor, reach and cost", _constrained, ()
     yield "chair behind a wall", _cluttered, ()
 
 
 def _recognise(sample, options, how):
-    return nextview.load(threads=1, **options).recognise(SAMPLES / f"{sample}.off", **how)
+    return nextview.load(threads=1, **options).recognise(
+        SAMPLES / f"{sample}.off",
+        **how,
+    )
 
 
 def _arm(sample):
@@ -136,13 +143,19 @@ def _arm(sample):
     finally:
         sys.path.remove(str(ROOT / "examples"))
     return example.recognise(
-        example.Arm(nextview.load_mesh(SAMPLES / f"{sample}.off"), np.random.default_rng(1))
+        example.Arm(
+            nextview.load_mesh(SAMPLES / f"{sample}.off"),
+            np.random.default_rng(1),
+        )
     )
 
 
 def _constrained():
     """A session with a mask, a matrix of costs, and two targets that could not be reached."""
-    session = nextview.load(threads=1, threshold=0.9995, max_views=5).session(start=10, seed=3)
+    session = nextview.load(threads=1, threshold=0.9995, max_views=5).session(
+        start=10,
+        seed=3,
+    )
     camera = nextview.SimulatedCamera(nextview.load_mesh(SAMPLES / "monitor.off"))
     session.reachable = np.arange(40) % 3 > 0
     session.travel_cost = np.abs(np.subtract.outer(np.arange(40.0), np.arange(40.0)))
@@ -168,18 +181,29 @@ def _cluttered():
     }
     chair = Placement("chair.off", sha["chair.off"])
     table = Placement("table.off", sha["table.off"], -0.6, 2.0, 0.7, 1.1)
-    blocks = (Block(1.6, 0.0, 0.3, 0.3, 1.6, 1.8), Block(-3.0, 0.0, 0.0, 0.1, 4.0, 3.0, True))
+    blocks = (
+        Block(1.6, 0.0, 0.3, 0.3, 1.6, 1.8),
+        Block(-3.0, 0.0, 0.0, 0.1, 4.0, 3.0, True),
+    )
     scene = build_scene(
-        SceneLayout("chair@medium-0", "medium", 0, chair, (table,), blocks), SAMPLES
+        SceneLayout("chair@medium-0", "medium", 0, chair, (table,), blocks),
+        SAMPLES,
     )
     camera = RobotCamera(scene, "wrist", named="box")
-    system = nextview.load(policy="visible-gain", threads=1, threshold=0.999, max_views=4)
+    system = nextview.load(
+        policy="visible-gain",
+        threads=1,
+        threshold=0.999,
+        max_views=4,
+    )
     session = system.session_with(camera, start=0)
     session.reachable = camera.reachable
     return session.run(camera)
 
 
-EPISODES = {name: (run, given) for name, run, given in (*policy_episodes(), *other_episodes())}
+EPISODES = {
+    name: (run, given) for name, run, given in (*policy_episodes(), *other_episodes())
+}
 
 
 def measured(name):
@@ -202,7 +226,9 @@ def synthetic_predictions():
     rng = np.random.default_rng(7)
     labels, n = np.arange(60) % 3, 60
     logits = (
-        rng.normal(size=(n, 40, 3)) + rng.normal(size=(n, 1, 3)) + 1.5 * np.eye(3)[labels][:, None]
+        rng.normal(size=(n, 40, 3))
+        + rng.normal(size=(n, 1, 3))
+        + 1.5 * np.eye(3)[labels][:, None]
     )
     maps = {"lem": rng.random((n, 40, 5, 3)).astype(np.float32)}
     return Predictions(
@@ -220,7 +246,15 @@ def synthetic_predictions():
     )
 
 
-TABLE_OF = ("random", "random-all", "furthest", "spread", "lem", "lem-peak", "oracle-gain")
+TABLE_OF = (
+    "random",
+    "random-all",
+    "furthest",
+    "spread",
+    "lem",
+    "lem-peak",
+    "oracle-gain",
+)
 MEASURES = ("accuracy", "n_views", "travel_all", "confident", "calibration_error")
 
 
@@ -241,11 +275,21 @@ def table(folder):
         "--seed",
         "1",
     ]
-    main(["benchmark", str(folder / "p.npz"), str(folder / "out"), "--policies", *TABLE_OF, *how])
+    main(
+        [
+            "benchmark",
+            str(folder / "p.npz"),
+            str(folder / "out"),
+            "--policies",
+            *TABLE_OF,
+            *how,
+        ]
+    )
     rows = pd.read_csv(folder / "out" / "summary.csv")
     rows = rows[rows.measure.isin(MEASURES) & rows.threshold.isin([0.8, 0.97])]
     return {
-        f"{r.policy} {r.threshold} {r.measure}": [r.value, r.low, r.high] for r in rows.itertuples()
+        f"{r.policy} {r.threshold} {r.measure}": [r.value, r.low, r.high]
+        for r in rows.itertuples()
     }
 
 
@@ -261,28 +305,37 @@ def test_public_names():
 
 @pytest.mark.parametrize("kind", ATTRIBUTES | FIELDS, ids=lambda kind: kind.__name__)
 def test_attributes_and_fields(kind):
-    assert not [name for name in ATTRIBUTES.get(kind, "").split() if not hasattr(kind, name)]
+    assert not [
+        name for name in ATTRIBUTES.get(kind, "").split() if not hasattr(kind, name)
+    ]
     found = set(getattr(kind, "__dataclass_fields__", ())) | set(
         getattr(kind, "__struct_fields__", ())
     )
     assert not set(FIELDS.get(kind, "").split()) - found
 
 
-PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md")), *sorted(ROOT.glob("examples/*.py"))]
+PAGES = [
+    ROOT / "README.md",
+    *sorted(ROOT.glob("docs/*.md")),
+    *sorted(ROOT.glob("examples/*.py")),
+]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_what_pages_import_is_there(page):
     """Lines "from nextview... import names", each name of which has to be there."""
     lines = re.findall(
-        r"^(?:>>> )?from (nextview(?:\.[\w.]+)?) import ([\w, ]+)", page.read_text(), re.M
+        r"^(?:>>> )?from (nextview(?:\.[\w.]+)?) import ([\w, ]+)",
+        page.read_text(),
+        re.M,
     )
     for module, name in (
         (module, name.strip()) for module, names in lines for name in names.split(", ")
     ):
-        there = hasattr(importlib.import_module(module), name) or importlib.util.find_spec(
-            f"{module}.{name}"
-        )
+        there = hasattr(
+            importlib.import_module(module),
+            name,
+        ) or importlib.util.find_spec(f"{module}.{name}")
         assert there, f"{page.name}: {name} of {module}"
 
 
@@ -295,7 +348,8 @@ def test_episodes(name, golden):
         wanted["confident"],
     )
     assert [found["travel"], found["arc"]] == pytest.approx(
-        [wanted["travel"], wanted["arc"]], abs=1e-9
+        [wanted["travel"], wanted["arc"]],
+        abs=1e-9,
     )
     np.testing.assert_allclose(found["belief"], wanted["belief"], rtol=0, atol=1e-5)
     assert found["novelty"] == pytest.approx(wanted["novelty"], abs=1e-4)
@@ -314,8 +368,16 @@ if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as folder:
         numbers = table(Path(folder))
     found = {"episodes": {name: measured(name) for name in EPISODES}, "table": numbers}
-    lines = [f"{json.dumps(name)}: {json.dumps(e)}" for name, e in found["episodes"].items()]
-    rows = [f"{json.dumps(name)}: {json.dumps(row)}" for name, row in found["table"].items()]
+    lines = [
+        f"{json.dumps(name)}: {json.dumps(e)}" for name, e in found["episodes"].items()
+    ]
+    rows = [
+        f"{json.dumps(name)}: {json.dumps(row)}" for name, row in found["table"].items()
+    ]
     GOLDEN.write_text(
-        '{"episodes": {\n' + ",\n".join(lines) + '\n},\n"table": {\n' + ",\n".join(rows) + "\n}}\n"
+        '{"episodes": {\n'
+        + ",\n".join(lines)
+        + '\n},\n"table": {\n'
+        + ",\n".join(rows)
+        + "\n}}\n"
     )

@@ -35,7 +35,11 @@ def seen(meshes, pose, seed, told=None, sigma=NOISE) -> Frame:
     """A noisy frame, with the pose that it was taken from or another one."""
     depth, _ = cast(meshes, pose)
     rng = np.random.default_rng(seed)
-    depth = np.where(depth > 0, depth + sigma * (depth / 0.5) ** 2 * rng.normal(size=SHAPE), 0)
+    depth = np.where(
+        depth > 0,
+        depth + sigma * (depth / 0.5) ** 2 * rng.normal(size=SHAPE),
+        0,
+    )
     depth[rng.random(SHAPE) < 0.03] = 0
     return Frame(depth, INTRINSICS, pose if told is None else told, pixel_centre=0.5)
 
@@ -89,7 +93,9 @@ def test_errors_of_an_arm_are_allowed_for(seed):
         pose = pose_at(*view, 0.5, (0, 0, 0.04))
         told = pose.copy()
         told[:3, 3] += 0.006 * _direction(rng)
-        told[:3, :3] = Rotation.from_rotvec(0.01 * _direction(rng)).as_matrix() @ told[:3, :3]
+        told[:3, :3] = (
+            Rotation.from_rotvec(0.01 * _direction(rng)).as_matrix() @ told[:3, :3]
+        )
         known.add(seen([TABLE, CARTON], pose, k, told))
         places.append((told @ np.linalg.inv(pose) @ [*CARTON.centroid, 1])[:3])
 
@@ -103,7 +109,9 @@ def test_errors_of_an_arm_are_allowed_for(seed):
     # In the world it is where the frames show it in the mean: their errors differ.
     centre = PoseFrame.of(known).from_object[:3, 3]
     np.testing.assert_allclose(
-        centre - known.object_frame.centre, stood.mean(0) - mended.mean(0), atol=1e-9
+        centre - known.object_frame.centre,
+        stood.mean(0) - mended.mean(0),
+        atol=1e-9,
     )
 
 
@@ -113,7 +121,12 @@ def _direction(rng) -> np.ndarray:
 
 
 def test_what_moved_far_is_not_put_back():
-    known = looked_at(CARTON, [np.zeros(3), (0.06, 0.03, 0)], VIEWS[:2], point=(0.02, 0, 0.04))
+    known = looked_at(
+        CARTON,
+        [np.zeros(3), (0.06, 0.03, 0)],
+        VIEWS[:2],
+        point=(0.02, 0, 0.04),
+    )
     assert not known.sightings[-1].shift.any()
 
 
@@ -129,7 +142,10 @@ def test_the_displacement_moves_with_the_world():
             pose = pose_at(*view, 0.5, (0, 0, 0.04))
             moved = CARTON.copy().apply_translation((move, 0, 0))
             known.add(seen([TABLE, moved], pose, k, world @ pose))
-        told = [replace(one.shifted(-one.shift), shift=np.zeros(3)) for one in known.sightings]
+        told = [
+            replace(one.shifted(-one.shift), shift=np.zeros(3))
+            for one in known.sightings
+        ]
         found.append(displacement(told[1], told[:1]).shift)
     np.testing.assert_allclose(found[1], turn[:3, :3] @ found[0], atol=1e-4)
 
@@ -149,7 +165,10 @@ def leaning(degrees, azimuth) -> np.ndarray:
     return turn
 
 
-@pytest.mark.parametrize(("degrees", "warned"), [(0.0, False), (0.4, False), (2.0, True)])
+@pytest.mark.parametrize(
+    ("degrees", "warned"),
+    [(0.0, False), (0.4, False), (2.0, True)],
+)
 @pytest.mark.parametrize("azimuth", [10, 130, 250])
 def test_a_table_that_leans_is_warned_of(degrees, warned, azimuth):
     turn = leaning(degrees, azimuth)
@@ -208,7 +227,8 @@ def test_frames_that_disagree_say_less_of_the_lean():
 def test_what_is_allowed_for_takes_no_certainty():
     """A nudged taught thing is named with confidence, and the result warns of the nudge."""
     session = nextview.load("ycb", max_views=3, threshold=1.0).session(
-        object=ObservedObject(point=(0, 0, 0.04)), distance=0.5
+        object=ObservedObject(point=(0, 0, 0.04)),
+        distance=0.5,
     )
     for k, (view, move) in enumerate(zip(VIEWS, (0, 0.01, 0.02), strict=True)):
         moved = MUG.copy().apply_translation((move, 0, 0))

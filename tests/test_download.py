@@ -59,7 +59,11 @@ class Server:
         self.url = f"http://127.0.0.1:{self.http.server_address[1]}/shapes.zip"
 
     def __enter__(self):
-        threading.Thread(target=self.http.serve_forever, args=(0.01,), daemon=True).start()
+        threading.Thread(
+            target=self.http.serve_forever,
+            args=(0.01,),
+            daemon=True,
+        ).start()
         return self
 
     def __exit__(self, *error):
@@ -67,7 +71,11 @@ class Server:
         self.http.server_close()
 
     def archive(self, published: bytes | None = None) -> Archive:
-        return Archive(self.url, hashlib.sha256(published or self.data).hexdigest(), "Shapes")
+        return Archive(
+            self.url,
+            hashlib.sha256(published or self.data).hexdigest(),
+            "Shapes",
+        )
 
 
 def test_download_unpacks_only_its_folder_once_and_leaves_nothing_else(tmp_path):
@@ -75,7 +83,9 @@ def test_download_unpacks_only_its_folder_once_and_leaves_nothing_else(tmp_path)
         assert download(server.archive(), tmp_path / "data") == tmp_path / "data/Shapes"
         download(server.archive(), tmp_path / "data")  # there already
         assert server.requests == 1
-    left = sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file())
+    left = sorted(
+        str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()
+    )
     assert left == ["data/Shapes/chair/test/noise.bin", "data/Shapes/chair/train/a.off"]
     assert (tmp_path / "data/Shapes/chair/train/a.off").read_bytes() == MESH
 
@@ -92,7 +102,12 @@ def test_download_unpacks_only_its_folder_once_and_leaves_nothing_else(tmp_path)
         ({"data": zipped({"Other/a.off": MESH})}, None, "holds no folder Shapes"),
     ],
 )
-def test_what_is_not_the_published_file_leaves_nothing(tmp_path, options, published, sentence):
+def test_what_is_not_the_published_file_leaves_nothing(
+    tmp_path,
+    options,
+    published,
+    sentence,
+):
     with (
         Server(**{"data": GOOD} | options) as server,
         pytest.raises(DatasetError, match=sentence) as refusal,
@@ -109,8 +124,12 @@ def test_a_download_that_fails_leaves_no_folder_of_its_own(tmp_path, there):
     for name in there:
         (tmp_path / name).mkdir()
     with Server(GOOD, status=500) as server, pytest.raises(DatasetError, match="500"):
-        download(Archive(server.url, "0" * 64, "Shapes"), tmp_path / "mine" / "data", timeout=5)
-    assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")) == list(
-        there
-    )
+        download(
+            Archive(server.url, "0" * 64, "Shapes"),
+            tmp_path / "mine" / "data",
+            timeout=5,
+        )
+    assert sorted(
+        path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")
+    ) == list(there)
     gc.collect()

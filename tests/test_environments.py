@@ -28,10 +28,18 @@ INPUTS = ("belief", "view", "place", "lem", "azimuth_bin")
 
 
 def learnable(n: int = 12) -> Predictions:
-    azimuth_bins = np.random.default_rng(9).normal(size=(n, 40, 3, 8)).astype(np.float32)
-    calibration, splits = Calibration(1.5, 0.3, bin_correlation=0.2), np.array(["train"] * n)
+    azimuth_bins = (
+        np.random.default_rng(9).normal(size=(n, 40, 3, 8)).astype(np.float32)
+    )
+    calibration, splits = (
+        Calibration(1.5, 0.3, bin_correlation=0.2),
+        np.array(["train"] * n),
+    )
     return replace(
-        some_predictions(n), splits=splits, azimuth_bins=azimuth_bins, calibration=calibration
+        some_predictions(n),
+        splits=splits,
+        azimuth_bins=azimuth_bins,
+        calibration=calibration,
     )
 
 
@@ -60,7 +68,10 @@ def file(tmp_path_factory):
 def test_gymnasium_finds_nothing_wrong(file, options):
     env = gymnasium.make(RECOGNISE, predictions=str(file), **options)
     check_env(env.unwrapped)
-    assert all(env.observation_space.contains(observation) for observation, *_ in played(env, 0))
+    assert all(
+        env.observation_space.contains(observation)
+        for observation, *_ in played(env, 0)
+    )
 
 
 def played(env, seed: int, n: int = 60):
@@ -77,7 +88,8 @@ def played(env, seed: int, n: int = 60):
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"threshold": 0.7, "travel_price": 0.02, "frame": "object", "inputs": INPUTS}]
+    "options",
+    [{}, {"threshold": 0.7, "travel_price": 0.02, "frame": "object", "inputs": INPUTS}],
 )
 def test_the_vectorised_environment_is_many_single_ones(options):
     p, n, rng = learnable(), 7, np.random.default_rng(1)
@@ -103,14 +115,17 @@ def test_the_vectorised_environment_is_many_single_ones(options):
             seen, reward, over, _, alone = singles[row].step(actions[row])
             last = info["final_info"] if over else info
             np.testing.assert_array_equal(
-                seen, info["final_obs"][row] if over else observation[row]
+                seen,
+                info["final_obs"][row] if over else observation[row],
             )
             assert (reward, over) == (rewards[row], ended[row])
             assert all(np.array_equal(alone[name], last[name][row]) for name in alone)
             if over:
                 lengths.add(int(alone["n_views"]))
                 np.testing.assert_array_equal(begin(row), observation[row])
-    assert len(lengths) > 1 or not options  # with a threshold some end earlier than others
+    assert (
+        len(lengths) > 1 or not options
+    )  # with a threshold some end earlier than others
 
 
 def test_an_episode_is_the_loop_of_a_robot():
@@ -126,15 +141,29 @@ def test_an_episode_is_the_loop_of_a_robot():
 
         rng = np.random.default_rng(k)
         expected = run_episodes(
-            observe, p.sphere, policy, np.array([3 * k]), stopping, rng, p.calibration
+            observe,
+            p.sphere,
+            policy,
+            np.array([3 * k]),
+            stopping,
+            rng,
+            p.calibration,
         )
         views = expected.outcome.views[0]
         env = gymnasium.make(
-            RECOGNISE, predictions=p, threshold=0.75, objective="belief", inputs=("belief",)
+            RECOGNISE,
+            predictions=p,
+            threshold=0.75,
+            objective="belief",
+            inputs=("belief",),
         )
         observation, info = env.reset(options={"object": k, "start": int(views[0])})
         total, ended = observation[p.labels[k]], False
-        for step, (here, there) in zip(expected.steps[1:], pairwise(views), strict=False):
+        for step, (here, there) in zip(
+            expected.steps[1:],
+            pairwise(views),
+            strict=False,
+        ):
             action = cells_to(p.sphere)[here, there]
             assert info["action_mask"][action]
             observation, reward, ended, _, info = env.step(action)
@@ -167,7 +196,9 @@ def test_meshes_are_rendered_as_the_agent_goes(tmp_path):
     camera = simulated(sample_mesh(next(iter(SAMPLE_MESHES))))
     session: Session = system.session(start=3)
     np.testing.assert_allclose(
-        observation[:10], session.update(camera.observe(session.pose)).belief, atol=1e-5
+        observation[:10],
+        session.update(camera.observe(session.pose)).belief,
+        atol=1e-5,
     )
     with pytest.raises(DatasetError, match="no such folder"):
         gymnasium.make("nextview/RecogniseMesh-v0", meshes=str(tmp_path / "none"))
@@ -181,7 +212,8 @@ def test_the_page_does_what_it_says(tmp_path, monkeypatch):
     learnable().save(tmp_path / "validation.npz")
     monkeypatch.chdir(tmp_path)
     failed, tried = doctest.testfile(
-        str(Path(__file__).parents[1] / "docs/environments.md"), module_relative=False
+        str(Path(__file__).parents[1] / "docs/environments.md"),
+        module_relative=False,
     )
     assert tried > 12
     assert failed == 0

@@ -29,24 +29,41 @@ class Table:
     lem: np.ndarray
 
     @classmethod
-    def random(cls, objects: int, sphere: ViewSphere = SPHERE, seed: int = 0) -> "Table":
+    def random(
+        cls,
+        objects: int,
+        sphere: ViewSphere = SPHERE,
+        seed: int = 0,
+    ) -> "Table":
         rng = np.random.default_rng(seed)
         logits = rng.normal(size=(objects, len(sphere), CLASSES)) * 1.5
         logits[np.arange(objects), :, rng.integers(0, CLASSES, objects)] += 1
         return cls(logits, rng.random((objects, len(sphere), sphere.rings, 3)))
 
     def observe(self, episodes: np.ndarray, views: np.ndarray) -> Evidence:
-        return Evidence(self.logits[episodes, views], {"lem": self.lem[episodes, views]})
+        return Evidence(
+            self.logits[episodes, views],
+            {"lem": self.lem[episodes, views]},
+        )
 
 
 def walk(
-    table: Table, policy, episode: int, start: int, stopping: Stopping, calibration, sphere=SPHERE
+    table: Table,
+    policy,
+    episode: int,
+    start: int,
+    stopping: Stopping,
+    calibration,
+    sphere=SPHERE,
 ):
     """One episode as one would write it for one object: views, beliefs."""
     views, beliefs = [start], []
     while True:
         beliefs.append(
-            softmax(table.logits[episode, views].sum(0) / calibration.temperature_after(len(views)))
+            softmax(
+                table.logits[episode, views].sum(0)
+                / calibration.temperature_after(len(views))
+            )
         )
         if beliefs[-1].max() >= stopping.threshold or len(views) in (
             stopping.max_views,
@@ -58,14 +75,33 @@ def walk(
         here = np.array([views[-1]])
         evidence = table.observe(np.array([episode]), here)
         state = EpisodeState(
-            here, visited, beliefs[-1][None], evidence, len(views), np.array([episode])
+            here,
+            visited,
+            beliefs[-1][None],
+            evidence,
+            len(views),
+            np.array([episode]),
         )
         views.append(int(policy.next_views(state, np.random.default_rng(0))[0]))
 
 
-def run(table, policy, starts, stopping, sphere=SPHERE, seed=0, calibration=PLAIN_SUM) -> Episodes:
+def run(
+    table,
+    policy,
+    starts,
+    stopping,
+    sphere=SPHERE,
+    seed=0,
+    calibration=PLAIN_SUM,
+) -> Episodes:
     return run_episodes(
-        table.observe, sphere, policy, starts, stopping, np.random.default_rng(seed), calibration
+        table.observe,
+        sphere,
+        policy,
+        starts,
+        stopping,
+        np.random.default_rng(seed),
+        calibration,
     )
 
 
@@ -84,7 +120,11 @@ def run(table, policy, starts, stopping, sphere=SPHERE, seed=0, calibration=PLAI
     st.sampled_from([PLAIN_SUM, Calibration(0.7, 0.4)]),
 )
 def test_many_episodes_at_once_are_each_episode_alone(
-    seed, threshold, max_views, policy, calibration
+    seed,
+    threshold,
+    max_views,
+    policy,
+    calibration,
 ):
     table, stopping = Table.random(20, seed=seed), Stopping(threshold, max_views)
     starts = np.random.default_rng(seed).integers(0, 40, 20)
@@ -99,8 +139,14 @@ def test_many_episodes_at_once_are_each_episode_alone(
         assert end.confidence[e] == pytest.approx(beliefs[-1].max(), abs=1e-12)
         assert end.confident[e] == (beliefs[-1].max() >= threshold)
         legs = list(pairwise(views))
-        assert end.travel[e] == pytest.approx(sum(SPHERE.travel[leg] for leg in legs), abs=1e-12)
-        assert end.arc[e] == pytest.approx(sum(SPHERE.arc[leg] for leg in legs), abs=1e-12)
+        assert end.travel[e] == pytest.approx(
+            sum(SPHERE.travel[leg] for leg in legs),
+            abs=1e-12,
+        )
+        assert end.arc[e] == pytest.approx(
+            sum(SPHERE.arc[leg] for leg in legs),
+            abs=1e-12,
+        )
 
 
 class Turning:
@@ -124,12 +170,25 @@ def test_the_belief_in_the_side_is_that_of_an_object_that_stands_still():
     log_evidence = np.random.default_rng(1).normal(size=(20, len(SPHERE), CLASSES, 8))
 
     def observe(episodes, views):
-        return replace(table.observe(episodes, views), azimuth_bins=log_evidence[episodes, views])
+        return replace(
+            table.observe(episodes, views),
+            azimuth_bins=log_evidence[episodes, views],
+        )
 
     starts = np.random.default_rng(2).integers(0, 40, 20)
     rng = np.random.default_rng(0)
-    done = run_episodes(observe, SPHERE, policy, starts, Stopping(0.995, 6), rng, calibration)
-    assert len({len(episodes) for episodes, _, _ in policy.features}) > 1  # some end earlier
+    done = run_episodes(
+        observe,
+        SPHERE,
+        policy,
+        starts,
+        Stopping(0.995, 6),
+        rng,
+        calibration,
+    )
+    assert (
+        len({len(episodes) for episodes, _, _ in policy.features}) > 1
+    )  # some end earlier
     for n_views, (episodes, current, azimuth_bins) in enumerate(policy.features, 1):
         for e, now, found in zip(episodes, current, azimuth_bins, strict=True):
             at = done.outcome.views[e, :n_views]
@@ -139,7 +198,10 @@ def test_the_belief_in_the_side_is_that_of_an_object_that_stands_still():
             for view in at:
                 for side in range(8):
                     zero[:, (SPHERE.azimuth_index[view] - side) % 8] += log_evidence[
-                        e, view, :, side
+                        e,
+                        view,
+                        :,
+                        side,
                     ]
             expected = softmax(zero / (1 + 0.4 * (n_views - 1)), axis=1)
             seen = expected[:, (SPHERE.azimuth_index[now] - np.arange(8)) % 8]
@@ -194,7 +256,13 @@ def test_a_look_that_fails_is_not_taken_in():
             return (state.current + 1) % 40
 
     policy, sphere = Moody(), ViewSphere.named("40")
-    episodes = Episodes(sphere, policy, np.array([3]), Stopping(1.0, 3), np.random.default_rng(0))
+    episodes = Episodes(
+        sphere,
+        policy,
+        np.array([3]),
+        Stopping(1.0, 3),
+        np.random.default_rng(0),
+    )
     observation = Evidence(np.array([[1.0, 0.0]]))
     with pytest.raises(PolicyError, match="not now"):
         episodes.update(observation)

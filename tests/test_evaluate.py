@@ -12,7 +12,11 @@ from scipy.special import softmax
 from scipy.stats import bootstrap
 
 from nextview.benchmark.evaluation import evaluate, fused_views
-from nextview.benchmark.published import published_map, published_recognisers, read_table
+from nextview.benchmark.published import (
+    published_map,
+    published_recognisers,
+    read_table,
+)
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.belief import Calibration
 
@@ -22,10 +26,16 @@ TEN = tuple(read_table("table8_accuracy_per_class_modelnet10"))
 def test_published_scores_stand_only_beside_what_they_were_published_for():
     assert published_recognisers(TEN, 40)[0] == ("ResNet34", 32, 0.871)
     assert published_recognisers(TEN[::-1], 12) == [("ResNet18", 32, 0.8901)]
-    assert published_recognisers(TEN, 7) == published_recognisers(("cat", "dog"), 40) == []
+    assert (
+        published_recognisers(TEN, 7) == published_recognisers(("cat", "dog"), 40) == []
+    )
     assert published_map("lcm", "class_d_le_1", TEN) == 0.2332
     assert published_map("lcm", "d_le_1", TEN, "bed") is None
-    assert published_map("lem", "regret", TEN) is published_map("lem", "d0", ("cat", "dog")) is None
+    assert (
+        published_map("lem", "regret", TEN)
+        is published_map("lem", "d0", ("cat", "dog"))
+        is None
+    )
     assert published_map("gain", "d0", TEN) is None
 
 
@@ -39,7 +49,8 @@ def by_hand():
     """
     sure, unsure = np.log([9, 1]), np.log([2, 3])  # beliefs 0.9 for a, 0.6 for b
     logits = np.array(
-        [[sure] * 3, [sure, unsure, unsure], [sure, sure, unsure], [sure] * 3], np.float32
+        [[sure] * 3, [sure, unsure, unsure], [sure, sure, unsure], [sure] * 3],
+        np.float32,
     )
     maps = np.zeros((4, 3, 1, 3), np.float32)
     maps[..., 2] = 1
@@ -85,11 +96,17 @@ def test_what_is_right_without_knowing_the_size_stands_beside():
     p = by_hand()
     of_size = np.where(np.eye(2)[p.labels] > 0, 0, -99).astype(np.float32)
     sized = replace(p, logits=p.logits + of_size[:, None], of_size=of_size)
-    known, shape = (evaluate(x, 50, np.random.default_rng(0)).accuracy for x in (sized, p))
-    for row in shape.query("measure == 'accuracy' or measure == 'class_accuracy'").itertuples():
+    known, shape = (
+        evaluate(x, 50, np.random.default_rng(0)).accuracy for x in (sized, p)
+    )
+    for row in shape.query(
+        "measure == 'accuracy' or measure == 'class_accuracy'"
+    ).itertuples():
         before = row.measure.removesuffix("accuracy")
         here = {"n_views": row.n_views, "label": row.label}
-        assert score(known, **here, measure=f"{before}shape_accuracy").value == row.value
+        assert (
+            score(known, **here, measure=f"{before}shape_accuracy").value == row.value
+        )
         assert score(known, **here, measure=row.measure).value == 1
     assert "shape_accuracy" not in set(shape["measure"])
 
@@ -97,7 +114,8 @@ def test_what_is_right_without_knowing_the_size_stands_beside():
 def test_confusion_and_calibration_by_hand():
     found = evaluate(by_hand(), 10, np.random.default_rng(0))
     answers = {
-        (row.n_views, row.label, row.answer): row.answers for row in found.confusion.itertuples()
+        (row.n_views, row.label, row.answer): row.answers
+        for row in found.confusion.itertuples()
     }
     assert answers == {
         (1, "a", "a"): 6,
@@ -112,7 +130,9 @@ def test_confusion_and_calibration_by_hand():
     # one view: 9 answers at 0.9, of which 6 are right; 3 at 0.6, none of them right
     rows = found.reliability[found.reliability["n_views"] == 1]
     np.testing.assert_allclose(
-        rows[["confidence", "accuracy", "answers"]], [[0.6, 0, 3], [0.9, 6 / 9, 9]], rtol=1e-6
+        rows[["confidence", "accuracy", "answers"]],
+        [[0.6, 0, 3], [0.9, 6 / 9, 9]],
+        rtol=1e-6,
     )
     error = (9 * abs(0.9 - 6 / 9) + 3 * 0.6) / 12
     assert score(found.fusion, n_views=1).calibration_error == pytest.approx(error)
@@ -124,7 +144,9 @@ def test_fusing_random_views_against_every_combination():
     right, confidence = fused_views(logits, labels, Calibration(1.5, 0.4), rng, 4)
     for k, temperature in ((1, 1.5), (2, 1.5 * 1.4), (3, 1.5 * 1.8)):
         # of three views, the rotations of any order hold every pair once
-        sums = np.stack([logits[:, list(views)].sum(1) for views in combinations(range(3), k)])
+        sums = np.stack(
+            [logits[:, list(views)].sum(1) for views in combinations(range(3), k)]
+        )
         assert right[k - 1].mean() == pytest.approx((sums.argmax(2) == labels).mean())
         belief = softmax(sums / temperature, axis=2)
         assert confidence[k - 1].mean() == pytest.approx(belief.max(2).mean())
@@ -137,23 +159,40 @@ def test_intervals_are_scipys():
     error = ((p.maps["lem"] - true_windows(p)) ** 2).mean((1, 2, 3))
     for row, values in (
         (score(found.accuracy, n_views=1, label="", measure="accuracy"), single),
-        (score(found.accuracy, n_views=1, label="box", measure="accuracy"), single[p.labels == 1]),
+        (
+            score(found.accuracy, n_views=1, label="box", measure="accuracy"),
+            single[p.labels == 1],
+        ),
         (score(found.maps, by="network", label="", measure="mse"), error),
     ):
         theirs = bootstrap(
-            (values,), np.mean, n_resamples=4000, method="percentile", rng=1
+            (values,),
+            np.mean,
+            n_resamples=4000,
+            method="percentile",
+            rng=1,
         ).confidence_interval
         assert row.value == pytest.approx(values.mean())
-        assert (row.low, row.high) == pytest.approx(theirs, abs=0.1 * (theirs.high - theirs.low))
+        assert (row.low, row.high) == pytest.approx(
+            theirs,
+            abs=0.1 * (theirs.high - theirs.low),
+        )
 
 
 def true_windows(p):
     """The true LEM's windows, cell by cell."""
     values = p.depth_entropy.astype(float)
-    values = (values - values.min(1, keepdims=True)) / np.ptp(values, axis=1, keepdims=True)
+    values = (values - values.min(1, keepdims=True)) / np.ptp(
+        values,
+        axis=1,
+        keepdims=True,
+    )
     windows = np.empty((len(p), 40, 5, 3))
     for view, ring, column in np.ndindex(40, 5, 3):
-        windows[:, view, ring, column] = values[:, 8 * ring + (view % 8 + column - 1) % 8]
+        windows[:, view, ring, column] = values[
+            :,
+            8 * ring + (view % 8 + column - 1) % 8,
+        ]
     return windows
 
 
@@ -176,7 +215,13 @@ def test_map_scores_by_hand():
     assert near == pytest.approx({"d_le_1": 2 / 3, "d_lt_2": 2 / 3})
     # All objects have the same true map, so the class's mean at the view is the truth; the mean map
     # is 4/9 everywhere.
-    of_class = score(found.maps, map="lem", by="mean map of the class", label="", measure="mse")
+    of_class = score(
+        found.maps,
+        map="lem",
+        by="mean map of the class",
+        label="",
+        measure="mse",
+    )
     assert of_class.value == pytest.approx(0, abs=1e-12)
     mean = score(found.maps, map="lem", by="mean map", label="", measure="mse")
     assert mean.value == pytest.approx(((4 / 9) ** 2 + (1 / 9) ** 2 + (5 / 9) ** 2) / 3)
@@ -184,10 +229,14 @@ def test_map_scores_by_hand():
 
 def test_lcm_leaves_out_what_is_never_recognised():
     found = evaluate(by_hand(), 50, np.random.default_rng(0))
-    assert found.left_out == {"lcm": "without the objects that are recognised from no view: 1 of 4"}
+    assert found.left_out == {
+        "lcm": "without the objects that are recognised from no view: 1 of 4"
+    }
     lcm = found.maps[found.maps["map"] == "lcm"]
     assert set(lcm["label"]) == {"", "a"}
     # confidences 0.9 where right: (.9, .9, .9), (.9, 0, 0), (.9, .9, 0); each cell stands in every
     # column once
     off = [1.63] * 3 + [0.81 + 1] * 2 + [0.01] + [1.62 + 1, 0.81 + 0.01, 0.81 + 0.01]
-    assert score(lcm, by="network", label="", measure="mse").value == pytest.approx(sum(off) / 27)
+    assert score(lcm, by="network", label="", measure="mse").value == pytest.approx(
+        sum(off) / 27
+    )

@@ -40,7 +40,10 @@ def table(folder, name):
 def test_the_folder_holds_tables_settings_and_a_page(made):
     files = {*(f"{name}.csv" for name in TABLES), "evaluate.json", "evaluate.html"}
     assert {path.name for path in (made / "out").iterdir()} == files
-    assert json.loads((made / "out" / "evaluate.json").read_text())["settings"]["objects"] == 30
+    assert (
+        json.loads((made / "out" / "evaluate.json").read_text())["settings"]["objects"]
+        == 30
+    )
     assert all(len(table(made, name)) > 1 for name in TABLES)
     assert (made / "out" / "evaluate.html").read_text().count("data:image/svg+xml") == 4
     assert sorted(path.name for path in made.iterdir() if "part" in path.name) == []
@@ -53,7 +56,8 @@ def test_the_page_shows_the_numbers_of_the_tables(made):
         for row in table(made, "accuracy")
     }
     cells = re.findall(
-        r"<td>([\d.]+)", re.search(r'<tr><th scope="row">pillar</th>.*?</tr>', text)[0]
+        r"<td>([\d.]+)",
+        re.search(r'<tr><th scope="row">pillar</th>.*?</tr>', text)[0],
     )
     shown = [
         (n_views, "pillar", measure)
@@ -67,7 +71,10 @@ def test_the_page_shows_the_numbers_of_the_tables(made):
         if (row["map"], row["label"]) == ("lem", "box")
     )
     section = text[text.index('id="lem"') : text.index('id="lcm"')]
-    assert f"<td>{mse:.4f}" in re.search(r'<tr><th scope="row">box</th>.*?</tr>', section)[0]
+    assert (
+        f"<td>{mse:.4f}"
+        in re.search(r'<tr><th scope="row">box</th>.*?</tr>', section)[0]
+    )
 
 
 def test_predictions_that_name_no_model_are_judged_alike(made, tmp_path, capsys):
@@ -80,7 +87,10 @@ def test_predictions_that_name_no_model_are_judged_alike(made, tmp_path, capsys)
 
 
 def test_a_card_that_changed_while_it_was_judged_keeps_the_change(
-    predictions, models, tmp_path, monkeypatch
+    predictions,
+    models,
+    tmp_path,
+    monkeypatch,
 ):
     for path in models.iterdir():
         shutil.copy(path, tmp_path)
@@ -92,26 +102,42 @@ def test_a_card_that_changed_while_it_was_judged_keeps_the_change(
         return judge(*given)
 
     monkeypatch.setattr(evaluation_page, "evaluate", slowly)
-    settings = evaluation_page.EvaluationSettings("test", cards=(str(card),), samples=10)
+    settings = evaluation_page.EvaluationSettings(
+        "test",
+        cards=(str(card),),
+        samples=10,
+    )
     evaluation_page.write_evaluation(predictions, tmp_path / "out", settings)
     after = read_card(card)
     assert (after.note, list(after.scores)) == ("changed", ["test (6 objects)"])
 
 
-def test_scores_are_noted_on_the_cards_of_the_models_that_made_the_predictions(tmp_path, capsys):
+def test_scores_are_noted_on_the_cards_of_the_models_that_made_the_predictions(
+    tmp_path,
+    capsys,
+):
     p = some_predictions(30, seed=1)
     for kind, name in (("recogniser", "net"), ("lem", "map"), ("lem", "other")):
         (tmp_path / f"{name}.onnx").write_bytes(name.encode())
         weights = tmp_path / f"{name}.onnx"
         classes = ("a", "b", "c") if kind == "recogniser" else ()
         card = ModelCard(
-            name, kind, InputSpec("geometry", 16), sha256_of(weights), weights, classes=classes
+            name,
+            kind,
+            InputSpec("geometry", 16),
+            sha256_of(weights),
+            weights,
+            classes=classes,
         )
         write_card(
-            tmp_path / f"{name}.json", msgspec.structs.replace(card, scores={"validation": 1})
+            tmp_path / f"{name}.json",
+            msgspec.structs.replace(card, scores={"validation": 1}),
         )
     models = {"recogniser": "net", "lem": "map"}
-    models = {kind: (name, sha256_of(tmp_path / f"{name}.onnx")) for kind, name in models.items()}
+    models = {
+        kind: (name, sha256_of(tmp_path / f"{name}.onnx"))
+        for kind, name in models.items()
+    }
     replace(p, models=models, splits=np.full(30, "test")).save(tmp_path / "p.npz")
     cards = [str(tmp_path / "net.json"), str(tmp_path / "map.json")]
     main(
@@ -128,12 +154,16 @@ def test_scores_are_noted_on_the_cards_of_the_models_that_made_the_predictions(t
     net, lem = (json.loads(Path(card).read_text())["scores"] for card in cards)
     right = p.logits.argmax(2) == p.labels[:, None]
     assert net["test (30 objects)"]["single_view"]["instance"] == pytest.approx(
-        right.mean(), abs=1e-4
+        right.mean(),
+        abs=1e-4,
     )
     assert net["validation"] == 1
     assert lem["test (30 objects)"].keys() >= {"mse", "regret"}
     sized = replace(
-        p, models=models, splits=np.full(30, "test"), of_size=np.zeros((30, 3), np.float32)
+        p,
+        models=models,
+        splits=np.full(30, "test"),
+        of_size=np.zeros((30, 3), np.float32),
     )
     sized.save(tmp_path / "sized.npz")
     main(
@@ -154,8 +184,16 @@ def test_scores_are_noted_on_the_cards_of_the_models_that_made_the_predictions(t
         == net["test (30 objects)"]
     )
     assert capsys.readouterr().out.count("size not known") == 1
-    assert "size of the objects not known" in (tmp_path / "s" / "evaluate.html").read_text()
+    assert (
+        "size of the objects not known"
+        in (tmp_path / "s" / "evaluate.html").read_text()
+    )
     said = refused(
-        capsys, "evaluate", tmp_path / "p.npz", tmp_path / "x", "--cards", tmp_path / "other.json"
+        capsys,
+        "evaluate",
+        tmp_path / "p.npz",
+        tmp_path / "x",
+        "--cards",
+        tmp_path / "other.json",
     )
     assert "not made by model other" in said

@@ -9,7 +9,12 @@ import trimesh
 from nextview.errors import PolicyError, UsageError
 from nextview.geometry.mesh import Mesh, make_mesh
 from nextview.geometry.observation import SceneView
-from nextview.geometry.viewsphere import ViewSphere, angle_between, look_at_origin, rotation_z
+from nextview.geometry.viewsphere import (
+    ViewSphere,
+    angle_between,
+    look_at_origin,
+    rotation_z,
+)
 from nextview.policies.base import EpisodeState
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.recognition.evidence import Evidence
@@ -46,7 +51,9 @@ def box_mesh(*boxes) -> Mesh:
 
 
 def surfaces_of(*meshes: Mesh) -> SurfaceCaster:
-    return SurfaceCaster([Surface.from_mesh(mesh, str(k)) for k, mesh in enumerate(meshes)])
+    return SurfaceCaster(
+        [Surface.from_mesh(mesh, str(k)) for k, mesh in enumerate(meshes)]
+    )
 
 
 def hypotheses_of(things, belief, yaws=None) -> Hypotheses:
@@ -92,7 +99,9 @@ def test_a_small_motion_that_registration_takes_away_tells_nothing():
     found = expected_views(caster, hypotheses, cameras(), SENSOR)
     assert found.information().max() < 0.2
     hypotheses.poses[1, :3, 3] = (0.03, 0.0, 0.0)
-    assert expected_views(caster, hypotheses, cameras(), SENSOR).information().max() > 0.4
+    assert (
+        expected_views(caster, hypotheses, cameras(), SENSOR).information().max() > 0.4
+    )
 
 
 def wall(distance: float) -> np.ndarray:
@@ -116,7 +125,11 @@ def test_the_order_of_the_hypotheses_does_not_matter():
     forth = knob_or_not((0.3, 0.7), (0, 1))
     back = knob_or_not((0.3, 0.7), (1, 0))
     np.testing.assert_allclose(forth.information(), back.information(), atol=1e-6)
-    np.testing.assert_allclose(forth.divergence[:, 0, 1], back.divergence[:, 1, 0], atol=1e-5)
+    np.testing.assert_allclose(
+        forth.divergence[:, 0, 1],
+        back.divergence[:, 1, 0],
+        atol=1e-5,
+    )
     np.testing.assert_allclose(forth.divergence, forth.divergence.swapaxes(1, 2))
 
 
@@ -125,7 +138,13 @@ def expected(divergence, belief, things) -> ExpectedViews:
     divergence = np.asarray(divergence, float)
     hypotheses = hypotheses_of(things, belief)
     some = np.ones(len(divergence))
-    return ExpectedViews(hypotheses, divergence, np.zeros_like(divergence), some, 0 * some)
+    return ExpectedViews(
+        hypotheses,
+        divergence,
+        np.zeros_like(divergence),
+        some,
+        0 * some,
+    )
 
 
 @pytest.mark.parametrize("belief", [(0.5, 0.5), (0.9, 0.1)])
@@ -187,7 +206,15 @@ def test_what_is_expected_is_what_the_verifier_says(shown, side):
     sensor = ExpectedSensor(view.pitch, SENSOR.noise)
     floor = SeenSurroundings(np.zeros((0, 3)), -0.05, 10.0)
     plain = EvidenceWeights(geometry=1.0, correlation=0.0)
-    expected_ratio = expected_views(caster, hypotheses, pose[None], sensor, floor, 1, plain)
+    expected_ratio = expected_views(
+        caster,
+        hypotheses,
+        pose[None],
+        sensor,
+        floor,
+        1,
+        plain,
+    )
     divergence = expected_ratio.divergence[0, 0, 1]
     if side == 0.0:
         assert ratio > 0.15
@@ -212,7 +239,13 @@ def outlook_of(belief, taken=1) -> Outlook:
     )
 
 
-def settled(belief, visited, reachable=None, travel=None, **policy) -> tuple[int, np.ndarray]:
+def settled(
+    belief,
+    visited,
+    reachable=None,
+    travel=None,
+    **policy,
+) -> tuple[int, np.ndarray]:
     """Where the policy goes from some views, a box or the same with a knob, and its values."""
     been = np.isin(np.arange(len(SPHERE)), visited)[None]
     state = EpisodeState(
@@ -257,7 +290,12 @@ def test_among_views_that_are_worth_the_same_the_nearer_one_is_taken(near, monke
 def test_where_nothing_is_left_to_tell_the_belief_is_tested_from_afar():
     chosen, _ = settled((1.0, 0.0), [0])
     assert SPHERE.arc[0, chosen] == SPHERE.arc[0].max()
-    _, values = settled((0.5, 0.5), [4], travel=np.full((1, 40), 3.0), travel_weight=0.1)
+    _, values = settled(
+        (0.5, 0.5),
+        [4],
+        travel=np.full((1, 40), 3.0),
+        travel_weight=0.1,
+    )
     _, free = settled((0.5, 0.5), [4], travel=np.full((1, 40), 3.0))
     np.testing.assert_allclose(values[0], free[0] - 0.3)
 
@@ -279,19 +317,28 @@ def test_a_policy_without_known_geometry_says_so():
 def test_what_is_known_of_a_scene_comes_from_the_views_and_the_verifier():
     meshes = [box_mesh(BODY), box_mesh(BODY, HANDLE)]
     verifier = Verifier(
-        [Surface.from_mesh(m, str(k)) for k, m in enumerate(meshes)], [0, 1], [np.eye(3)] * 2
+        [Surface.from_mesh(m, str(k)) for k, m in enumerate(meshes)],
+        [0, 1],
+        [np.eye(3)] * 2,
     )
     sensor = replace(SENSORS["none"], radius=meshes[1].metres, distance=AWAY)
     block = trimesh.creation.box((0.2, 1.0, 1.5))
     block.apply_translation((1.8, 0.0, 0.0))  # object radii
-    obstacle = Mesh(np.asarray(block.vertices), block.faces.astype(np.int32), np.zeros(3), 1.0)
+    obstacle = Mesh(
+        np.asarray(block.vertices),
+        block.faces.astype(np.int32),
+        np.zeros(3),
+        1.0,
+    )
     camera = SensedCamera(meshes[1], sensor, np.random.default_rng(0), around=obstacle)
     observations = [camera.observe(SPHERE.poses[view]) for view in (12, 18)]
     found = verifier(observations, np.full((2, 16), 1 / 32))
     outlook = Outlook.of(verifier, found, observations)
     assert outlook.taken == 2
     assert outlook.distance == pytest.approx(AWAY, rel=1e-3)
-    assert outlook.sensor.pitch == pytest.approx(1 / observations[0].scene.intrinsics[0, 0])
+    assert outlook.sensor.pitch == pytest.approx(
+        1 / observations[0].scene.intrinsics[0, 0]
+    )
     assert outlook.hypotheses.belief.sum() == pytest.approx(1)
     around = outlook.surroundings
     metres = meshes[1].metres
@@ -317,7 +364,9 @@ def test_nothing_can_be_foreseen_without_geometry():
 
 def test_poses_of_a_robot_are_ranked():
     outlook = outlook_of((0.5, 0.5))
-    behind, aside, ahead = (look_at_origin(0.3, azimuth, AWAY) for azimuth in (3.1, 1.5, 0.1))
+    behind, aside, ahead = (
+        look_at_origin(0.3, azimuth, AWAY) for azimuth in (3.1, 1.5, 0.1)
+    )
     inside = np.stack([behind, aside, ahead])
     ranked = rank_views(outlook, inside, 1.0, inside, np.array([7, 8, 9]), "thing")
     assert ranked[0].index == 9
@@ -360,7 +409,9 @@ def test_words_name_the_rivals_and_how_much_is_settled():
     best = int(found.information().argmax())
     worst = int(found.information().argmin())
     names = ("box", "knob")
-    assert found.words(best, names).startswith("would settle box or knob: they differ in ")
+    assert found.words(best, names).startswith(
+        "would settle box or knob: they differ in "
+    )
     assert found.words(worst, names).startswith("would tell little of box or knob")
     alone = expected(np.zeros((1, 1, 1)), (1.0,), (1,))
     assert alone.words(0, names) == "there is no rival of knob"
@@ -372,7 +423,9 @@ def half_a_wall() -> MeasuredDepth:
     pose = look_at_origin(np.zeros(1), np.full(1, np.pi))[0]
     pose[:3, 3] *= AWAY / np.linalg.norm(pose[:3, 3])
     x, y = np.meshgrid(np.arange(64) + 0.5, np.arange(64) + 0.5)
-    rays = np.stack([(x - 32) / 60, (y - 32) / 60, np.ones_like(x)], -1) @ pose[:3, :3].T
+    rays = (
+        np.stack([(x - 32) / 60, (y - 32) / 60, np.ones_like(x)], -1) @ pose[:3, :3].T
+    )
     depth = np.where(rays[..., 1] > 0, 0.35, 5.0).astype(np.float32)
     return MeasuredDepth(depth, pose, np.array([[60.0, 0, 32], [0, 60, 32], [0, 0, 1]]))
 
@@ -436,7 +489,14 @@ def test_the_pose_becomes_sharper_from_where_more_is_told():
     surfaces = surfaces_of(box_mesh(BODY, HANDLE))
     hypotheses = hypotheses_of((0,), (1.0,))
     wall_around = SeenSurroundings(wall(0.14))
-    found = expected_views(surfaces, hypotheses, cameras(), SENSOR, wall_around, covariance=loose)
+    found = expected_views(
+        surfaces,
+        hypotheses,
+        cameras(),
+        SENSOR,
+        wall_around,
+        covariance=loose,
+    )
     hidden = found.found < 1e-6
     towards = SPHERE.directions[:, 0]
     assert hidden[(towards > 0.6) & (SPHERE.elevation < 0.4)].all()

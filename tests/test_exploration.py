@@ -26,7 +26,10 @@ def chair():
 @pytest.mark.parametrize("start", [3, 22])
 def test_a_policy_walks_as_it_does_in_an_episode(policy, start):
     options = {"threshold": 0.9995, "max_views": 4, "threads": 1}
-    episode = nextview.load(policy=policy, **options).recognise(sample_mesh("monitor"), start=start)
+    episode = nextview.load(policy=policy, **options).recognise(
+        sample_mesh("monitor"),
+        start=start,
+    )
     monitor = [shown for shown in shown_objects() if shown.name == "monitor"]
     exploration = Exploration(monitor, (policy,), start=start, **options)
     walk = exploration.walks[0]
@@ -36,7 +39,10 @@ def test_a_policy_walks_as_it_does_in_an_episode(policy, start):
     assert walk.visited == [view.index for view in episode.views]
     for seen, expected in zip(walk.views, episode.views, strict=True):
         np.testing.assert_array_equal(seen.belief, expected.belief)
-        np.testing.assert_array_equal(seen.observation.depth, expected.observation.depth)
+        np.testing.assert_array_equal(
+            seen.observation.depth,
+            expected.observation.depth,
+        )
 
 
 def test_a_view_by_hand_counts_from_where_it_was_taken(chair):
@@ -44,7 +50,10 @@ def test_a_view_by_hand_counts_from_where_it_was_taken(chair):
     walk.look(5)
     view = walk.look(chair.pose_towards(np.array([2.0, -1.0, 1.5])))
     assert walk.visited[0] == 5
-    np.testing.assert_allclose(view.direction, np.array([2.0, -1.0, 1.5]) / np.sqrt(7.25))
+    np.testing.assert_allclose(
+        view.direction,
+        np.array([2.0, -1.0, 1.5]) / np.sqrt(7.25),
+    )
     assert view.travel == pytest.approx(
         float(walk.sphere.travel_between(walk.sphere.directions[5], view.direction))
     )
@@ -53,14 +62,18 @@ def test_a_view_by_hand_counts_from_where_it_was_taken(chair):
 
 @pytest.mark.parametrize("place", [(0.3, 0.2, 4), (-5, 1, -2), (0, 0, 0), (0, 0, 1)])
 def test_a_camera_that_is_dragged_looks_at_the_object_level_and_from_the_usual_distance(
-    chair, place
+    chair,
+    place,
 ):
     pose = chair.pose_towards(np.array(place, float))
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(pose[:3, 3] + 3 * pose[:3, 2], 0, atol=1e-12)
     assert pose[2, 0] == pytest.approx(0)  # x, right, is level
     if any(place):
-        assert angle_between(pose[:3, 3] / 3, np.array(place) / np.linalg.norm(place)) < 1e-7
+        assert (
+            angle_between(pose[:3, 3] / 3, np.array(place) / np.linalg.norm(place))
+            < 1e-7
+        )
 
 
 def test_another_policy_takes_over_the_views(chair):
@@ -90,13 +103,19 @@ def test_objects_of_files_and_folders(tmp_path):
     assert one.open().faces.shape == sample_mesh("chair").faces.shape
     for label, split in (("chair", "train"), ("table", "test")):
         (tmp_path / label / split).mkdir(parents=True)
-        shutil.copy(SAMPLES / f"{label}.off", tmp_path / label / split / f"{label}_1.off")
+        shutil.copy(
+            SAMPLES / f"{label}.off",
+            tmp_path / label / split / f"{label}_1.off",
+        )
     shown = [(shown.name, shown.label) for shown in shown_objects(tmp_path)]
     assert shown == [("chair_1", "chair"), ("table_1", "table")]
     shutil.copy(SAMPLES / "chair.off", tmp_path / "loose.off")
     shown = [(shown.name, shown.label) for shown in shown_objects(tmp_path)]
     assert shown == [("chair_1", "chair"), ("loose", None), ("table_1", "table")]
-    shutil.copy(SAMPLES / "chair.off", tmp_path / "loose.ply")  # another format of the same model
+    shutil.copy(
+        SAMPLES / "chair.off",
+        tmp_path / "loose.ply",
+    )  # another format of the same model
     assert len(shown_objects(tmp_path)) == 3
     (tmp_path / "empty").mkdir()
     with pytest.raises(DatasetError, match="no meshes"):
@@ -120,6 +139,9 @@ def test_the_objects_of_a_store_are_seen_as_they_were_rendered(tmp_path):
     nearby = exploration.walks[0].look(
         exploration.pose_towards(SPHERE.directions[12] + (0, 0, 0.02))
     )
-    np.testing.assert_array_equal(nearby.observation.pose, SPHERE.poses[12])  # its own pose counts
+    np.testing.assert_array_equal(
+        nearby.observation.pose,
+        SPHERE.poses[12],
+    )  # its own pose counts
     with pytest.raises(UsageError, match="seat has only stored views"):
         exploration.use_sensor("kinect")

@@ -50,7 +50,10 @@ def test_what_is_chosen_is_done_and_shown(page):
     page._object.value = "monitor"
     until(lambda: exploration.shown.name == "monitor", "another object")
     page._second.value = NO_ANSWER
-    until(lambda: exploration.policies == ["gain"] and len(page._scenes) == 1, "one policy")
+    until(
+        lambda: exploration.policies == ["gain"] and len(page._scenes) == 1,
+        "one policy",
+    )
     page._sensor.value = "kinect"
     until(lambda: exploration.sensor == "kinect:1", "a sensor")
     page._strength.value = 2.0
@@ -59,12 +62,17 @@ def test_what_is_chosen_is_done_and_shown(page):
     assert "<img" in page._preview.content
     assert not exploration.walks[0].views
     page._drag(0, np.array([1.0, -2.0, 1.0]), True)
-    until(lambda: len(exploration.walks[0].views) == 1, "a view from where the camera was let go")
+    until(
+        lambda: len(exploration.walks[0].views) == 1,
+        "a view from where the camera was let go",
+    )
     assert not page._preview.visible
 
 
 def test_a_name_means_nothing_in_the_page_and_a_sensor_may_be_any():
-    shown = ShownObject("<img src=x>", lambda: sample_mesh("chair"), "<img src=x onerror=alert(1)>")
+    shown = ShownObject(
+        "<img src=x>", lambda: sample_mesh("chair"), "<img src=x onerror=alert(1)>"
+    )
     page = Page(Exploration([shown], sensor="mix:0.5", threads=1), port=8790)
     try:
         assert (page._sensor.value, page._strength.value) == ("mix", 0.5)
@@ -94,7 +102,11 @@ def sockets(page, **headers):
         ("{address}", None, True),
         ("localhost:{port}", "http://localhost:{port}", True),
         ("{address}", "http://evil.example", False),
-        ("{address}", "http://127.0.0.1:1", False),  # another server of the same machine
+        (
+            "{address}",
+            "http://127.0.0.1:1",
+            False,
+        ),  # another server of the same machine
         ("{address}", "null", False),
         # a name that points here (DNS rebinding)
         ("evil.example:{port}", "http://evil.example:{port}", False),
@@ -110,7 +122,11 @@ def test_only_pages_of_its_own_may_drive_it(page, host, origin, allowed):
     headers = {"Host": host.format(**names)} | (
         {} if origin is None else {"Origin": origin.format(**names)}
     )
-    upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
+    upgrade = {
+        "Connection": "Upgrade",
+        "Upgrade": "websocket",
+        "Sec-WebSocket-Version": "13",
+    }
     upgrade |= {
         "Sec-WebSocket-Key": 22 * "A" + "==",
         "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}",
@@ -145,7 +161,9 @@ def test_a_policy_that_is_not_listed_is_not_imported(page, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     said = []
     monkeypatch.setattr(
-        viser.ClientHandle, "add_notification", lambda *about, **more: said.append(about[-1])
+        viser.ClientHandle,
+        "add_notification",
+        lambda *about, **more: said.append(about[-1]),
     )
     with sockets(page) as socket:
         socket.send(msgspec.msgpack.encode(CAMERA))  # the first message of a page
@@ -159,7 +177,10 @@ def test_a_policy_that_is_not_listed_is_not_imported(page, tmp_path, monkeypatch
             socket.send(msgspec.msgpack.encode(message))
             until(lambda: said, "the page says so")
             assert f"{sent}" in said.pop()
-            until(lambda: page._policy.value == "gain", "the page goes back to what it was")
+            until(
+                lambda: page._policy.value == "gain",
+                "the page goes back to what it was",
+            )
     assert page.exploration.policies == ["gain"]
     assert not (tmp_path / "imported").exists()
     with pytest.raises(InvalidStatus):

@@ -39,7 +39,9 @@ def imported(tree: ast.AST, in_extras: bool = False):
     """
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.Import):
-            yield from ((alias.name.partition(".")[0], in_extras) for alias in node.names)
+            yield from (
+                (alias.name.partition(".")[0], in_extras) for alias in node.names
+            )
         elif isinstance(node, ast.ImportFrom) and node.level == 0:
             yield node.module.partition(".")[0], in_extras
         elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
@@ -64,23 +66,32 @@ def faults(code: str) -> list[str]:
     """What is wrong with the imports of some code, a phrase each."""
     table = project(".")
     base = names(table["dependencies"])
-    by_extra = {extra: names(asked) for extra, asked in table["optional-dependencies"].items()}
+    by_extra = {
+        extra: names(asked) for extra, asked in table["optional-dependencies"].items()
+    }
     found = []
     for package, in_extras in sorted(set(imported(ast.parse(code)))):
-        if package in sys.stdlib_module_names or package in ("nextview", "nextview_command"):
+        if package in sys.stdlib_module_names or package in (
+            "nextview",
+            "nextview_command",
+        ):
             continue
         distributions = brought_by().get(package, set())
         if distributions & base:
             continue
         extras = [extra for extra, packages in EXTRAS.items() if package in packages]
         if not any(distributions & by_extra[extra] for extra in extras):
-            found.append(f"{package}: neither a dependency nor of an extra in checks.EXTRAS")
+            found.append(
+                f"{package}: neither a dependency nor of an extra in checks.EXTRAS"
+            )
         elif not in_extras:
             found.append(f"{package}: imported outside of extras()")
     return found
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT / "src")))
+@pytest.mark.parametrize(
+    "path", SOURCES, ids=lambda path: str(path.relative_to(ROOT / "src"))
+)
 def test_what_is_imported_is_asked_for(path):
     assert faults(path.read_text(encoding="utf-8")) == []
 
@@ -96,7 +107,10 @@ def test_what_is_imported_is_asked_for(path):
             "class A:\n    def f(self):\n        from faiss import Index",
             ["faiss: imported outside of extras()"],
         ),
-        ("try:\n    import hypothesis\nexcept ImportError:\n    pass", ["hypothesis: neither"]),
+        (
+            "try:\n    import hypothesis\nexcept ImportError:\n    pass",
+            ["hypothesis: neither"],
+        ),
         ("with extras():\n    import pytest", ["pytest: neither"]),
         ("import not_a_package_of_anybody", ["not_a_package_of_anybody: neither"]),
     ],
@@ -104,7 +118,9 @@ def test_what_is_imported_is_asked_for(path):
 def test_a_wrong_import_is_found(code, wrong):
     found = faults(code)
     assert len(found) == len(wrong)
-    assert all(phrase.startswith(begin) for phrase, begin in zip(found, wrong, strict=True))
+    assert all(
+        phrase.startswith(begin) for phrase, begin in zip(found, wrong, strict=True)
+    )
 
 
 @pytest.mark.parametrize("folder", [".", "research"])
@@ -118,7 +134,8 @@ def test_an_extra_brings_what_its_error_speaks_of(folder):
                 texts += [text for own in needed.extras for text in of_nextview[own]]
         try:
             brought = {
-                canonicalize_name(name) for name, _ in asked_for([(text, "") for text in texts])
+                canonicalize_name(name)
+                for name, _ in asked_for([(text, "") for text in texts])
             }
         except PackageNotFoundError:
             continue  # the extra is not installed here
@@ -134,7 +151,11 @@ def base(tmp_path_factory) -> Path:
 
 def in_base(base: Path, code: str, *arguments: str) -> str:
     done = subprocess.run(
-        [str(base), "-c", code, *arguments], cwd=ROOT, env={}, capture_output=True, text=True
+        [str(base), "-c", code, *arguments],
+        cwd=ROOT,
+        env={},
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
@@ -161,7 +182,11 @@ def test_every_module_imports_in_the_base_installation_or_names_its_extra(base):
     assert torch_is_there == "False"
     assert any(line.startswith("nextview.training.export ") for line in missing)
     for line in missing:
-        named = [extra for extra in EXTRAS if line.endswith(f": pip install 'nextview[{extra}]'")]
+        named = [
+            extra
+            for extra in EXTRAS
+            if line.endswith(f": pip install 'nextview[{extra}]'")
+        ]
         assert len(named) == 1, line
 
 
@@ -204,7 +229,10 @@ def runs(base: Path, options: str, scripts: list[str]) -> dict[str, tuple[int, s
     """Exit status and output of scripts, by their names."""
     lines = in_base(base, RUN_EACH, options, *scripts).splitlines()
     ended = {line.split(" ", 2)[0]: line.split(" ", 2)[1:] for line in lines}
-    return {name: (int(status), ast.literal_eval(said)) for name, (status, said) in ended.items()}
+    return {
+        name: (int(status), ast.literal_eval(said))
+        for name, (status, said) in ended.items()
+    }
 
 
 def test_the_help_of_every_script_shows_in_the_base_installation(base):

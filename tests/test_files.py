@@ -43,7 +43,9 @@ def test_a_file_appears_whole_and_replaces_nothing_unless_told(tmp_path):
     assert everything(tmp_path) == {"new/a.txt": "new"}
 
 
-def test_a_folder_is_new_or_empty_and_with_overwrite_only_its_own_files_are_replaced(tmp_path):
+def test_a_folder_is_new_or_empty_and_with_overwrite_only_its_own_files_are_replaced(
+    tmp_path,
+):
     out = tmp_path / "out"
     out.mkdir()
     with files.new_folder(out) as part:
@@ -62,8 +64,15 @@ def test_links_and_places_of_another_kind_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "link").symlink_to(tmp_path / "file")
     os.mkfifo(tmp_path / "pipe")
-    cases = ("link", False, "link"), ("file", True, "is a file"), ("file/x", False, "not a folder")
-    cases += (("pipe", False, "is a pipe or a device"), ("pipe", True, "is a pipe or a device"))
+    cases = (
+        ("link", False, "link"),
+        ("file", True, "is a file"),
+        ("file/x", False, "not a folder"),
+    )
+    cases += (
+        ("pipe", False, "is a pipe or a device"),
+        ("pipe", True, "is a pipe or a device"),
+    )
     for path, folder, words in cases:
         with pytest.raises(ResultsError, match=words):
             files.check_new(tmp_path / path, overwrite=True, folder=folder)
@@ -75,12 +84,16 @@ def test_a_full_disk_is_one_sentence_and_leaves_the_old_file(tmp_path):
     (tmp_path / "a").write_text("old")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     program = (
-        "import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\nfrom pathlib import Path\n"
+        "import signal; signal.signal(signal.SIGXFSZ, "
+        "signal.SIG_IGN)\nfrom pathlib import Path\n"
     )
     program += (
-        "from nextview.files import new_file\nfrom nextview.errors import ResultsError\ntry:\n"
+        "from nextview.files import new_file\nfrom nextview.errors "
+        "import ResultsError\ntry:\n"
     )
-    program += " with new_file(Path('a'), True) as part: part.write_bytes(bytes(10**6))\n"
+    program += (
+        " with new_file(Path('a'), True) as part: part.write_bytes(bytes(10**6))\n"
+    )
     program += "except ResultsError as error: print(error)"
     done = subprocess.run(
         [sys.executable, "-c", program],

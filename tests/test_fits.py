@@ -15,7 +15,13 @@ from nextview import SimulatedCamera
 from nextview.data.predictions import Predictions
 from nextview.data.samples import sample_mesh
 from nextview.data.splits import divide
-from nextview.errors import DatasetError, ModelError, PredictionsError, ResultsError, UsageError
+from nextview.errors import (
+    DatasetError,
+    ModelError,
+    PredictionsError,
+    ResultsError,
+    UsageError,
+)
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.policies.baselines import Random
 from nextview.policies.learned_tables import ClassTable, cells_from, cells_to
@@ -36,18 +42,31 @@ from nextview.training.card_fits import (
 )
 from nextview.training.fitting_set import blind_walks, card_to_fit
 from nextview.training.unknown import fit_novelty, fit_unknown
-from research.fit_policies import fit_class_table, fit_policies, fit_ring, fit_sequence, fitting_set
+from research.fit_policies import (
+    fit_class_table,
+    fit_policies,
+    fit_ring,
+    fit_sequence,
+    fitting_set,
+)
 
 SPHERE = ViewSphere.named("40")
 SMALL = ViewSphere((0.0, 30.0, 60.0), 4)
 
 
-def correlated(n: int, correlation: float, temperature: float, seed: int = 0) -> Predictions:
+def correlated(
+    n: int,
+    correlation: float,
+    temperature: float,
+    seed: int = 0,
+) -> Predictions:
     """Two classes at -1 and +1, seen through Gaussian noise that is shared in part by all views
     of an object.
     """
     rng, spread = np.random.default_rng(seed), 1.5
-    labels = (rng.random(n) < 0.8).astype(np.int64)  # a mix that the even weights have to undo
+    labels = (rng.random(n) < 0.8).astype(
+        np.int64
+    )  # a mix that the even weights have to undo
     shared, own = rng.normal(size=(n, 1)), rng.normal(size=(n, len(SMALL)))
     seen = (
         2.0 * labels[:, None]
@@ -56,12 +75,21 @@ def correlated(n: int, correlation: float, temperature: float, seed: int = 0) ->
     )
     logits = np.stack([-((seen - m) ** 2) / (2 * spread**2) for m in (-1, 1)], -1)
     return train_predictions(
-        (temperature * logits).astype(np.float32), labels, SMALL, ("minus", "plus")
+        (temperature * logits).astype(np.float32),
+        labels,
+        SMALL,
+        ("minus", "plus"),
     )
 
 
-@pytest.mark.parametrize(("correlation", "temperature"), [(0.0, 1.0), (0.4, 0.5), (0.8, 2.0)])
-def test_the_correlation_and_temperature_of_generated_looks_are_found(correlation, temperature):
+@pytest.mark.parametrize(
+    ("correlation", "temperature"),
+    [(0.0, 1.0), (0.4, 0.5), (0.8, 2.0)],
+)
+def test_the_correlation_and_temperature_of_generated_looks_are_found(
+    correlation,
+    temperature,
+):
     data = correlated(4000, correlation, temperature)
     found = fit_temperature(data, np.random.default_rng(1), walks=1)
     assert found.temperature == pytest.approx(temperature, rel=0.08)
@@ -86,11 +114,13 @@ def test_sides_count_as_far_as_looks_are_right_about_them(right):
     true = (SMALL.azimuth_index - zero[:, None]) % s
     wrong = (true + rng.integers(1, s, (n, v))) % s
     claimed[np.arange(n)[:, None], np.arange(v), labels[:, None]] = np.where(
-        rng.random((n, v)) < right, true, wrong
+        rng.random((n, v)) < right,
+        true,
+        wrong,
     )
-    azimuth_bins = np.log(np.where(np.arange(s) == claimed[..., None], 0.8, 0.2 / (s - 1))).astype(
-        np.float32
-    )
+    azimuth_bins = np.log(
+        np.where(np.arange(s) == claimed[..., None], 0.8, 0.2 / (s - 1))
+    ).astype(np.float32)
     logits = rng.normal(size=(n, v, 2)).astype(np.float32) / 100
     data = train_predictions(logits, labels, SMALL, ("a", "b"), azimuth_bins)
     found = fit_temperature(data, np.random.default_rng(1), walks=1)
@@ -99,7 +129,9 @@ def test_sides_count_as_far_as_looks_are_right_about_them(right):
     else:
         assert found.bin_correlation > 0.1
     blind = Calibration(found.temperature, found.correlation)
-    of_found, of_blind = (loss(data, c, np.random.default_rng(2), walks=1) for c in (found, blind))
+    of_found, of_blind = (
+        loss(data, c, np.random.default_rng(2), walks=1) for c in (found, blind)
+    )
     assert of_found < of_blind
 
 
@@ -110,7 +142,9 @@ def test_the_bound_of_single_episodes_is_that_of_clopper_and_pearson():
         failed = np.concatenate([np.ones(wrong), np.zeros(n - wrong), np.zeros(20)])
         order = rng.permutation(n + 20)
         bound = error_bound(failed[order], stopped[order], np.full(n + 20, 0.7), 0.05)
-        exact = binomtest(wrong, n, alternative="less").proportion_ci(0.95, "exact").high
+        exact = (
+            binomtest(wrong, n, alternative="less").proportion_ci(0.95, "exact").high
+        )
         assert bound == pytest.approx(exact, abs=1e-6)
     assert error_bound(np.zeros(5), np.zeros(5), np.ones(5), 0.1) == 1
 
@@ -129,13 +163,23 @@ def test_promises_are_kept_as_often_as_promised():
     def error_at(threshold: float) -> float:
         reached = sure >= threshold
         stopped, first = reached.any(1), reached.argmax(1)
-        return np.average(wrong[np.arange(len(whole)), first][stopped], weights=even[stopped])
+        return np.average(
+            wrong[np.arange(len(whole)), first][stopped],
+            weights=even[stopped],
+        )
 
     promises, broken = 0, 0
     for seed in range(60):
         some = np.random.default_rng([5, seed]).choice(len(whole), 300, replace=False)
         part = whole.of_objects(some)
-        bounds = fit_risk(part, calibration, np.random.default_rng(seed), delta, n_views, walks=1)
+        bounds = fit_risk(
+            part,
+            calibration,
+            np.random.default_rng(seed),
+            delta,
+            n_views,
+            walks=1,
+        )
         # else it promises nothing, and nothing is broken
         if min(bounds.bounds[n_views - 1]) <= risk:
             promises += 1
@@ -155,7 +199,10 @@ def test_a_shape_that_was_copied_counts_once():
         name: getattr(p, name)[rows]
         for name in ("labels", "splits", "conflicting", "depth_entropy")
     }
-    names, maps = (*p.names, *(f"copy{i}" for i in range(9))), {"lem": p.maps["lem"][rows]}
+    names, maps = (
+        (*p.names, *(f"copy{i}" for i in range(9))),
+        {"lem": p.maps["lem"][rows]},
+    )
     many = replace(
         p,
         **arrays,
@@ -166,14 +213,21 @@ def test_a_shape_that_was_copied_counts_once():
     once = many.deduplicate()
     assert once.names == p.names
     np.testing.assert_array_equal(once.logits, p.logits)
-    relabelled = replace(many, labels=np.r_[many.labels[:-1], (many.labels[-1] + 1) % 3])
+    relabelled = replace(
+        many,
+        labels=np.r_[many.labels[:-1], (many.labels[-1] + 1) % 3],
+    )
     # which of two labels is right is not for us
     assert relabelled.deduplicate().names == (*p.names, "copy8")
     np.testing.assert_array_equal(fitting_set(many, 1.0, 0).logits, p.logits)
     drawn = [fitting_set(many, 0.1, seed) for seed in range(40)]
     assert any(p.logits[0] in data.logits for data in drawn)
-    assert all(sum((row == p.logits[0]).all() for row in data.logits) < 2 for data in drawn)
-    assert not any((row == p.logits[0] + 1).all() for data in drawn for row in data.logits)
+    assert all(
+        sum((row == p.logits[0]).all() for row in data.logits) < 2 for data in drawn
+    )
+    assert not any(
+        (row == p.logits[0] + 1).all() for data in drawn for row in data.logits
+    )
 
 
 def test_it_is_fitted_to_the_objects_that_validate():
@@ -189,7 +243,10 @@ def test_it_is_fitted_to_the_objects_that_validate():
 
 
 def telling(
-    sphere: ViewSphere, rings_of_class: list[list[int]], n: int = 40, seed: int = 0
+    sphere: ViewSphere,
+    rings_of_class: list[list[int]],
+    n: int = 40,
+    seed: int = 0,
 ) -> Predictions:
     """Every view says little of the class, but those on some rings, which depend on the class,
     say it loudly.
@@ -202,7 +259,12 @@ def telling(
     for i, label in enumerate(labels):
         loud = np.isin(sphere.ring, rings_of_class[label])
         logits[i, loud, label] += 3
-    return train_predictions(logits.astype(np.float32), labels, sphere, tuple("abcdef"[:c]))
+    return train_predictions(
+        logits.astype(np.float32),
+        labels,
+        sphere,
+        tuple("abcdef"[:c]),
+    )
 
 
 @pytest.mark.parametrize("scope", ["global", "local"])
@@ -211,12 +273,20 @@ def test_what_tells_most_is_found(scope):
     assert fit_ring(data, scope, 4, PLAIN_SUM)[0] == 2
     assert (SMALL.ring[fit_sequence(data, scope, 3, PLAIN_SUM)] == 2).all()
     by_class = fit_class_table(
-        telling(SMALL, [[0], [2]]), 4, 0.0, PLAIN_SUM, np.random.default_rng(0)
+        telling(SMALL, [[0], [2]]),
+        4,
+        0.0,
+        PLAIN_SUM,
+        np.random.default_rng(0),
     )
     assert (SMALL.ring[by_class[0].argmax(1)] == 0).all()
     assert (SMALL.ring[by_class[1].argmax(1)] == 2).all()
     shared = fit_class_table(
-        telling(SMALL, [[0], [2]]), 4, 1e9, PLAIN_SUM, np.random.default_rng(0)
+        telling(SMALL, [[0], [2]]),
+        4,
+        1e9,
+        PLAIN_SUM,
+        np.random.default_rng(0),
     )
     np.testing.assert_allclose(shared[0], shared[1], atol=1e-6)
 
@@ -226,7 +296,10 @@ def test_each_move_of_a_sequence_is_the_best_there_is(scope):
     rng, calibration = np.random.default_rng(0), Calibration(0.8, 0.5)
     labels = np.array([0, 0, 0, 1, 2])
     data = train_predictions(
-        rng.normal(size=(5, len(SMALL), 3)).astype(np.float32), labels, SMALL, ("a", "b", "c")
+        rng.normal(size=(5, len(SMALL), 3)).astype(np.float32),
+        labels,
+        SMALL,
+        ("a", "b", "c"),
     )
     travel_weight = 0.05
     moves = fit_sequence(data, scope, 2, calibration, travel_weight)
@@ -239,7 +312,11 @@ def test_each_move_of_a_sequence_is_the_best_there_is(scope):
         by_class = {0: [], 1: [], 2: []}
         for i, label in enumerate(labels):
             for steps in range(4):
-                total = data.logits[i, [turned(v, steps) for v in path]].astype(float).sum(0)
+                total = (
+                    data.logits[i, [turned(v, steps) for v in path]]
+                    .astype(float)
+                    .sum(0)
+                )
                 by_class[label].append(
                     log_softmax(total / calibration.temperature_after(len(path)))[label]
                 )
@@ -248,10 +325,13 @@ def test_each_move_of_a_sequence_is_the_best_there_is(scope):
     for ring in range(3):
         path = [ring * 4]
         for move in moves[ring]:
-            reachable = range(12) if scope == "global" else SMALL.windows[path[-1]].ravel()
+            reachable = (
+                range(12) if scope == "global" else SMALL.windows[path[-1]].ravel()
+            )
             left = [v for v in reachable if v not in path]
             values = {
-                v: value([*path, v]) - travel_weight * SMALL.travel[path[-1], v] for v in left
+                v: value([*path, v]) - travel_weight * SMALL.travel[path[-1], v]
+                for v in left
             }
             path.append(int(cells_from(SMALL)[path[-1], move]))
             assert values[path[-1]] == pytest.approx(max(values.values()), abs=1e-9)
@@ -266,23 +346,35 @@ def training_predictions(tmp_path):
     card = make_recogniser(tmp_path, ["ball", "box", "pillar"])
     p = some_predictions(90)
     logits = p.logits.copy()
-    logits[np.arange(90), :, p.labels] += np.random.default_rng(0).normal(0.6, 0.8, (90, 1))
+    logits[np.arange(90), :, p.labels] += np.random.default_rng(0).normal(
+        0.6,
+        0.8,
+        (90, 1),
+    )
     change_card(card, held_out=list(p.names[:45]))
     models = {**p.models, "recogniser": ("tiny", read_card(card).sha256)}
     path = tmp_path / "training.npz"
     replace(
-        p, logits=logits.astype(np.float32), splits=np.array(["train"] * 90), models=models
+        p,
+        logits=logits.astype(np.float32),
+        splits=np.array(["train"] * 90),
+        models=models,
     ).save(path)
     return card, path
 
 
-def test_a_calibration_goes_into_the_card_and_is_used(training_predictions, monkeypatch):
+def test_a_calibration_goes_into_the_card_and_is_used(
+    training_predictions,
+    monkeypatch,
+):
     card, path = training_predictions
     before = json.loads(card.read_text())
     monkeypatch.setattr("sys.argv", ["/bin/nextview", "fit", "calibration", "a b"])
     fitted = fit_calibration(path, card)
     after = json.loads(card.read_text())
-    assert {name: after[name] for name in before} == before | {"schema": 2}  # written anew
+    assert {name: after[name] for name in before} == before | {
+        "schema": 2
+    }  # written anew
     assert after["training"]["commands"] == ["nextview fit calibration 'a b'"]
     assert NetworkRecogniser(card).calibration == fitted.calibration
     assert fitted.after < fitted.before
@@ -291,7 +383,9 @@ def test_a_calibration_goes_into_the_card_and_is_used(training_predictions, monk
     assert [p.name for p in card.parent.iterdir() if p.name.startswith(".")] == []
 
 
-def test_logits_of_ones_own_are_fitted_to_where_they_name_no_model(training_predictions):
+def test_logits_of_ones_own_are_fitted_to_where_they_name_no_model(
+    training_predictions,
+):
     card, path = training_predictions
     named = fit_calibration(path, card).calibration
     unnamed = replace(Predictions.load(path), models={})
@@ -302,31 +396,42 @@ def test_logits_of_ones_own_are_fitted_to_where_they_name_no_model(training_pred
         fit_calibration(path, card)
 
 
-def test_a_calibration_by_a_bad_sensor_trusts_views_less(training_predictions, tmp_path):
+def test_a_calibration_by_a_bad_sensor_trusts_views_less(
+    training_predictions,
+    tmp_path,
+):
     card, path = training_predictions
     p = Predictions.load(path)
     change_card(card, held_out=list(p.names[:60]))
     clean = fit_calibration(path, card).calibration
-    order = np.random.default_rng(1).permutation(90)  # the same objects, in another order
+    order = np.random.default_rng(1).permutation(
+        90
+    )  # the same objects, in another order
     noise = np.random.default_rng(2).normal(0, 4, p.logits.shape)
     sensed = replace(p, logits=(p.logits + noise).astype(np.float32)).of_objects(order)
     sensed.save(tmp_path / "sensed.npz")
     fitted = fit_calibration(path, card, sensed=(tmp_path / "sensed.npz",)).calibration
     assert fitted.temperature > 1.5 * clean.temperature
-    assert json.loads(card.read_text())["fitted_to"]["calibration"].startswith("60 objects")
+    assert json.loads(card.read_text())["fitted_to"]["calibration"].startswith(
+        "60 objects"
+    )
     sensed.of_objects(np.arange(50)).save(tmp_path / "few.npz")
     with pytest.raises(PredictionsError, match="lacks"):
         fit_calibration(path, card, sensed=(tmp_path / "few.npz",))
 
 
 def test_a_card_that_was_changed_meanwhile_or_does_not_fit_is_left_alone(
-    training_predictions, monkeypatch
+    training_predictions,
+    monkeypatch,
 ):
     card, path = training_predictions
     whole, p = json.loads(card.read_text()), Predictions.load(path)
 
     def fit_slowly(*given, **options):
-        with pytest.raises(DatasetError, match="another run is writing it"), card_to_fit(card):
+        with (
+            pytest.raises(DatasetError, match="another run is writing it"),
+            card_to_fit(card),
+        ):
             pass
         change_card(card, note="changed")
         return fit_temperature(*given, **options)
@@ -366,7 +471,10 @@ def test_learned_policies_can_be_run_from_their_cards(training_predictions, tmp_
             travel_weight = 0.01 if card.stem.endswith("near") else 0.0
             for ring, azimuth in [(0, 0), (2, 5)]:
                 view = 8 * ring + azimuth
-                paid = values[:, ring, cells_to(SPHERE)[view]] - travel_weight * SPHERE.travel[view]
+                paid = (
+                    values[:, ring, cells_to(SPHERE)[view]]
+                    - travel_weight * SPHERE.travel[view]
+                )
                 here = policy.values[:, ring, cells_to(SPHERE)[view]]
                 np.testing.assert_allclose(here, paid, atol=1e-5)
     foreign = tmp_path / "learned/fixed-ring-local.json"
@@ -399,7 +507,9 @@ def test_what_is_fitted_finds_the_strange_and_keeps_the_rate_that_was_asked_for(
 
     def objects(n, middle, views=5):
         """(n, 2, views, 12): through a sensor, with twice the errors, and without one."""
-        errors = np.array([2.0, 1.0])[:, None, None] * rng.normal(size=(n, 2, views, 12))
+        errors = np.array([2.0, 1.0])[:, None, None] * rng.normal(
+            size=(n, 2, views, 12)
+        )
         rows = middle[:, None, None] + rng.normal(size=(n, 1, 1, 12)) * 0.5 + errors
         return (rows / np.linalg.norm(rows, axis=-1, keepdims=True)).astype(np.float32)
 
@@ -414,7 +524,9 @@ def test_what_is_fitted_finds_the_strange_and_keeps_the_rate_that_was_asked_for(
     for n in (1, 3):
         for kind in (0, 1):
             novelty = (
-                score.scores(rows[:, kind, :n].reshape(-1, 12), kind == 1).reshape(-1, n).mean(1)
+                score.scores(rows[:, kind, :n].reshape(-1, 12), kind == 1)
+                .reshape(-1, n)
+                .mean(1)
                 for rows in (fresh, strange)
             )
             usual, novel = (score.p_value(scores, n) < 0.05 for scores in novelty)
@@ -422,7 +534,12 @@ def test_what_is_fitted_finds_the_strange_and_keeps_the_rate_that_was_asked_for(
             assert novel.mean() > 0.8
 
 
-def test_a_recogniser_learns_to_notice_unknown_objects(furniture, models, tmp_path, caplog):
+def test_a_recogniser_learns_to_notice_unknown_objects(
+    furniture,
+    models,
+    tmp_path,
+    caplog,
+):
     card = Path(shutil.copy(models / "tiny.json", tmp_path))
     shutil.copy(models / "tiny.onnx", tmp_path)
     assert NetworkRecogniser(card).novelty is None
@@ -438,10 +555,14 @@ def test_a_recogniser_learns_to_notice_unknown_objects(furniture, models, tmp_pa
     assert said.startswith(f"left out: {broken}: not a readable OFF mesh")
     taught, about = NetworkRecogniser(card), read_card(card).fitted_to["novelty"]
     assert "calibrated on 6 others" in about
-    views = [SimulatedCamera(sample_mesh("chair")).observe(pose) for pose in SPHERE.poses[:3]]
+    views = [
+        SimulatedCamera(sample_mesh("chair")).observe(pose) for pose in SPHERE.poses[:3]
+    ]
     evidence = taught(views)
     np.testing.assert_allclose(
-        values_of(evidence.novelty), taught.novelty.scores(embeddings(views), True), atol=1e-5
+        values_of(evidence.novelty),
+        taught.novelty.scores(embeddings(views), True),
+        atol=1e-5,
     )
     sensed = taught([replace(view, exact=False) for view in views])
     np.testing.assert_array_equal(sensed.logits, evidence.logits)

@@ -4,7 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from nextview.data.folders import left_out_phrases, list_dataset, read_folder, scan_dataset
+from nextview.data.folders import (
+    left_out_phrases,
+    list_dataset,
+    read_folder,
+    scan_dataset,
+)
 from nextview.errors import DatasetError
 from nextview.teaching.thing_sources import find_things
 
@@ -25,7 +30,10 @@ def meshes(root: Path, *places: str) -> Path:
             ["cup/test/b.off", "cup/train/a.off", "cup/val/c.off"],
             [("a", "cup", "train"), ("b", "cup", "test"), ("c", "cup", "val")],
         ),
-        (["train/cup/a.off", "val/cup/b.off"], [("a", "cup", "train"), ("b", "cup", "val")]),
+        (
+            ["train/cup/a.off", "val/cup/b.off"],
+            [("a", "cup", "train"), ("b", "cup", "val")],
+        ),
         (
             ["bed/77/models/model.off", "bed/78/models/model.off"],
             [("77", "bed", ""), ("78", "bed", "")],
@@ -47,7 +55,9 @@ def meshes(root: Path, *places: str) -> Path:
     ],
 )
 def test_every_layout_is_understood(tmp_path, places, entries):
-    assert [(e.name, e.label, e.split) for e in list_dataset(meshes(tmp_path, *places))] == entries
+    assert [
+        (e.name, e.label, e.split) for e in list_dataset(meshes(tmp_path, *places))
+    ] == entries
 
 
 def test_links_are_followed_but_not_in_circles(tmp_path):
@@ -87,7 +97,15 @@ def test_what_is_understood_and_what_is_left_out_is_said(tmp_path):
 # reason
 CASES = {
     "formats": (
-        ["tin.stl", "tin.ply", "tin.OBJ", "box.stl", "cup/a.stl", "cup/a.off", "textures/wood.png"],
+        [
+            "tin.stl",
+            "tin.ply",
+            "tin.OBJ",
+            "box.stl",
+            "cup/a.stl",
+            "cup/a.off",
+            "textures/wood.png",
+        ],
         [("a", "cup", ""), ("box", "box", ""), ("tin", "tin", "")],
         {
             "tin.OBJ, tin.stl": "the PLY file of the same model is taken",
@@ -174,7 +192,12 @@ CASES = {
         },
     ),
     "names that cannot be printed": (
-        ["a.ply", "b\nc.ply", b"caf\xe9.ply".decode("utf-8", "surrogateescape"), "cl\x1bass/d.ply"],
+        [
+            "a.ply",
+            "b\nc.ply",
+            b"caf\xe9.ply".decode("utf-8", "surrogateescape"),
+            "cl\x1bass/d.ply",
+        ],
         [("a", "a", "")],
         {r"b c.ply, caf\udce9.ply, cl\x1bass": "its name cannot be printed; rename it"},
     ),
@@ -186,19 +209,25 @@ def test_all_that_is_in_a_folder_is_taken_or_left_out_with_a_reason(tmp_path, ca
     places, expected, left_out = CASES[case]
     listing = read_folder(meshes(tmp_path, *places), loose=True)
     in_order = sorted(expected, key=lambda e: (e[1], e[2] != "train"))
-    assert [(entry.name, entry.label, entry.split) for entry in listing.entries] == in_order
+    assert [
+        (entry.name, entry.label, entry.split) for entry in listing.entries
+    ] == in_order
     phrases = left_out_phrases(listing.left_out)
     for path, reason in left_out.items():
-        assert any(path in phrase.partition(": ")[0] and reason in phrase for phrase in phrases), (
-            phrases
-        )
+        assert any(
+            path in phrase.partition(": ")[0] and reason in phrase for phrase in phrases
+        ), phrases
     assert len(phrases) >= len(left_out)
     assert bool(phrases) == bool(left_out)
     taken = {entry.path for entry in listing.entries}
     said = {tmp_path / place for place, _ in listing.left_out}
     for place in places:
         path = tmp_path / place
-        assert path in taken or path in said or any(above in said for above in path.parents), place
+        assert (
+            path in taken
+            or path in said
+            or any(above in said for above in path.parents)
+        ), place
 
 
 def test_links_that_lead_nowhere_and_folders_of_results_are_left_out(tmp_path):
@@ -215,7 +244,9 @@ def test_links_that_lead_nowhere_and_folders_of_results_are_left_out(tmp_path):
     (root / "gone.ply").symlink_to("nowhere.ply")
     (root / "circle.ply").symlink_to("circle.ply")
     listing = read_folder(
-        root, loose=True, skip={root / "new": "a result", root / "not there": "nothing"}
+        root,
+        loose=True,
+        skip={root / "new": "a result", root / "not there": "nothing"},
     )
     assert [entry.name for entry in listing.entries] == ["a"]
     assert dict(listing.left_out) == {
@@ -252,7 +283,10 @@ def test_a_folder_around_the_classes_is_told(tmp_path):
 
 def test_a_file_is_no_folder_of_things(tmp_path):
     mesh = meshes(tmp_path, "cup.ply") / "cup.ply"
-    with pytest.raises(DatasetError, match=r"cup\.ply: is a file, .* the folder .*: \S+$"):
+    with pytest.raises(
+        DatasetError,
+        match=r"cup\.ply: is a file, .* the folder .*: \S+$",
+    ):
         find_things(mesh)
 
 
@@ -260,18 +294,27 @@ def test_a_dataset_without_meshes_is_refused_and_says_what_it_holds(tmp_path, ca
     with pytest.raises(DatasetError, match="no such folder"):
         list_dataset(tmp_path / "nowhere")
     with pytest.raises(
-        DatasetError, match=r"no meshes in CLASS/NAME.*; left out: cup/a\.dae: of a format"
+        DatasetError,
+        match=r"no meshes in CLASS/NAME.*; left out: cup/a\.dae: of a format",
     ):
         list_dataset(meshes(tmp_path / "empty", "cup/a.dae"))
     with pytest.raises(
-        DatasetError, match=r"a/b_c\.off and .*a_b/c\.off would both be called a_b_c; rename one"
+        DatasetError,
+        match=r"a/b_c\.off and .*a_b/c\.off would both be called a_b_c; rename one",
     ):
         list_dataset(
             meshes(
-                tmp_path / "twice", "a/b_c.off", "a_b/c.off", "d/c.off", "d/e/c.off", "f/b_c.off"
+                tmp_path / "twice",
+                "a/b_c.off",
+                "a_b/c.off",
+                "d/c.off",
+                "d/e/c.off",
+                "f/b_c.off",
             )
         )
     list_dataset(meshes(tmp_path / "loose", "loose.off", "cup/a.off"))
     assert "loose: left out: loose.off: not in a class folder" in caplog.text
-    flat = list_dataset(meshes(tmp_path / "flat", "a.off", "b.off"))  # each is a class of its own
+    flat = list_dataset(
+        meshes(tmp_path / "flat", "a.off", "b.off")
+    )  # each is a class of its own
     assert [(entry.label, entry.name) for entry in flat] == [("a", "a"), ("b", "b")]

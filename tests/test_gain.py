@@ -6,7 +6,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from pipeline import make_map_network, make_recogniser, refused, some_predictions, train_predictions
+from pipeline import (
+    make_map_network,
+    make_recogniser,
+    refused,
+    some_predictions,
+    train_predictions,
+)
 from scipy.special import log_softmax
 from test_fits import SMALL, telling
 from test_policies import SPHERE, state_of
@@ -27,7 +33,13 @@ from nextview.policies.policy_card import PolicyCard
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import Calibration
 from nextview.session.session import Session
-from nextview.training.gain_training import Perceptrons, Score, best_epoch, train, write_gain
+from nextview.training.gain_training import (
+    Perceptrons,
+    Score,
+    best_epoch,
+    train,
+    write_gain,
+)
 from nextview.training.recipes import GainRecipe
 from nextview.training.rollout import (
     OBJECTIVES,
@@ -40,24 +52,49 @@ from nextview.training.rollout import (
 )
 
 CLASSES = 4
-MAPS = ("lem", "lcm", "mine:clutter", "view_area", "lem-sphere", "lcm-sphere", "view_area-sphere")
+MAPS = (
+    "lem",
+    "lcm",
+    "mine:clutter",
+    "view_area",
+    "lem-sphere",
+    "lcm-sphere",
+    "view_area-sphere",
+)
 INPUTS = ("belief", "view", "place", *MAPS, "azimuth_bin")
 """All that a network may take, of measures of all kinds; in the order that its weights are for."""
 
 
-def some_gain(sphere=SPHERE, inputs=INPUTS, networks=2, seed=0, frame="camera", **rest) -> Gain:
+def some_gain(
+    sphere=SPHERE,
+    inputs=INPUTS,
+    networks=2,
+    seed=0,
+    frame="camera",
+    **rest,
+) -> Gain:
     """With weights at random: whatever it was trained to, these promises hold."""
     rng = np.random.default_rng(seed)
     widths = list(
-        pairwise([len(mirrored_features(sphere, CLASSES, inputs, frame)), 8, 8, len(sphere)])
+        pairwise(
+            [len(mirrored_features(sphere, CLASSES, inputs, frame)), 8, 8, len(sphere)]
+        )
     )
     weights = [
-        torch.from_numpy(rng.normal(size=(networks, a, b)) / a**0.5).float() for a, b in widths
+        torch.from_numpy(rng.normal(size=(networks, a, b)) / a**0.5).float()
+        for a, b in widths
     ]
-    biases = [torch.from_numpy(rng.normal(size=(networks, 1, b))).float() for _, b in widths]
+    biases = [
+        torch.from_numpy(rng.normal(size=(networks, 1, b))).float() for _, b in widths
+    ]
     flips = mirrored_features(sphere, CLASSES, inputs, frame), mirrored(sphere)
     return Gain(
-        sphere, CLASSES, Score(Perceptrons(weights, biases, *flips)), inputs, frame=frame, **rest
+        sphere,
+        CLASSES,
+        Score(Perceptrons(weights, biases, *flips)),
+        inputs,
+        frame=frame,
+        **rest,
     )
 
 
@@ -69,8 +106,13 @@ def some_state(sphere=SPHERE, episodes=60, seed=0):
         belief=rng.dirichlet([1] * CLASSES, episodes),
     )
     state.visited[:] |= rng.random(state.visited.shape) < rng.random((episodes, 1))
-    columns = {name: sphere.azimuths if name.endswith("-sphere") else 3 for name in MAPS}
-    maps = {name: rng.random((episodes, sphere.rings, wide)) for name, wide in columns.items()}
+    columns = {
+        name: sphere.azimuths if name.endswith("-sphere") else 3 for name in MAPS
+    }
+    maps = {
+        name: rng.random((episodes, sphere.rings, wide))
+        for name, wide in columns.items()
+    }
     azimuth_bins = rng.dirichlet([1] * sphere.azimuths, (episodes, CLASSES))
     return replace(
         state,
@@ -99,12 +141,16 @@ def test_an_unvisited_view_is_chosen_in_each_episode_by_itself(scope, inputs, fr
     assert free.sum() > 40
     assert not state.visited[np.arange(60), chosen][free].any()
     for i in range(0, 60, 7):
-        assert policy.next_views(state.select([i]), np.random.default_rng(1)) == chosen[i]
+        assert (
+            policy.next_views(state.select([i]), np.random.default_rng(1)) == chosen[i]
+        )
 
 
 def turned(state, sphere, steps: int):
     """The same episodes with the world's azimuth counted from elsewhere."""
-    views = sphere.ring * sphere.azimuths + (sphere.azimuth_index + steps) % sphere.azimuths
+    views = (
+        sphere.ring * sphere.azimuths + (sphere.azimuth_index + steps) % sphere.azimuths
+    )
     visited = np.zeros_like(state.visited)
     visited[:, views] = state.visited
     return replace(state, current=views[state.current], visited=visited), views
@@ -114,13 +160,17 @@ def turned(state, sphere, steps: int):
 @pytest.mark.parametrize("travel_weight", [0.0, 0.3])
 def test_absolute_azimuth_means_nothing(travel_weight, frame):
     state, policy = some_state(), some_gain(travel_weight=travel_weight, frame=frame)
-    gains, chosen = policy.gains(state), policy.next_views(state, np.random.default_rng(0))
+    gains, chosen = (
+        policy.gains(state),
+        policy.next_views(state, np.random.default_rng(0)),
+    )
     for steps in (1, 3, 4):
         other, views = turned(state, SPHERE, steps)
         np.testing.assert_allclose(policy.gains(other)[:, views], gains, atol=1e-9)
         going = ~state.visited.all(1)
         np.testing.assert_array_equal(
-            policy.next_views(other, np.random.default_rng(0))[going], views[chosen][going]
+            policy.next_views(other, np.random.default_rng(0))[going],
+            views[chosen][going],
         )
 
 
@@ -142,8 +192,12 @@ def test_in_the_objects_frame_it_does_not_matter_from_which_azimuth_the_object_i
         state.visited[:] = np.arange(40) % 3 == 0
         states.append(replace(state, current=np.array([ring * 8 + azimuth])))
     inputs = ("belief", "place", "lem-sphere")
-    np.testing.assert_allclose(*(features(SPHERE, state, inputs, "object") for state in states))
-    assert not np.allclose(*(features(SPHERE, state, inputs, "camera") for state in states))
+    np.testing.assert_allclose(
+        *(features(SPHERE, state, inputs, "object") for state in states)
+    )
+    assert not np.allclose(
+        *(features(SPHERE, state, inputs, "camera") for state in states)
+    )
     for state in states:  # and the networks are told on which side the camera is
         assert (
             features(SPHERE, state, ("azimuth_bin",), "object")[0, :8].argmax()
@@ -177,11 +231,16 @@ def some_table(n=30, sphere=SMALL, seed=0, azimuth_bins=False) -> ReplayTable:
     data = telling(sphere, [[0], [1], [2]], n, seed)
     noisy = data.logits + rng.normal(size=data.logits.shape)
     maps = {
-        "lem-sphere": rng.random((n, len(sphere), sphere.rings, sphere.azimuths), dtype=np.float32)
+        "lem-sphere": rng.random(
+            (n, len(sphere), sphere.rings, sphere.azimuths),
+            dtype=np.float32,
+        )
     }
     shape = (n, len(sphere), len(data.classes), sphere.azimuths)
     likely = (
-        log_softmax(rng.normal(size=shape), axis=3).astype(np.float32) if azimuth_bins else None
+        log_softmax(rng.normal(size=shape), axis=3).astype(np.float32)
+        if azimuth_bins
+        else None
     )
     calibration = Calibration(0.8, 0.5, bin_correlation=0.1 if azimuth_bins else None)
     known = {"logits": noisy.astype(np.float32), "azimuth_bins": likely}
@@ -200,15 +259,24 @@ def test_what_a_choice_leads_to_is_what_is_there_after_it(azimuth_bins):
             for kind in OBJECTIVES:
                 reached = value_after(table, moment.total, state.step, kind)
                 np.testing.assert_allclose(
-                    reached, log_evidence[kind][np.arange(30), state.current], atol=1e-9
+                    reached,
+                    log_evidence[kind][np.arange(30), state.current],
+                    atol=1e-9,
                 )
-        seen.append((moment, {kind: candidate_values(table, moment, kind) for kind in OBJECTIVES}))
+        seen.append(
+            (
+                moment,
+                {kind: candidate_values(table, moment, kind) for kind in OBJECTIVES},
+            )
+        )
     moment = seen[-1][0]
     logs = np.log(moment.state.belief)  # test_nothing_seen computes beliefs by hand
     assert (moment.state.visited.sum(1) == 4).all()
     of_truth = logs[np.arange(30), table.data.labels]
     np.testing.assert_allclose(
-        value_after(table, moment.total, 4, "log-belief"), of_truth, atol=1e-9
+        value_after(table, moment.total, 4, "log-belief"),
+        of_truth,
+        atol=1e-9,
     )
     right = (logs.argmax(1) == table.data.labels).astype(float)
     np.testing.assert_array_equal(value_after(table, moment.total, 4, "right"), right)
@@ -221,7 +289,12 @@ def write_card(card, policy, state=None):
     """The card of a policy, and the ONNX file beside it."""
     seen = features(SPHERE, state or some_state(), policy.inputs, policy.frame)
     about = PolicyCard(
-        "gain", policy.scope, SPHERE.elevations, SPHERE.azimuths, ("a", "b", "c", "d"), {}
+        "gain",
+        policy.scope,
+        SPHERE.elevations,
+        SPHERE.azimuths,
+        ("a", "b", "c", "d"),
+        {},
     )
     return write_gain(card, policy, about, seen.astype(np.float32))
 
@@ -239,13 +312,17 @@ def test_a_mirrored_object_gets_the_mirrored_choice(travel_weight, frame, tmp_pa
     state = some_state(episodes=300)
     other, flip = reflected(state)
     seen, mirror = (
-        features(SPHERE, each, INPUTS, frame).astype(np.float32) for each in (state, other)
+        features(SPHERE, each, INPUTS, frame).astype(np.float32)
+        for each in (state, other)
     )
     np.testing.assert_array_equal(
-        mirror, seen[:, mirrored_features(SPHERE, CLASSES, INPUTS, frame)]
+        mirror,
+        seen[:, mirrored_features(SPHERE, CLASSES, INPUTS, frame)],
     )
     np.testing.assert_array_equal(policy.score(mirror)[:, flip], policy.score(seen))
-    chosen, mirror = (policy.next_views(each, np.random.default_rng(0)) for each in (state, other))
+    chosen, mirror = (
+        policy.next_views(each, np.random.default_rng(0)) for each in (state, other)
+    )
     going = ~state.visited.all(1)
     assert len(np.unique(chosen[going])) > 10
     np.testing.assert_array_equal(mirror[going], flip[chosen][going])
@@ -261,9 +338,16 @@ def test_the_file_chooses_as_the_networks_do(scope, inputs, tmp_path):
     other = shipped(tmp_path, policy)
     assert (other.inputs, other.scope, other.travel_weight) == (inputs, scope, 0.1)
     seen = features(SPHERE, state, inputs)
-    np.testing.assert_allclose(other.score(seen.astype(np.float32)), policy.score(seen), atol=1e-5)
+    np.testing.assert_allclose(
+        other.score(seen.astype(np.float32)),
+        policy.score(seen),
+        atol=1e-5,
+    )
     random = np.random.default_rng(0)
-    np.testing.assert_array_equal(other.next_views(state, random), policy.next_views(state, random))
+    np.testing.assert_array_equal(
+        other.next_views(state, random),
+        policy.next_views(state, random),
+    )
 
 
 def test_a_map_of_another_measure_is_predicted_live_where_a_network_of_the_folder_predicts_it(
@@ -293,7 +377,14 @@ def test_a_map_of_another_measure_is_predicted_live_where_a_network_of_the_folde
 # Training
 
 
-QUICK = GainRecipe(epochs=6, episodes=2, batch=128, networks_per_fold=2, max_views=3, lr=1e-2)
+QUICK = GainRecipe(
+    epochs=6,
+    episodes=2,
+    batch=128,
+    networks_per_fold=2,
+    max_views=3,
+    lr=1e-2,
+)
 
 
 def test_training_finds_the_views_that_tell_the_class_believed():
@@ -302,10 +393,16 @@ def test_training_finds_the_views_that_tell_the_class_believed():
     """
     learned = ReplayTable(telling(SMALL, [[0], [1], [2]], 240))
     fresh = ReplayTable(telling(SMALL, [[0], [1], [2]], 90, seed=1))
-    recipe = replace(QUICK, inputs=("belief", "view", "place"), frame="camera", epochs=20)
+    recipe = replace(
+        QUICK,
+        inputs=("belief", "view", "place"),
+        frame="camera",
+        epochs=20,
+    )
     *_, ((policy,), value) = best_epoch([train(learned, recipe)], [fresh], recipe)
     first, second = (
-        SMALL.ring[m.state.current] for m in rollout(fresh, policy, 2, np.random.default_rng(5))
+        SMALL.ring[m.state.current]
+        for m in rollout(fresh, policy, 2, np.random.default_rng(5))
     )
     not_told_yet = first != fresh.data.labels
     assert np.mean((second == fresh.data.labels)[not_told_yet]) > 0.9
@@ -317,10 +414,14 @@ def test_training_finds_the_views_that_tell_the_class_believed():
 
     # The dearer the way, the shorter; and it can be made as short as that of random views.
     free, cheap, dear = (
-        travel(replace(policy, travel_weight=weight))[-1] for weight in (0.0, 0.05, 10.0)
+        travel(replace(policy, travel_weight=weight))[-1]
+        for weight in (0.0, 0.05, 10.0)
     )
     assert free > cheap > dear
-    fitted = replace(policy, travel_weight=fit_travel_weight([(fresh, policy)], 3, "log-belief", 0))
+    fitted = replace(
+        policy,
+        travel_weight=fit_travel_weight([(fresh, policy)], 3, "log-belief", 0),
+    )
     assert (travel(fitted) <= travel(Random(SMALL))).all()
 
 
@@ -331,7 +432,10 @@ def test_the_same_seed_gives_the_same_policy():
     def weights(seed):
         *_, policy = train(table, replace(recipe, seed=seed))
         return np.concatenate(
-            [part.detach().numpy().ravel() for part in policy.score.networks.parameters()]
+            [
+                part.detach().numpy().ravel()
+                for part in policy.score.networks.parameters()
+            ]
         )
 
     np.testing.assert_array_equal(weights(0), weights(0))
@@ -353,7 +457,12 @@ def unseen(tmp_path):
         .astype(np.float32)
     )
     maps = p.maps | {"lem-sphere": sphere}
-    replace(p, splits=np.array(["train"] * 90), maps=maps, azimuth_bins=azimuth_bins).save(path)
+    replace(
+        p,
+        splits=np.array(["train"] * 90),
+        maps=maps,
+        azimuth_bins=azimuth_bins,
+    ).save(path)
     return path
 
 
@@ -394,7 +503,9 @@ def test_the_command_writes_a_card_that_runs_at_any_price(unseen, tmp_path, caps
         "mine.onnx",
         "unseen.npz",
     ]
-    assert "its answers differ from the networks' by" in " ".join(capsys.readouterr().err.split())
+    assert "its answers differ from the networks' by" in " ".join(
+        capsys.readouterr().err.split()
+    )
     main(
         [
             "train",
@@ -434,7 +545,13 @@ def test_few_objects_have_a_fold_each(unseen, tmp_path, capsys):
         in json.loads((tmp_path / "few.json").read_text())["learned_from"]
     )
     Predictions.load(unseen).of_objects(np.arange(1)).save(tmp_path / "one.npz")
-    words = refused(capsys, "train", "gain", tmp_path / "one.npz", tmp_path / "one.json")
+    words = refused(
+        capsys,
+        "train",
+        "gain",
+        tmp_path / "one.npz",
+        tmp_path / "one.json",
+    )
     assert (
         "1 objects cannot be divided into 1 folds: two folds and as many objects are needed at"
         " least" in words
@@ -452,7 +569,8 @@ def test_it_learns_from_what_sensors_made_of_the_same_objects(unseen, tmp_path, 
     np.testing.assert_array_equal(table.data.logits[3:], p.logits[kept][:, ::-1])
     np.testing.assert_array_equal(table.data.labels, np.tile(p.labels[kept], 2))
     np.testing.assert_array_equal(
-        table.data.maps["lem-sphere"], np.tile(p.maps["lem-sphere"][kept], (2, 1, 1, 1))
+        table.data.maps["lem-sphere"],
+        np.tile(p.maps["lem-sphere"][kept], (2, 1, 1, 1)),
     )
     card = tmp_path / "mine.json"
     more = ["--sensed", str(tmp_path / "sensed.npz"), "--epochs", "1", "--folds", "2"]
@@ -462,8 +580,17 @@ def test_it_learns_from_what_sensors_made_of_the_same_objects(unseen, tmp_path, 
         "90 objects of the training split, clean and through sensors"
         in json.loads(card.read_text())["learned_from"]
     )
-    assert isinstance(make_policy(str(card), SPHERE, classes=("ball", "box", "pillar")), Gain)
-    assert "no --validation" in refused(capsys, *start, "--overwrite", "--validation", unseen)
+    assert isinstance(
+        make_policy(str(card), SPHERE, classes=("ball", "box", "pillar")),
+        Gain,
+    )
+    assert "no --validation" in refused(
+        capsys,
+        *start,
+        "--overwrite",
+        "--validation",
+        unseen,
+    )
 
 
 def test_validation_objects_are_left_out_of_the_training(unseen, tmp_path, capsys):
@@ -506,22 +633,41 @@ def ring_that_tells(n: int, seed: int, split: str) -> Predictions:
     logits[np.arange(n), :, labels] += 4 * tells
     window = tells[:, SMALL.windows].astype(np.float32)
     whole = np.broadcast_to(
-        tells.reshape(n, 1, SMALL.rings, SMALL.azimuths), (n, len(SMALL), 3, 4)
+        tells.reshape(n, 1, SMALL.rings, SMALL.azimuths),
+        (n, len(SMALL), 3, 4),
     ).astype(np.float32)
     maps = {"mine:clutter": window, "mine:clutter-sphere": whole}
-    known = {"maps": maps, "depth_entropy": rng.random((n, len(SMALL))).astype(np.float32)}
-    known |= {"names": tuple(f"{split}_{i}" for i in range(n)), "splits": np.array([split] * n)}
-    return train_predictions(logits.astype(np.float32), labels, SMALL, ("a", "b", "c"), **known)
+    known = {
+        "maps": maps,
+        "depth_entropy": rng.random((n, len(SMALL))).astype(np.float32),
+    }
+    known |= {
+        "names": tuple(f"{split}_{i}" for i in range(n)),
+        "splits": np.array([split] * n),
+    }
+    return train_predictions(
+        logits.astype(np.float32),
+        labels,
+        SMALL,
+        ("a", "b", "c"),
+        **known,
+    )
 
 
 @pytest.mark.parametrize("given", ["mine:clutter", "mine:clutter-sphere"])
 def test_a_map_of_a_measure_of_ones_own_leads_a_policy_to_the_views_that_it_shows(
-    given, tmp_path, capsys
+    given,
+    tmp_path,
+    capsys,
 ):
     """Trained from the command, and followed in the benchmark on objects that were not learned
     from.
     """
-    learned, fresh, card = tmp_path / "learn.npz", tmp_path / "test.npz", tmp_path / "mine.json"
+    learned, fresh, card = (
+        tmp_path / "learn.npz",
+        tmp_path / "test.npz",
+        tmp_path / "mine.json",
+    )
     ring_that_tells(120, 0, "train").save(learned)
     p = ring_that_tells(60, 1, "test")
     p.save(fresh)
@@ -539,19 +685,39 @@ def test_a_map_of_a_measure_of_ones_own_leads_a_policy_to_the_views_that_it_show
     ]
     main(["train", "gain", str(learned), str(card), *how, *quick])
     assert json.loads(card.read_text())["table"]["inputs"] == [given, "place"]
-    run = ["--runs", "4", "--samples", "20", "--max-views", "2", "--thresholds", "0.999"]
-    main(["benchmark", str(fresh), str(tmp_path / "out"), *run, "--policies", str(card)])
+    run = [
+        "--runs",
+        "4",
+        "--samples",
+        "20",
+        "--max-views",
+        "2",
+        "--thresholds",
+        "0.999",
+    ]
+    main(
+        ["benchmark", str(fresh), str(tmp_path / "out"), *run, "--policies", str(card)]
+    )
     episodes = load_results(tmp_path / "out").episodes(str(card), 0.999)
     rows = [p.names.index(name) for name in episodes["object"].astype(str)]
     tells = p.maps["mine:clutter-sphere"][rows, 0].argmax(1)[:, 0]
     first, second = (
-        np.array([views[min(k, len(views) - 1)] for views in episodes["views"]]) for k in (0, 1)
+        np.array([views[min(k, len(views) - 1)] for views in episodes["views"]])
+        for k in (0, 1)
     )
     going = SMALL.ring[first] != tells
     assert 100 < going.sum() < 240
     assert (SMALL.ring[second] == tells)[going].mean() > 0.95
     replace(p, maps={}).save(fresh, overwrite=True)
     said = refused(
-        capsys, "benchmark", fresh, tmp_path / "none", *run, "--policies", card, "--reference", card
+        capsys,
+        "benchmark",
+        fresh,
+        tmp_path / "none",
+        *run,
+        "--policies",
+        card,
+        "--reference",
+        card,
     )
     assert f"needs the map '{given}', which these predictions lack" in said

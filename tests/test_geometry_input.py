@@ -23,7 +23,12 @@ STEP = 1 / 127
 
 def channels_of(depth: np.ndarray, pose: np.ndarray) -> dict[str, np.ndarray]:
     """The channels in their own scale; NaN where there is background."""
-    coded = geometry_input(depth[None].astype(np.float32), pose[None], INTRINSICS, SIZE)[0]
+    coded = geometry_input(
+        depth[None].astype(np.float32),
+        pose[None],
+        INTRINSICS,
+        SIZE,
+    )[0]
     values = np.where(coded > 0, (coded.astype(float) - 1) / 127 - 1, np.nan)
     named = dict(zip(CHANNELS, values, strict=True))
     named["facing"] = (named["facing"] + 1) / 2
@@ -64,7 +69,10 @@ def test_the_ball():
             # Positions are exact; a normal is taken over one pixel's width, on a curved surface.
             limit = STEP if name in ("height", "nearness") else 0.03
             np.testing.assert_allclose(
-                found[name][inner], expected[inner], atol=limit, err_msg=name
+                found[name][inner],
+                expected[inner],
+                atol=limit,
+                err_msg=name,
             )
 
 
@@ -78,7 +86,9 @@ def test_the_ball():
 )
 def test_a_plane_at_any_slant(elevation, azimuth, tilt, turn, offset):
     pose = look_at_origin(elevation, azimuth)
-    normal = np.array([np.sin(tilt), np.sin(turn) * np.cos(tilt), -np.cos(turn) * np.cos(tilt)])
+    normal = np.array(
+        [np.sin(tilt), np.sin(turn) * np.cos(tilt), -np.cos(turn) * np.cos(tilt)]
+    )
     normal = pose[:3, :3] @ normal  # towards the camera in its frame
     depth = plane_depth(pose, -offset * normal, normal)
     expected, found = expected_channels(depth, pose, normal), channels_of(depth, pose)
@@ -91,7 +101,10 @@ def test_a_plane_at_any_slant(elevation, azimuth, tilt, turn, offset):
             inside &= expected["facing"] > 0.3
         limit = 0.5 * STEP + (1e-4 if name in ("height", "nearness") else 0.02)
         np.testing.assert_allclose(
-            found[name][inside], expected[name][inside], atol=limit, err_msg=name
+            found[name][inside],
+            expected[name][inside],
+            atol=limit,
+            err_msg=name,
         )
 
 
@@ -99,17 +112,32 @@ def as_the_bundled_models_were_trained(depth, poses, focal, centre):
     """The formula of the bundled models' training, for square pixels: what they are given must
     not change by a bit.
     """
-    rotation, origin = poses[:, :3, :3].astype(np.float32), poses[:, :3, 3].astype(np.float32)
+    rotation, origin = (
+        poses[:, :3, :3].astype(np.float32),
+        poses[:, :3, 3].astype(np.float32),
+    )
 
     def slope(axis):
-        back = np.where(np.roll(depth, 1, axis) > 0, depth - np.roll(depth, 1, axis), np.inf)
-        forth = np.where(np.roll(depth, -1, axis) > 0, np.roll(depth, -1, axis) - depth, np.inf)
+        back = np.where(
+            np.roll(depth, 1, axis) > 0,
+            depth - np.roll(depth, 1, axis),
+            np.inf,
+        )
+        forth = np.where(
+            np.roll(depth, -1, axis) > 0,
+            np.roll(depth, -1, axis) - depth,
+            np.inf,
+        )
         least = np.where(np.abs(back) < np.abs(forth), back, forth)
         return np.where(np.isfinite(least), least, 0).astype(np.float32)
 
     focal = np.float32(focal)
     across, down = slope(2), slope(1)
-    x = ((np.arange(depth.shape[2]) + 0.5 - centre) / focal).astype(np.float32)[None, None, :]
+    x = ((np.arange(depth.shape[2]) + 0.5 - centre) / focal).astype(np.float32)[
+        None,
+        None,
+        :,
+    ]
     y = x.reshape(1, -1, 1)
     through = depth / focal + x * across + y * down
     length = np.sqrt(across**2 + down**2 + through**2) + 1e-12
@@ -119,9 +147,11 @@ def as_the_bundled_models_were_trained(depth, poses, focal, centre):
     height = a * (x * depth) + b * (y * depth) + c * depth + origin[:, 2, None, None]
     nearness = np.linalg.norm(origin, axis=1)[:, None, None] - depth
     channels = np.stack([2 * facing - 1, up, height, nearness], 1)
-    return np.where(depth[:, None] > 0, 1 + 127 * (np.clip(channels, -1, 1) + 1) + 0.5, 0).astype(
-        np.uint8
-    )
+    return np.where(
+        depth[:, None] > 0,
+        1 + 127 * (np.clip(channels, -1, 1) + 1) + 0.5,
+        0,
+    ).astype(np.uint8)
 
 
 @pytest.mark.parametrize("name", ["chair", "monitor"])
@@ -129,9 +159,12 @@ def test_a_render_is_coded_as_the_bundled_models_know_it(name):
     poses = POSES[::3]
     camera = SimulatedCamera(sample_mesh(name), SIZE)
     depth = np.stack([camera.observe(pose).depth for pose in poses])
-    depth[:, [0, -1]] = depth[:, :, [0, -1]] = 0  # the formula above wraps around the border
+    depth[:, [0, -1]] = depth[:, :, [0, -1]] = (
+        0  # the formula above wraps around the border
+    )
     found = geometry_input(depth, poses, INTRINSICS, SIZE)
     assert (found > 0).mean() > 0.05
     np.testing.assert_array_equal(
-        found, as_the_bundled_models_were_trained(depth, poses, INTRINSICS[0, 0], SIZE / 2)
+        found,
+        as_the_bundled_models_were_trained(depth, poses, INTRINSICS[0, 0], SIZE / 2),
     )

@@ -17,8 +17,12 @@ def dish(length, width, height=0.022, rim=0.012) -> trimesh.Trimesh:
     """A flat dish with an upright rim, metres."""
     parts = [box((length, width, 0.006), (0, 0, 0.003))]
     for side in (-1, 1):
-        parts.append(box((length, rim, height), (0, side * (width - rim) / 2, height / 2)))
-        parts.append(box((rim, width, height), (side * (length - rim) / 2, 0, height / 2)))
+        parts.append(
+            box((length, rim, height), (0, side * (width - rim) / 2, height / 2))
+        )
+        parts.append(
+            box((rim, width, height), (side * (length - rim) / 2, 0, height / 2))
+        )
     return trimesh.util.concatenate(parts)
 
 
@@ -34,7 +38,9 @@ def mug() -> trimesh.Trimesh:
     wall = trimesh.creation.annulus(0.036, 0.04, 0.1)
     bottom = trimesh.creation.cylinder(0.04, 0.006).apply_translation((0, 0, -0.047))
     handle = trimesh.creation.torus(0.03, 0.006)
-    handle.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
+    handle.apply_transform(
+        trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0))
+    )
     handle.apply_translation((0.055, 0, 0))
     return trimesh.util.concatenate([wall, bottom, handle])
 
@@ -74,9 +80,13 @@ def shown(system, thing, folder, draws) -> list[nextview.Recognition]:
     for seed in range(draws):
         turned = thing.copy()
         angle = np.random.default_rng(seed).uniform(0, 2 * np.pi)
-        turned.apply_transform(trimesh.transformations.rotation_matrix(angle, (0, 0, 1)))
+        turned.apply_transform(
+            trimesh.transformations.rotation_matrix(angle, (0, 0, 1))
+        )
         turned.export(folder / "thing.ply")
-        found.append(system.recognise(folder / "thing.ply", unit="m", sensor="wrist", seed=seed))
+        found.append(
+            system.recognise(folder / "thing.ply", unit="m", sensor="wrist", seed=seed)
+        )
     return found
 
 
@@ -86,7 +96,8 @@ def test_a_taught_soap_is_known_wherever_it_lies(system, tmp_path):
 
 
 @pytest.mark.xfail(
-    strict=True, reason="a taught thing is known by its radius and features, not by its proportions"
+    strict=True,
+    reason="a taught thing is known by its radius and features, not by its proportions",
 )
 def test_a_plate_of_other_proportions_is_not_the_taught_one(system, tmp_path):
     results = shown(system, dish(0.21, 0.19), tmp_path, 7)

@@ -207,10 +207,16 @@ hash in its name.
 
 
 @pytest.mark.parametrize(("case", "layout"), COMMANDS)
-def test_learn_killed_before_any_step_leaves_the_old_memory_or_the_new_one(tmp_path, case, layout):
+def test_learn_killed_before_any_step_leaves_the_old_memory_or_the_new_one(
+    tmp_path,
+    case,
+    layout,
+):
     said = died(LEARN, case, layout, tmp_path)
     events = [event for event, *_ in said]
-    assert events.count("os.rename") >= 5  # weights, card and picture aside, and to their places
+    assert (
+        events.count("os.rename") >= 5
+    )  # weights, card and picture aside, and to their places
     assert [code for _, code, _ in said] == [9] * (len(said) - 1) + [0]
     found = [which for *_, (which, _) in said]
     assert set(found) == {"old", "new"}
@@ -224,7 +230,9 @@ def test_learn_killed_before_any_step_leaves_the_old_memory_or_the_new_one(tmp_p
         ]
 
 
-def test_capture_killed_between_any_two_steps_never_mixes_the_views_of_two_objects(tmp_path):
+def test_capture_killed_between_any_two_steps_never_mixes_the_views_of_two_objects(
+    tmp_path,
+):
     said = died(CAPTURE, tmp_path)
     found = [which for *_, which in said]
     assert found == sorted(found, key=["old", "none", "new"].index)

@@ -40,10 +40,12 @@ def room_of(module: str) -> str:
 
 
 def test_the_table_names_every_room() -> None:
-    entries = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or path.is_dir()}
-    assert {entry for entry in entries if entry.isidentifier()} - SHELL - {"__pycache__"} == set(
-        ROOMS
-    )
+    entries = {
+        path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or path.is_dir()
+    }
+    assert {entry for entry in entries if entry.isidentifier()} - SHELL - {
+        "__pycache__"
+    } == set(ROOMS)
 
 
 @pytest.mark.parametrize("room", ROOMS)

@@ -53,7 +53,10 @@ def test_taught_things_are_recognised_through_a_sensor(taught, scans):
 
 def test_the_explorer_shows_the_leading_things_as_they_were_taught(taught, scans):
     exploration = Exploration(
-        shown_objects(scans / "chair.off"), models=taught, start=11, threads=1
+        shown_objects(scans / "chair.off"),
+        models=taught,
+        start=11,
+        threads=1,
     )
     walk = exploration.walks[0]
     assert walk.rivals is None
@@ -61,7 +64,9 @@ def test_the_explorer_shows_the_leading_things_as_they_were_taught(taught, scans
     rivals, belief = walk.rivals, walk.views[0].belief
     np.testing.assert_array_equal(rivals.classes, np.argsort(-belief)[:2])
     view = 33
-    assert FORTY.azimuth[view] == pytest.approx(2 * np.pi / AZIMUTHS * rivals.azimuths[0, view])
+    assert FORTY.azimuth[view] == pytest.approx(
+        2 * np.pi / AZIMUTHS * rivals.azimuths[0, view]
+    )
     (name, picture), (other, _) = walk.remembered(rivals, view)
     assert (name, other) == tuple(walk.system.classes[c] for c in rivals.classes)
     pose = look_at_origin(np.radians(RINGS[rivals.rings[view]]), FORTY.azimuth[view])
@@ -70,13 +75,20 @@ def test_the_explorer_shows_the_leading_things_as_they_were_taught(taught, scans
     shown = walk_card(walk)
     assert f"as view {walk.next_view} would show them" in shown
     assert f"differ by {1 - rivals.alike[walk.next_view]:.2f}" in shown
-    assert f"The two likeliest, as view {view} would show them" in preview_card(seen, walk)
+    assert f"The two likeliest, as view {view} would show them" in preview_card(
+        seen,
+        walk,
+    )
     # its meshes are not here, but their surfaces
     bundled = nextview.load(models="ycb", threads=1).models.recogniser
     thing = bundled.memory.thing[100]
-    surface = bundled.memory.surfaces.surface(thing, bundled.card.memory.things[thing].name)
+    surface = bundled.memory.surfaces.surface(
+        thing,
+        bundled.card.memory.things[thing].name,
+    )
     standing = rotated(
-        make_mesh(surface.vertices, surface.faces), bundled.memory.rotations[100].astype(float)
+        make_mesh(surface.vertices, surface.faces),
+        bundled.memory.rotations[100].astype(float),
     )
     drawn = SimulatedCamera(standing, 64).observe(
         look_at_origin(np.radians(RINGS[1]), 2 * np.pi * 3 / AZIMUTHS)
@@ -84,9 +96,25 @@ def test_the_explorer_shows_the_leading_things_as_they_were_taught(taught, scans
     np.testing.assert_array_equal(remembered_picture(bundled, 100, 1, 3), drawn.picture)
 
 
-def test_predictions_of_taught_things_replay_with_their_policy(tmp_path, taught, scans, capsys):
+def test_predictions_of_taught_things_replay_with_their_policy(
+    tmp_path,
+    taught,
+    scans,
+    capsys,
+):
     store, table = tmp_path / "shown.zarr", tmp_path / "shown.npz"
-    main(["render", str(scans), str(store), "--sensor", "wrist", "--rotated", "--workers", "0"])
+    main(
+        [
+            "render",
+            str(scans),
+            str(store),
+            "--sensor",
+            "wrist",
+            "--rotated",
+            "--workers",
+            "0",
+        ]
+    )
     main(["predict", str(store), str(table), "--models", str(taught), "--workers", "0"])
     specs = make_specs(Predictions.load(table), 4, 0)
     for policy in ("random-all", str(taught / "memory.json")):
@@ -95,31 +123,53 @@ def test_predictions_of_taught_things_replay_with_their_policy(tmp_path, taught,
 
 
 def test_adding_leaves_what_is_known_as_it_was_and_removing_takes_it_away(
-    tmp_path, taught, scans, capsys
+    tmp_path,
+    taught,
+    scans,
+    capsys,
 ):
     more, models = tmp_path / "more", tmp_path / "models"
     more.mkdir()
     shutil.copytree(taught, models)
-    slab = make_mesh(sample_mesh("table").vertices * (1, 0.2, 1), sample_mesh("table").faces)
+    slab = make_mesh(
+        sample_mesh("table").vertices * (1, 0.2, 1),
+        sample_mesh("table").faces,
+    )
     write_off(more / "bench.off", slab)
     before = open_memory(taught / "memory.json")[1]
     learn(more, models, upright=True, add=True, workers=0)
     card = read_card(models / "memory.json")
     assert card.classes == ("bench", *THINGS)
-    np.testing.assert_array_equal(open_memory(card.card_path)[1].views[1:], before.views)
+    np.testing.assert_array_equal(
+        open_memory(card.card_path)[1].views[1:],
+        before.views,
+    )
     learn(models, models, remove=("bench",))
     card = read_card(models / "memory.json")
     assert card.classes == THINGS
-    np.testing.assert_array_equal(open_memory(card.card_path)[1].held_out, before.held_out)
+    np.testing.assert_array_equal(
+        open_memory(card.card_path)[1].held_out,
+        before.held_out,
+    )
     assert "is all it knows" in learn(models, models, remove=THINGS[1:]).notes[0]
     with pytest.raises(UsageError, match="knows nothing called 'mug'"):
         learn(models, models, remove=("mug",))
     with pytest.raises(UsageError, match=r"chair is known already"):
         learn(scans, models, add=True)
-    assert "already knows things; --add" in refused(capsys, "learn", str(scans), str(models))
+    assert "already knows things; --add" in refused(
+        capsys,
+        "learn",
+        str(scans),
+        str(models),
+    )
 
 
-def test_a_run_that_was_stopped_goes_on_and_gives_the_same(tmp_path, taught, scans, monkeypatch):
+def test_a_run_that_was_stopped_goes_on_and_gives_the_same(
+    tmp_path,
+    taught,
+    scans,
+    monkeypatch,
+):
     again = []
 
     def stopping(done, total, what):
@@ -141,17 +191,32 @@ def test_a_run_that_was_stopped_goes_on_and_gives_the_same(tmp_path, taught, sca
     )
     assert counts[0] == 2  # what was finished is not looked at again
     assert (
-        read_card(tmp_path / "mine/memory.json").sha256 == read_card(taught / "memory.json").sha256
+        read_card(tmp_path / "mine/memory.json").sha256
+        == read_card(taught / "memory.json").sha256
     )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]
 
 
-def test_what_is_wrong_with_a_folder_is_one_sentence_and_nothing_is_lost(tmp_path, scans, capsys):
+def test_what_is_wrong_with_a_folder_is_one_sentence_and_nothing_is_lost(
+    tmp_path,
+    scans,
+    capsys,
+):
     empty = tmp_path / "empty"
     empty.mkdir()
-    assert "holds no mesh" in refused(capsys, "learn", str(empty), str(tmp_path / "out"))
+    assert "holds no mesh" in refused(
+        capsys,
+        "learn",
+        str(empty),
+        str(tmp_path / "out"),
+    )
     (empty / "view.png").write_bytes(b"")
-    assert "holds no mesh" in refused(capsys, "learn", str(empty), str(tmp_path / "out"))
+    assert "holds no mesh" in refused(
+        capsys,
+        "learn",
+        str(empty),
+        str(tmp_path / "out"),
+    )
     mixed = tmp_path / "mixed"
     mixed.mkdir()
     for name in ("chair", "seat"):
@@ -185,7 +250,12 @@ def test_classes_of_several_things_and_one_alone(tmp_path, scans):
     found = learn(folder, tmp_path / "two", upright=True, workers=0)
     assert (found.things, found.classes) == (4, 2)
     assert found.accuracy[2] > 0.9  # by the other things of the class
-    assert read_card(tmp_path / "two/memory.json").calibration.hypotheses == (0, 0, 1, 1)
+    assert read_card(tmp_path / "two/memory.json").calibration.hypotheses == (
+        0,
+        0,
+        1,
+        1,
+    )
 
 
 def test_belief_in_classes_is_the_sum_over_their_things_and_azimuths():
@@ -194,13 +264,23 @@ def test_belief_in_classes_is_the_sum_over_their_things_and_azimuths():
     logits, bins = rng.normal(0, 2, (3, 3)), rng.normal(0, 4, (3, 6, AZIMUTHS))
     azimuth = np.array([0, 3, 7]) * 2 * np.pi / AZIMUTHS
     total = log_evidence_of(logits, bins, azimuth).sum(0)
-    belief, joint = calibration.belief(total, 3, 3), calibration.joint(total, 3, 3, azimuth[2])
-    pointing = np.stack([reorient(b, a) for b, a in zip(bins, azimuth, strict=True)]).sum(0) / 1.8
-    by_hand = logits.mean(0) + [logsumexp(pointing[k]) for k in ([0, 1], [2], [3, 4, 5])]
+    belief, joint = (
+        calibration.belief(total, 3, 3),
+        calibration.joint(total, 3, 3, azimuth[2]),
+    )
+    pointing = (
+        np.stack([reorient(b, a) for b, a in zip(bins, azimuth, strict=True)]).sum(0)
+        / 1.8
+    )
+    by_hand = logits.mean(0) + [
+        logsumexp(pointing[k]) for k in ([0, 1], [2], [3, 4, 5])
+    ]
     np.testing.assert_allclose(np.log(belief), by_hand - logsumexp(by_hand), atol=1e-9)
     marginal = joint.sum(1)
     np.testing.assert_allclose(
-        [marginal[:2].sum(), marginal[2], marginal[3:].sum()], belief, atol=1e-12
+        [marginal[:2].sum(), marginal[2], marginal[3:].sum()],
+        belief,
+        atol=1e-12,
     )
     with pytest.raises(NextviewError, match="not of every class"):
         Calibration(hypotheses=(0, 2))
@@ -211,7 +291,11 @@ def test_similarity_is_a_cosine_between_rings_interpolated():
     views = rng.normal(size=(3, len(RINGS), AZIMUTHS, 5)).astype(np.float32)
     seen = rng.normal(size=(2, 5)).astype(np.float32)
     found = similarities(by_ring(views), seen, np.radians([27.0, 80.0]))
-    np.testing.assert_allclose(found[0], (views[:, 1] + views[:, 2]) @ seen[0] / 2, rtol=1e-4)
+    np.testing.assert_allclose(
+        found[0],
+        (views[:, 1] + views[:, 2]) @ seen[0] / 2,
+        rtol=1e-4,
+    )
     np.testing.assert_allclose(found[1], views[:, 4] @ seen[1], rtol=1e-4)
 
 
@@ -219,13 +303,20 @@ def test_the_nearest_of_many_views_are_those_of_an_exact_search():
     pytest.importorskip("faiss", reason="the extra 'large' is not installed")
     rng = np.random.default_rng(0)
     kinds, kind = rng.normal(size=(300, 256)), rng.integers(300, size=10_500)
-    views = unit(kinds[kind] + 0.5 * rng.normal(size=(len(kind), 256))).astype(np.float32)
+    views = unit(kinds[kind] + 0.5 * rng.normal(size=(len(kind), 256))).astype(
+        np.float32
+    )
     seen = unit(kinds[:20] + 0.5 * rng.normal(size=(20, 256))).astype(np.float32)
     found = NearestViews(np.stack([views, views]))
-    found, exact = found.similarities(seen, np.full((20, 2), 0.5, np.float32)), seen @ views.T
+    found, exact = (
+        found.similarities(seen, np.full((20, 2), 0.5, np.float32)),
+        seen @ views.T,
+    )
     best = np.argsort(-exact, 1)[:, :20]
     close = np.isclose(
-        np.take_along_axis(found, best, 1), np.take_along_axis(exact, best, 1), atol=1e-5
+        np.take_along_axis(found, best, 1),
+        np.take_along_axis(exact, best, 1),
+        atol=1e-5,
     )
     assert close.mean() > 0.95
     np.testing.assert_array_less(found.max(1), exact.max(1) + 1e-5)
@@ -246,7 +337,12 @@ def test_the_policy_goes_where_two_things_differ(place):
     visited = np.arange(40)[None] == current
     evidence = Evidence(np.zeros((1, 2)))
     state = EpisodeState(
-        np.array([current]), visited, np.full((1, 2), 0.5), evidence, 1, joint=joint
+        np.array([current]),
+        visited,
+        np.full((1, 2), 0.5),
+        evidence,
+        1,
+        joint=joint,
     )
     assert policy.next_views(state, np.random.default_rng(0)).tolist() == [place]
     rivals = policy.rivals(joint[0], FORTY.azimuth[current])

@@ -74,7 +74,9 @@ def test_frames_meshes_and_classes_are_found_together(tmp_path):
         "mine: is where the result goes",
         "b.dae: of a format that is not read; export it as .off, .obj, .ply, .stl, .glb",
     }
-    assert found.notes == (f"in {tmp_path}: 1 in MESH, 1 in CLASS/MESH, 1 folder of depth frames",)
+    assert found.notes == (
+        f"in {tmp_path}: 1 in MESH, 1 in CLASS/MESH, 1 folder of depth frames",
+    )
 
 
 def test_what_is_for_tests_is_not_taught(tmp_path):
@@ -83,7 +85,8 @@ def test_what_is_for_tests_is_not_taught(tmp_path):
     assert [thing.name for thing in found.things] == ["box", "a"]
     assert found.left_out == ["cup/test/b.ply: of the split test"]
     with pytest.raises(
-        DatasetError, match=r"holds no mesh .*; left out: a\.step: of a format that is not read"
+        DatasetError,
+        match=r"holds no mesh .*; left out: a\.step: of a format that is not read",
     ):
         find_things(scans_in(tmp_path / "drawings", "a.step"))
 
@@ -110,13 +113,21 @@ def test_a_folder_around_all_things_is_asked_about(tmp_path, quickly, places, in
 
 
 def test_a_class_beside_those_that_are_known_is_not_asked_about(tmp_path, quickly):
-    learn(scans_in(tmp_path / "first", "box.ply", "tin.ply"), tmp_path / "mine", workers=0)
+    learn(
+        scans_in(tmp_path / "first", "box.ply", "tin.ply"),
+        tmp_path / "mine",
+        workers=0,
+    )
     learned = learn(
-        scans_in(tmp_path / "new", "cup/a.ply", "cup/b.ply"), tmp_path / "mine", add=True, workers=0
+        scans_in(tmp_path / "new", "cup/a.ply", "cup/b.ply"),
+        tmp_path / "mine",
+        add=True,
+        workers=0,
     )
     assert (learned.things, learned.classes) == (4, 3)
     assert [
-        thing.label for thing in find_things(scans_in(tmp_path / "one", "cup/a.ply")).things
+        thing.label
+        for thing in find_things(scans_in(tmp_path / "one", "cup/a.ply")).things
     ] == ["cup"]
 
 
@@ -136,7 +147,10 @@ def test_a_class_beside_those_that_are_known_is_not_asked_about(tmp_path, quickl
     ],
 )
 def test_a_value_that_makes_no_sense_is_refused_before_anything_is_taught(
-    tmp_path, monkeypatch, option, value
+    tmp_path,
+    monkeypatch,
+    option,
+    value,
 ):
     def teach(*arguments):
         raise AssertionError("a thing was taught")
@@ -144,15 +158,25 @@ def test_a_value_that_makes_no_sense_is_refused_before_anything_is_taught(
     monkeypatch.setattr("nextview.teaching.learn.teach", teach)
     scans_in(tmp_path / "things", "box.ply", "tin.ply")
     with pytest.raises(UsageError, match=re.escape(str(value).rpartition(":")[2])):
-        learn(tmp_path / "things", tmp_path / "mine", **({"workers": 0} | {option: value}))
+        learn(
+            tmp_path / "things",
+            tmp_path / "mine",
+            **({"workers": 0} | {option: value}),
+        )
     assert not (tmp_path / "mine").exists()
 
 
 @pytest.mark.parametrize(
-    ("folder", "out"), [(".", "mine"), ("../things", "."), ("../things", "../things/mine")]
+    ("folder", "out"),
+    [(".", "mine"), ("../things", "."), ("../things", "../things/mine")],
 )
 def test_the_result_may_lie_beside_the_things_or_in_the_working_folder(
-    tmp_path, monkeypatch, capsys, quickly, folder, out
+    tmp_path,
+    monkeypatch,
+    capsys,
+    quickly,
+    folder,
+    out,
 ):
     scans_in(tmp_path / "things", "box.ply", "tin.ply")
     (tmp_path / "empty").mkdir()
@@ -165,8 +189,15 @@ def test_the_result_may_lie_beside_the_things_or_in_the_working_folder(
     assert ("mine: is where the result goes" in printed) == (out != ".")
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="names of files are bytes on Linux alone")
-def test_a_file_that_cannot_be_taught_does_not_keep_the_others_from_it(tmp_path, quickly, capsys):
+@pytest.mark.skipif(
+    sys.platform != "linux",
+    reason="names of files are bytes on Linux alone",
+)
+def test_a_file_that_cannot_be_taught_does_not_keep_the_others_from_it(
+    tmp_path,
+    quickly,
+    capsys,
+):
     long = "n" * 251
     root = scans_in(tmp_path / "things", "box.ply", f"{long}.ply", "tin.ply")
     (root / "gone.ply").symlink_to("nowhere")
@@ -204,15 +235,23 @@ def test_sizes_that_give_a_wrong_unit_away_are_asked_about(radii, unit_given, sa
     assert "--any-size takes it as it is" in str(raised.value)
 
 
-@pytest.mark.parametrize(("count", "shown"), [(1, 1), (7, 7), (14, 14), (90, 90), (400, 120)])
+@pytest.mark.parametrize(
+    ("count", "shown"),
+    [(1, 1), (7, 7), (14, 14), (90, 90), (400, 120)],
+)
 def test_the_picture_shows_all_things_that_fit_each_in_a_place_of_its_own(
-    tmp_path, monkeypatch, count, shown
+    tmp_path,
+    monkeypatch,
+    count,
+    shown,
 ):
     pages = []
     monkeypatch.setattr(Figure, "savefig", lambda self, path: pages.append(self))
     pictures = {f"thing_{k}": np.full((64, 64), 99, np.uint8) for k in range(count)}
     draw_learned(
-        tmp_path / "p.png", pictures, SimpleNamespace(accuracy=(0.5, 0.6, 0.7, 0.8), confused=())
+        tmp_path / "p.png",
+        pictures,
+        SimpleNamespace(accuracy=(0.5, 0.6, 0.7, 0.8), confused=()),
     )
     (figure,) = pages
     page = figure.axes[0]
@@ -222,7 +261,9 @@ def test_the_picture_shows_all_things_that_fit_each_in_a_place_of_its_own(
     assert (places[:, :2] >= 0).all()
     assert (places[:, :2] <= width).all()
     assert (places[:, 2:] <= height).all()
-    apart = np.abs(places[:, None, [0, 3]] - places[None, :, [0, 3]]).max(-1) + 9 * np.eye(shown)
+    apart = np.abs(places[:, None, [0, 3]] - places[None, :, [0, 3]]).max(
+        -1
+    ) + 9 * np.eye(shown)
     assert apart.min() > 1.05  # inches: none lies on another
     assert (f"{shown} of them" in "".join(text.get_text() for text in page.texts)) == (
         shown < count

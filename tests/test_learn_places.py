@@ -32,7 +32,9 @@ def looked_at(monkeypatch):
         names.append(name)
         rng = np.random.default_rng([*name.encode()])
         return {
-            "views": unit(rng.normal(size=(1, len(RINGS), AZIMUTHS, 256))).astype(np.float16),
+            "views": unit(rng.normal(size=(1, len(RINGS), AZIMUTHS, 256))).astype(
+                np.float16
+            ),
             "rotations": np.eye(3, dtype=np.float32)[None],
             "held_out": unit(rng.normal(size=(4, 256))).astype(np.float16),
             "held_out_views": np.zeros((4, 2), np.float32),
@@ -42,7 +44,9 @@ def looked_at(monkeypatch):
 
     monkeypatch.setattr(module, "teach", teach)
     monkeypatch.setattr(
-        module, "draw_learned", lambda path, pictures, fit: path.write_text(" ".join(pictures))
+        module,
+        "draw_learned",
+        lambda path, pictures, fit: path.write_text(" ".join(pictures)),
     )
     return names
 
@@ -77,8 +81,18 @@ def contents(folder):
 
 RUNS = {
     "add": lambda place: learn(place / "more", place / "mine", add=True, workers=0),
-    "remove": lambda place: learn(place / "mine", place / "mine", remove=("box",), workers=0),
-    "overwrite": lambda place: learn(place / "more", place / "mine", overwrite=True, workers=0),
+    "remove": lambda place: learn(
+        place / "mine",
+        place / "mine",
+        remove=("box",),
+        workers=0,
+    ),
+    "overwrite": lambda place: learn(
+        place / "more",
+        place / "mine",
+        overwrite=True,
+        workers=0,
+    ),
 }
 AFTER = {"add": ["ball", "box", "cup"], "remove": ["ball"], "overwrite": ["cup"]}
 
@@ -93,7 +107,10 @@ def link_away(path, place):
 @pytest.mark.parametrize("run", RUNS)
 @pytest.mark.parametrize("linked", ["memory.json", "learned.png", "."])
 def test_a_link_where_a_file_is_to_be_replaced_is_refused_before_anything_is_done(
-    place, looked_at, run, linked
+    place,
+    looked_at,
+    run,
+    linked,
 ):
     link_away(place / "mine" / linked if linked != "." else place / "mine", place)
     before = contents(place)
@@ -106,7 +123,11 @@ def test_a_link_where_a_file_is_to_be_replaced_is_refused_before_anything_is_don
 
 @pytest.mark.parametrize("run", RUNS)
 @pytest.mark.parametrize("layout", ["now", "earlier"])
-def test_weights_that_are_a_link_are_replaced_and_what_it_points_to_stays(place, run, layout):
+def test_weights_that_are_a_link_are_replaced_and_what_it_points_to_stays(
+    place,
+    run,
+    layout,
+):
     weights = read_card(place / "mine/memory.json").path
     if layout == "earlier":
         weights = weights.rename(place / "mine/memory.safetensors")
@@ -154,7 +175,16 @@ def test_what_is_not_ours_beside_the_output_stays(place, run):
 def test_predict_leaves_a_folder_of_others_alone(tmp_path, views, models):
     (tmp_path / ".p.npz.part").mkdir()
     (tmp_path / ".p.npz.part/thesis.txt").write_text("mine")
-    list(predict(views, tmp_path / "p.npz", read_card(models / "tiny.json"), {}, "test", workers=0))
+    list(
+        predict(
+            views,
+            tmp_path / "p.npz",
+            read_card(models / "tiny.json"),
+            {},
+            "test",
+            workers=0,
+        )
+    )
     assert {path.name for path in tmp_path.iterdir()} == {".p.npz.part", "p.npz"}
     assert (tmp_path / ".p.npz.part/thesis.txt").read_text() == "mine"
 
@@ -162,17 +192,26 @@ def test_predict_leaves_a_folder_of_others_alone(tmp_path, views, models):
 def test_a_lock_of_others_is_not_taken_for_ours(tmp_path):
     (tmp_path / ".mine.lock").write_text("poetry")
     with (
-        pytest.raises(DatasetError, match=r"cannot be written while \S+/\.mine\.lock is there"),
+        pytest.raises(
+            DatasetError,
+            match=r"cannot be written while \S+/\.mine\.lock is there",
+        ),
         only_one(tmp_path / "mine"),
     ):
         pass
     assert (tmp_path / ".mine.lock").read_text() == "poetry"
 
 
-def test_of_two_runs_at_once_one_is_refused_and_none_loses_what_the_other_wrote(place, monkeypatch):
+def test_of_two_runs_at_once_one_is_refused_and_none_loses_what_the_other_wrote(
+    place,
+    monkeypatch,
+):
     shutil.copytree(place / "more", place / "third")
     (place / "third/cup.off").rename(place / "third/jug.off")
-    with only_one(place / "mine"), pytest.raises(DatasetError, match="another run is writing it"):
+    with (
+        only_one(place / "mine"),
+        pytest.raises(DatasetError, match="another run is writing it"),
+    ):
         learn(place / "more", place / "mine", add=True, workers=0)
 
     find = module.find_things
@@ -196,7 +235,10 @@ def test_numbers_of_other_features_are_not_mixed_with_these(place, looked_at, ru
     about["memory"]["features_sha256"] = "0" * 64
     card.write_text(json.dumps(about))
     before = contents(place / "mine")
-    with pytest.raises(ModelError, match=r"^\S+/memory\.json: was taught with other features"):
+    with pytest.raises(
+        ModelError,
+        match=r"^\S+/memory\.json: was taught with other features",
+    ):
         RUNS[run](place)
     assert contents(place / "mine") == before
     assert not looked_at
@@ -204,7 +246,10 @@ def test_numbers_of_other_features_are_not_mixed_with_these(place, looked_at, ru
 
 
 def test_a_memory_of_nothing_is_not_written(place):
-    with pytest.raises(UsageError, match="no thing would be left; delete the folder instead"):
+    with pytest.raises(
+        UsageError,
+        match="no thing would be left; delete the folder instead",
+    ):
         learn(place / "mine", place / "mine", remove=("box", "ball"), workers=0)
     assert known(place / "mine") == ["ball", "box"]
 
@@ -215,19 +260,29 @@ CHANGES = {
         lambda folder: (folder / "depth/0.png").write_bytes(b"longer than it was"),
         True,
     ),
-    "the time of a file": (lambda folder: os.utime(folder / "depth/0.png", (1, 1)), True),
+    "the time of a file": (
+        lambda folder: os.utime(folder / "depth/0.png", (1, 1)),
+        True,
+    ),
     "one file more": (lambda folder: (folder / "depth/1.png").write_bytes(b"0"), True),
     "one file less": (lambda folder: (folder / "scene_gt.json").unlink(), True),
     "the name of a file": (
         lambda folder: (folder / "depth/0.png").rename(folder / "depth/2.png"),
         True,
     ),
-    "a file behind a link": (lambda folder: os.utime(folder / "rgb/0.png", (1, 1)), True),
+    "a file behind a link": (
+        lambda folder: os.utime(folder / "rgb/0.png", (1, 1)),
+        True,
+    ),
 }
 
 
 @pytest.mark.parametrize("what", CHANGES)
-def test_frames_that_were_changed_in_place_are_looked_at_again(tmp_path, looked_at, what):
+def test_frames_that_were_changed_in_place_are_looked_at_again(
+    tmp_path,
+    looked_at,
+    what,
+):
     folder = tmp_path / "scans/thing"
     (folder / "depth").mkdir(parents=True)
     for name in ("scene_camera.json", "scene_gt.json", "depth/0.png"):
@@ -249,7 +304,8 @@ def test_frames_that_were_changed_in_place_are_looked_at_again(tmp_path, looked_
     looked_at.clear()
     change, again = CHANGES[what]
     times = {
-        path: path.stat().st_mtime_ns for path in (folder, folder / "depth", tmp_path / "disk")
+        path: path.stat().st_mtime_ns
+        for path in (folder, folder / "depth", tmp_path / "disk")
     }
     change(folder)
     for path, time in times.items():  # as cp over what is there leaves it
@@ -280,14 +336,25 @@ def test_no_file_of_a_folder_is_replaced_before_all_can_be(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "image", ["rgb/000001.jpg", "gray/000000.png", "mask_visib/000002_000000.png"]
+    "image",
+    ["rgb/000001.jpg", "gray/000000.png", "mask_visib/000002_000000.png"],
 )
-def test_capture_writes_no_views_beside_images_that_would_be_taken_for_theirs(tmp_path, image):
+def test_capture_writes_no_views_beside_images_that_would_be_taken_for_theirs(
+    tmp_path,
+    image,
+):
     sphere = ViewSphere((30.0,), 3)
     (tmp_path / image).parent.mkdir()
     (tmp_path / image).write_bytes(b"mine")
     with pytest.raises(ResultsError, match="would be taken for one of the new views"):
         list(
-            write_capture(sample_mesh("chair"), tmp_path, sphere, 0.4, masks=False, overwrite=True)
+            write_capture(
+                sample_mesh("chair"),
+                tmp_path,
+                sphere,
+                0.4,
+                masks=False,
+                overwrite=True,
+            )
         )
     assert contents(tmp_path) == {image: b"mine"}

@@ -35,7 +35,16 @@ def begin(models, limits=None, distance=0.5, max_views=4, seed=0, **asked) -> Se
     policy = make_policy("random-all", SPHERE)
     rng = np.random.default_rng(seed)
     thing = ObservedObject(**asked)
-    session = Session(models, policy, SPHERE, 0, Stopping(1.0, max_views), rng, thing, distance)
+    session = Session(
+        models,
+        policy,
+        SPHERE,
+        0,
+        Stopping(1.0, max_views),
+        rng,
+        thing,
+        distance,
+    )
     session.limits = limits or Limits()
     return session
 
@@ -43,7 +52,13 @@ def begin(models, limits=None, distance=0.5, max_views=4, seed=0, **asked) -> Se
 def look(pose, *meshes, masked=False) -> Frame:
     """What a camera sees of things, the object first."""
     depth, which = cast(meshes, pose, INTRINSICS, SHAPE)
-    return Frame(depth, INTRINSICS, pose, which == 0 if masked else None, pixel_centre=0.5)
+    return Frame(
+        depth,
+        INTRINSICS,
+        pose,
+        which == 0 if masked else None,
+        pixel_centre=0.5,
+    )
 
 
 def places(session) -> np.ndarray:
@@ -129,7 +144,9 @@ def test_no_target_is_in_or_beside_another_thing(tiny, name):
     facing = away < 0.6 * clearance
     assert left_out[facing].all()
     clear = (
-        (away > 2.5 * clearance) & (places(session)[:, 1] < 0.1) & (places(session)[:, 2] > 0.08)
+        (away > 2.5 * clearance)
+        & (places(session)[:, 1] < 0.1)
+        & (places(session)[:, 2] > 0.08)
     )
     assert clear.any()
     assert not left_out[clear].any()
@@ -168,9 +185,13 @@ def test_no_target_is_behind_a_wall(tiny, turn):
 def test_what_ends_is_no_wall_once_a_frame_shows_what_is_behind(tiny):
     screen = box((1.3, 0.02, 1.2), (0, 0.45, 0.6))
     session = begin(tiny, distance=0.7, point=(0, 0, 0.03))
-    session.update(look(pose_at(30, -90, 0.6, (0, 0, 0.1)), BRICK, TABLE, screen, FLOOR))
+    session.update(
+        look(pose_at(30, -90, 0.6, (0, 0, 0.1)), BRICK, TABLE, screen, FLOOR)
+    )
     assert BEHIND_WALL in session.left_out
-    session.update(look(pose_at(15, 190, 1.3, (0, 0.45, 0.05)), BRICK, TABLE, screen, FLOOR))
+    session.update(
+        look(pose_at(15, 190, 1.3, (0, 0.45, 0.05)), BRICK, TABLE, screen, FLOOR)
+    )
     assert BEHIND_WALL not in session.left_out
 
 
@@ -243,7 +264,12 @@ def test_a_function_of_reach_is_asked_only_of_what_is_left(tiny):
 
 def test_a_session_for_a_robot_takes_the_limits_at_its_beginning():
     system = nextview.load(policy="spread", threshold=1.0)
-    session = system.session(distance=0.5, min_height=0.2, max_height=0.4, clearance=0.05)
+    session = system.session(
+        distance=0.5,
+        min_height=0.2,
+        max_height=0.4,
+        clearance=0.05,
+    )
     assert session.limits == Limits(0.2, 0.4, 0.05)
     session.update(look(FROM, BRICK, TABLE))
     assert 0.2 <= session.target[2, 3] <= 0.4
@@ -279,7 +305,9 @@ def test_a_session_with_frames_can_be_pickled_and_goes_on_alike(tiny):
 
 def test_the_values_of_a_view_rank_the_candidates():
     """As the page about cameras says: the largest of those that are left is the target."""
-    session = nextview.load(policy="gain", threshold=1.0, threads=1).session(distance=0.5)
+    session = nextview.load(policy="gain", threshold=1.0, threads=1).session(
+        distance=0.5
+    )
     view = session.update(look(FROM, BRICK, TABLE))
     taken = {earlier.index for earlier in session.views}
     left = [
@@ -313,14 +341,20 @@ def test_a_distance_inside_the_object_is_refused_once_its_size_is_known(tiny):
 
 def test_before_the_first_frame_no_view_has_failed(tiny):
     session = begin(tiny)
-    with pytest.raises(SessionError, match="the first frame comes from wherever the camera stands"):
+    with pytest.raises(
+        SessionError,
+        match="the first frame comes from wherever the camera stands",
+    ):
         session.failed()
     session.failed(3)
     session.update(look(FROM, BRICK, TABLE))
     assert session.left_out[3] == "failed"
 
 
-@pytest.mark.parametrize("wrong", [{"min_height": 100}, {"clearance": 50}, {"max_height": 1400}])
+@pytest.mark.parametrize(
+    "wrong",
+    [{"min_height": 100}, {"clearance": 50}, {"max_height": 1400}],
+)
 def test_limits_in_another_unit_are_refused(wrong):
     with pytest.raises(UsageError, match=r"metres.* of at most 10"):
         Limits(**wrong)

@@ -46,26 +46,42 @@ constant = 3
 def test_k_values_equally_often_are_log2_k_bits(k, times):
     depth = np.repeat(2 + np.arange(k) * 2 * QUANTUM, times).reshape(k, times)
     assert depth_entropy(depth) == pytest.approx(np.log2(k), abs=1e-12)
-    assert depth_entropy(depth.astype(np.float32)) == pytest.approx(np.log2(k), abs=1e-12)
+    assert depth_entropy(depth.astype(np.float32)) == pytest.approx(
+        np.log2(k),
+        abs=1e-12,
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_scikit_image_agrees_on_the_quantised_image(dtype):
     rng = np.random.default_rng(0)
     for _ in range(20):
-        depth = rng.uniform(2, 4, (60, 60)).round(rng.choice([1, 2, 3, 9])).astype(dtype)
+        depth = (
+            rng.uniform(2, 4, (60, 60)).round(rng.choice([1, 2, 3, 9])).astype(dtype)
+        )
         depth[rng.random(depth.shape) < rng.random()] = 0
         levels = np.floor(depth.astype(np.float64) / QUANTUM + 0.5)
-        assert depth_entropy(depth) == pytest.approx(shannon_entropy(levels, base=2), abs=1e-9)
+        assert depth_entropy(depth) == pytest.approx(
+            shannon_entropy(levels, base=2),
+            abs=1e-9,
+        )
 
 
 def test_differences_below_the_quantum_do_not_count():
     depth = 2.5 + np.random.default_rng(1).uniform(-0.4, 0.4, (50, 50)) * QUANTUM
     assert depth_entropy(depth) == 0
-    assert depth_entropy(np.where(np.arange(50) % 2, depth, depth + QUANTUM)) == pytest.approx(1)
+    assert depth_entropy(
+        np.where(np.arange(50) % 2, depth, depth + QUANTUM)
+    ) == pytest.approx(1)
 
 
-@given(npst.arrays(np.float64, (3, 9), elements=st.floats(-100, 100, allow_subnormal=False)))
+@given(
+    npst.arrays(
+        np.float64,
+        (3, 9),
+        elements=st.floats(-100, 100, allow_subnormal=False),
+    )
+)
 def test_normalising_keeps_order_and_ends_at_zero_and_one(values):
     scaled = normalise_per_object(values)
     assert scaled.dtype == np.float32
@@ -74,13 +90,21 @@ def test_normalising_keeps_order_and_ends_at_zero_and_one(values):
             assert (out == 0).all()
             continue
         assert (out.min(), out.max()) == (0, 1)
-        np.testing.assert_allclose(out, np.interp(row, [row.min(), row.max()], [0, 1]), atol=1e-6)
+        np.testing.assert_allclose(
+            out,
+            np.interp(row, [row.min(), row.max()], [0, 1]),
+            atol=1e-6,
+        )
 
 
 def test_confidence_where_right_and_zero_where_wrong():
     half, three_quarters = np.log([1, 1]), np.log([1, 3])
     logits = np.array(
-        [[three_quarters, half], [three_quarters, -three_quarters], [half, three_quarters]]
+        [
+            [three_quarters, half],
+            [three_quarters, -three_quarters],
+            [half, three_quarters],
+        ]
     )
     maps = confidence_maps(logits, np.array([1, 0, 0]))
     # a tie counts for the lower index, so the second view of the first object is wrong and the
@@ -101,14 +125,22 @@ def store(views, tmp_path, monkeypatch) -> Path:
 
 def test_measures_are_kept_and_not_made_twice(store):
     before = ViewStore.open(store).measure()
-    assert list(measure(store, ["own_measures:rows"], workers=0)) == [(k, 18) for k in range(19)]
+    assert list(measure(store, ["own_measures:rows"], workers=0)) == [
+        (k, 18) for k in range(19)
+    ]
     views = ViewStore.open(store)
     rows = (views.group["depth"][3] > 0).any(2)
     heights = [np.ptp(np.flatnonzero(row)) + 1 for row in rows]
     np.testing.assert_array_equal(views.measure("own_measures:rows")[3], heights)
     assert list(measure(store, ["own_measures:rows"], workers=0)) == [(18, 18)]
-    assert len(list(measure(store, ["own_measures:rows"], workers=0, overwrite=True))) == 19
-    assert list(measure(store, ["depth_entropy"], workers=0, overwrite=True))[-1] == (18, 18)
+    assert (
+        len(list(measure(store, ["own_measures:rows"], workers=0, overwrite=True)))
+        == 19
+    )
+    assert list(measure(store, ["depth_entropy"], workers=0, overwrite=True))[-1] == (
+        18,
+        18,
+    )
     np.testing.assert_array_equal(ViewStore.open(store).measure(), before)
 
 
@@ -116,7 +148,10 @@ def test_a_stopped_run_is_completed_by_the_next(store):
     steps = measure(store, ["own_measures:rows"], workers=0)
     next(steps), next(steps)
     steps.close()
-    with pytest.raises(DatasetError, match=r"rows of .* is missing; nextview measure .* makes it"):
+    with pytest.raises(
+        DatasetError,
+        match=r"rows of .* is missing; nextview measure .* makes it",
+    ):
         ViewStore.open(store).measure("own_measures:rows")
     assert len(list(measure(store, ["own_measures:rows"], workers=0))) == 18
     assert ViewStore.open(store).held("measures/own_measures:rows").all()
@@ -127,7 +162,10 @@ def test_a_stopped_run_is_completed_by_the_next(store):
     [
         ("own_measures:endless", "of chair.*, view 0, is not finite"),
         ("own_measures:leave", "measure own_measures:leave of chair.*: SystemExit"),
-        ("own_measures:broken", "measure own_measures:broken of chair.*: AttributeError"),
+        (
+            "own_measures:broken",
+            "measure own_measures:broken of chair.*: AttributeError",
+        ),
         ("own_measures:constant", "is not a function"),
         ("no_such_module:none", "cannot be imported .ModuleNotFoundError"),
         ("own_measures:pixels", "needs the meshes"),

@@ -25,7 +25,16 @@ from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 from nextview.things.weighing import EvidenceWeights
 
-FLOATS = ("views", "rotations", "held_out", "held_out_views", "radii", "head", "head_bias", "boxes")
+FLOATS = (
+    "views",
+    "rotations",
+    "held_out",
+    "held_out_views",
+    "radii",
+    "head",
+    "head_bias",
+    "boxes",
+)
 ARRAYS = (*FLOATS, "thing", "pictures", "places", "faces", "counts")
 
 
@@ -60,7 +69,10 @@ def rewrite(models, change):
     change(arrays)
     weights.unlink()
     weights = models / "memory.safetensors"
-    save_file({name: np.array(values, order="C") for name, values in arrays.items()}, weights)
+    save_file(
+        {name: np.array(values, order="C") for name, values in arrays.items()},
+        weights,
+    )
     about = json.loads(card.read_text())
     card.write_text(json.dumps(about | {"sha256": sha256_of(weights)}))
 
@@ -96,7 +108,9 @@ OF_ONE = {
     ("views", "half as long"): lambda values: values / 2,
     ("held_out", "half as long"): lambda values: values / 2,
     ("rotations", "mirrored"): lambda values: -values,
-    ("rotations", "sheared"): lambda values: values + np.eye(3, k=1, dtype=np.float32) / 10,
+    ("rotations", "sheared"): lambda values: (
+        values + np.eye(3, k=1, dtype=np.float32) / 10
+    ),
     ("rotations", "zero"): lambda values: values * 0,
     ("held_out_views", "in degrees"): np.degrees,
     ("radii", "negative"): lambda values: values * 0 - 0.1,
@@ -161,12 +175,14 @@ def array_mutations():
 
 
 @pytest.mark.parametrize(
-    ("name", "how", "change"), [pytest.param(*m, id="-".join(m[:2])) for m in array_mutations()]
+    ("name", "how", "change"),
+    [pytest.param(*m, id="-".join(m[:2])) for m in array_mutations()],
 )
 def test_every_array_is_checked(models, name, how, change):
     rewrite(models, lambda arrays: arrays.update({name: change(arrays[name])}))
     with pytest.raises(
-        ModelError, match=r"^\S+/mine/memory\.safetensors: (not a memory \()?its .+"
+        ModelError,
+        match=r"^\S+/mine/memory\.safetensors: (not a memory \()?its .+",
     ):
         open_memory(models / "memory.json")
 
@@ -175,17 +191,24 @@ def test_every_array_is_checked(models, name, how, change):
 def test_every_array_has_to_be_there(models, name):
     rewrite(models, lambda arrays: arrays.pop(name))
     with pytest.raises(
-        ModelError, match=rf"memory\.safetensors: not a memory \(it holds no {name}\)"
+        ModelError,
+        match=rf"memory\.safetensors: not a memory \(it holds no {name}\)",
     ):
         open_memory(models / "memory.json")
 
 
-def test_a_memory_of_an_earlier_version_is_refused_in_a_sentence_that_says_what_to_do(models):
+def test_a_memory_of_an_earlier_version_is_refused_in_a_sentence_that_says_what_to_do(
+    models,
+):
     rewrite(
-        models, lambda arrays: [arrays.pop(name) for name in ("places", "faces", "counts", "boxes")]
+        models,
+        lambda arrays: [
+            arrays.pop(name) for name in ("places", "faces", "counts", "boxes")
+        ],
     )
     with pytest.raises(
-        ModelError, match=r"memory\.safetensors: is of an earlier version; teach it again"
+        ModelError,
+        match=r"memory\.safetensors: is of an earlier version; teach it again",
     ):
         open_memory(models / "memory.json")
 
@@ -193,7 +216,10 @@ def test_a_memory_of_an_earlier_version_is_refused_in_a_sentence_that_says_what_
 def fewer_features(arrays):
     for name in ("views", "held_out"):
         kept = arrays[name].astype(np.float32)[..., :-1]
-        arrays[name] = kept / np.maximum(np.linalg.norm(kept, axis=-1, keepdims=True), 1e-9)
+        arrays[name] = kept / np.maximum(
+            np.linalg.norm(kept, axis=-1, keepdims=True),
+            1e-9,
+        )
     arrays["head"] = arrays["head"][:-1]
 
 
@@ -227,9 +253,16 @@ def fewer_things(arrays):
         (fewer_things, "its resting poses are not those of the things on its card"),
     ],
 )
-def test_arrays_that_fit_together_have_to_fit_card_and_features(models, change, sentence):
+def test_arrays_that_fit_together_have_to_fit_card_and_features(
+    models,
+    change,
+    sentence,
+):
     rewrite(models, change)
-    with pytest.raises(ModelError, match=rf"^\S+/mine/memory\.safetensors: {re.escape(sentence)}"):
+    with pytest.raises(
+        ModelError,
+        match=rf"^\S+/mine/memory\.safetensors: {re.escape(sentence)}",
+    ):
         open_recogniser(models / "memory.json")
     with pytest.raises(ModelError, match=r"memory\.safetensors"):
         nextview.learn(models, models, remove=("table",))
@@ -276,7 +309,9 @@ REFUSED = {
     "no hypotheses": set_at("calibration/hypotheses", []),
     "a negative hypothesis": set_at("calibration/hypotheses", lambda h: [-1, *h[1:]]),
     "no calibration": lambda about: about.pop("calibration"),
-    "no calibration of the bins": lambda about: about["calibration"].pop("bin_correlation"),
+    "no calibration of the bins": lambda about: about["calibration"].pop(
+        "bin_correlation"
+    ),
     "negative correlation": set_at("calibration/bin_correlation", -0.1),
     "absurd correlation": set_at("calibration/bin_correlation", 1e30),
     "a temperature of next to nothing": set_at("calibration/temperature", 1e-30),
@@ -301,31 +336,48 @@ REFUSED = {
     "negative weight": set_at("memory/weight", -30.0),
     "endless weight": set_at("memory/weight", 1e300),
     "an empty row of novelty": set_at("memory/novelty", [[]]),
-    "one level of novelty": set_at("memory/novelty", lambda rows: [row[:1] for row in rows]),
+    "one level of novelty": set_at(
+        "memory/novelty", lambda rows: [row[:1] for row in rows]
+    ),
     "ragged novelty": set_at("memory/novelty/0", lambda row: row[:-1]),
     "descending novelty": set_at("memory/novelty/0", lambda row: row[::-1]),
     "novelty of text": set_at("memory/novelty/0/0", "NaN"),
     "novelty of nothing": set_at("memory/novelty/0/0", None),
     "an empty row of usual": set_at("memory/usual", [[]]),
     "ragged usual": set_at("memory/usual/0", lambda row: row[:-1]),
-    "usual of one class more": set_at("memory/usual", lambda rows: [[*row, 0.0] for row in rows]),
+    "usual of one class more": set_at(
+        "memory/usual", lambda rows: [[*row, 0.0] for row in rows]
+    ),
     "a symmetry of order one": set_at(
-        "memory/things/0/symmetries", [{"axis": [0, 0, 1], "order": 1}]
+        "memory/things/0/symmetries",
+        [{"axis": [0, 0, 1], "order": 1}],
     ),
     "a symmetry of negative order": set_at(
-        "memory/things/0/symmetries", [{"axis": [0, 0, 1], "order": -2}]
+        "memory/things/0/symmetries",
+        [{"axis": [0, 0, 1], "order": -2}],
     ),
     "a symmetry about no axis": set_at(
-        "memory/things/0/symmetries", [{"axis": [0, 0, 0], "order": 2}]
+        "memory/things/0/symmetries",
+        [{"axis": [0, 0, 0], "order": 2}],
     ),
     "a symmetry about half an axis": set_at(
-        "memory/things/0/symmetries", [{"axis": [0, 1], "order": 2}]
+        "memory/things/0/symmetries",
+        [{"axis": [0, 1], "order": 2}],
     ),
-    "negative weights": set_at("memory/verification", {"weights": {"geometry": -1}, "things": 3}),
-    "descending residuals": set_at("memory/verification", VERIFIED | {"excess": [[0.2, 0.1]]}),
+    "negative weights": set_at(
+        "memory/verification",
+        {"weights": {"geometry": -1}, "things": 3},
+    ),
+    "descending residuals": set_at(
+        "memory/verification",
+        VERIFIED | {"excess": [[0.2, 0.1]]},
+    ),
     "no residuals": set_at("memory/verification", VERIFIED | {"excess": [[]]}),
     "half of the residuals": set_at("memory/verification", VERIFIED | {"excess": []}),
-    "residuals of one thing less": set_at("memory/verification", VERIFIED | {"usual": [0.1, 0.2]}),
+    "residuals of one thing less": set_at(
+        "memory/verification",
+        VERIFIED | {"usual": [0.1, 0.2]},
+    ),
     "an unknown field": set_at("memory/things/0/colour", "red"),
 }
 
@@ -334,7 +386,8 @@ REFUSED = {
 def test_a_card_that_does_not_fit_is_refused_by_its_name(models, how):
     change = REFUSED[how]
     card = changed_card(
-        models, lambda about: change(Missing(about) if how == "an unknown field" else about)
+        models,
+        lambda about: change(Missing(about) if how == "an unknown field" else about),
     )
     with pytest.raises(ModelError, match=r"^\S+/mine/memory\.(json|safetensors): .+"):
         open_recogniser(card)
@@ -370,13 +423,22 @@ VALUES = {
     "large": lambda value: 10**30,
     "list": lambda value: [],
     "object": lambda value: {},
-    "shorter": lambda value: value[:-1] if isinstance(value, list | str) and value else {},
-    "longer": lambda value: [*value, value[-1]] if isinstance(value, list) and value else [[]],
+    "shorter": lambda value: (
+        value[:-1] if isinstance(value, list | str) and value else {}
+    ),
+    "longer": lambda value: (
+        [*value, value[-1]] if isinstance(value, list) and value else [[]]
+    ),
 }
 
 
 @pytest.mark.parametrize("how", ["dropped", *VALUES])
-def test_any_other_field_is_refused_by_name_or_the_memory_works(models, features, monkeypatch, how):
+def test_any_other_field_is_refused_by_name_or_the_memory_works(
+    models,
+    features,
+    monkeypatch,
+    how,
+):
     monkeypatch.setattr("nextview.things.memory.Features", lambda threads: features)
     card = models / "memory.json"
     original = json.loads(card.read_text())
@@ -412,11 +474,18 @@ def meshes_by_name(scans):
     return {path.stem: load_mesh(path, unit="cm") for path in sorted(scans.iterdir())}
 
 
-def test_a_memory_holds_the_surface_of_each_thing_in_the_frame_of_its_file(sized, scans):
+def test_a_memory_holds_the_surface_of_each_thing_in_the_frame_of_its_file(
+    sized,
+    scans,
+):
     things = TaughtThings.of(open_recogniser(sized / "memory.json"))
     meshes = meshes_by_name(scans)
     assert things.names == tuple(meshes)
-    for surface, mesh in zip(things.verifier.caster.surfaces, meshes.values(), strict=True):
+    for surface, mesh in zip(
+        things.verifier.caster.surfaces,
+        meshes.values(),
+        strict=True,
+    ):
         in_file = (mesh.vertices * mesh.radius + mesh.centre) / 100
         step = np.ptp(in_file, axis=0).max() / 65535
         np.testing.assert_allclose(surface.vertices, in_file, atol=step)
@@ -437,17 +506,31 @@ def test_weights_and_residuals_are_those_on_the_card(models):
 
 @pytest.mark.parametrize(
     ("weights", "sentence"),
-    [({"colour": 1.0}, "colour"), ({"doubt": 2.0}, "doubt"), ({"correlation": 1.5}, "correlation")],
+    [
+        ({"colour": 1.0}, "colour"),
+        ({"doubt": 2.0}, "doubt"),
+        ({"correlation": 1.5}, "correlation"),
+    ],
 )
 def test_weights_that_make_no_sense_are_refused(models, weights, sentence):
-    card = changed_card(models, set_at("memory/verification", VERIFIED | {"weights": weights}))
+    card = changed_card(
+        models,
+        set_at("memory/verification", VERIFIED | {"weights": weights}),
+    )
     with pytest.raises(ModelError, match=rf"mine/memory\.json: .*{sentence}"):
         TaughtThings.of(open_recogniser(card))
 
 
 def square(size, origin, name="square"):
-    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32) * size + origin
-    return Surface(name, corners.astype(np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.int32))
+    corners = (
+        np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32) * size
+        + origin
+    )
+    return Surface(
+        name,
+        corners.astype(np.float32),
+        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+    )
 
 
 @pytest.mark.parametrize("many", [4, 70_000])
@@ -460,5 +543,9 @@ def test_stored_surfaces_come_back_as_they_were(many):
     assert stored.surface(1, "nothing") is None
     for number, surface in ((0, square(0.3, (1, 2, 3))), (2, cloud)):
         again = stored.surface(number, surface.name)
-        np.testing.assert_allclose(again.vertices, surface.vertices, atol=np.ptp(points) / 65535)
+        np.testing.assert_allclose(
+            again.vertices,
+            surface.vertices,
+            atol=np.ptp(points) / 65535,
+        )
         np.testing.assert_array_equal(again.faces, surface.faces)

@@ -27,7 +27,8 @@ PYRAMID = (
 )
 GOOD = "0 0 0\n1 0 0\n0 1 1"
 FACET = (
-    "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 1\nendloop\nendfacet\n"
+    "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 "
+    "0 0\nvertex 0 1 1\nendloop\nendfacet\n"
 )
 TRIANGLE = (
     np.array([[0, 0, 0], [1, 0, 0], [0, 1, 1]], "<f4").tobytes()
@@ -55,7 +56,9 @@ def triangles(mesh: Mesh) -> np.ndarray:
     corners = np.round(mesh.vertices[mesh.faces] + 0.0, 5)
     first = np.lexsort(corners.transpose(2, 0, 1)[::-1], axis=-1)[:, 0]
     rotated = np.take_along_axis(
-        corners, ((first[:, None] + np.arange(3)) % 3)[..., None], 1
+        corners,
+        ((first[:, None] + np.arange(3)) % 3)[..., None],
+        1,
     ).reshape(-1, 9)
     return rotated[np.lexsort(rotated.T[::-1])]
 
@@ -73,9 +76,11 @@ def off(vertices: str, faces: str) -> str:
 
 def vertices_edited(replacement: str) -> str:
     """The pyramid with every line of three numbers replaced but the counts."""
-    return re.sub(r"(?m)^(\d) (\d) (\d)$", replacement, PYRAMID.replace("5 6 9", "counts")).replace(
-        "counts", "5 6 9"
-    )
+    return re.sub(
+        r"(?m)^(\d) (\d) (\d)$",
+        replacement,
+        PYRAMID.replace("5 6 9", "counts"),
+    ).replace("counts", "5 6 9")
 
 
 def ply(faces: int, body: str) -> str:
@@ -125,7 +130,10 @@ def one_triangle(positions=None, view=None, **changes) -> dict:
 # Reading
 
 
-@pytest.mark.parametrize("kind", ["off", "obj", "ply", "ply ascii", "stl", "stl_ascii", "glb"])
+@pytest.mark.parametrize(
+    "kind",
+    ["off", "obj", "ply", "ply ascii", "stl", "stl_ascii", "glb"],
+)
 def test_every_format_gives_the_same_mesh(tmp_path, kind):
     shape = wedge()
     if kind == "glb":  # y up: x stays, the height is y, and -y is the depth z
@@ -170,7 +178,9 @@ def test_the_fast_and_the_tolerant_way_of_reading_off_agree(data):
     vertices = data.draw(
         st.lists(st.tuples(numbers, numbers, numbers), min_size=count, max_size=count)
     )
-    faces = data.draw(st.lists(st.tuples(corner, corner, corner), min_size=1, max_size=6))
+    faces = data.draw(
+        st.lists(st.tuples(corner, corner, corner), min_size=1, max_size=6)
+    )
     text = off(
         "\n".join(f"{x!r} {y!r} {z!r}" for x, y, z in vertices),
         "\n".join("3 {} {} {}".format(*f) for f in faces),
@@ -183,11 +193,14 @@ def test_the_fast_and_the_tolerant_way_of_reading_off_agree(data):
         np.testing.assert_array_equal(read[1], faces)
 
 
-def test_parts_of_an_obj_are_joined_and_relative_indices_count_from_where_they_stand(tmp_path):
+def test_parts_of_an_obj_are_joined_and_relative_indices_count_from_where_they_stand(
+    tmp_path,
+):
     # The format's own example: every face takes the four vertices just before it.
     squares = [np.add(SQUARE, (0, 0, height)) for height in (0, 1, 5)]
     text = "".join(
-        "o a\n" + "".join("v {} {} {}\n".format(*v) for v in s) + "f -4 -3 -2 -1\n" for s in squares
+        "o a\n" + "".join("v {} {} {}\n".format(*v) for v in s) + "f -4 -3 -2 -1\n"
+        for s in squares
     )
     mesh = load_mesh(write(tmp_path, "squares.obj", text))
     found = (mesh.vertices * mesh.radius + mesh.centre)[mesh.faces]
@@ -210,7 +223,12 @@ def test_parts_of_an_obj_are_joined_and_relative_indices_count_from_where_they_s
 @pytest.mark.parametrize("change", [str, lambda text: text.replace("\n", "\r\n")])
 def test_obj_as_it_is_found_in_the_wild(tmp_path, faces, change):
     apex = "v 1 1 -3 0.5 0.5 0.5 # with a colour\nvt 0 0\nvn 0 0 1\n"
-    text = "mtllib none.mtl\n\n" + "".join("v {} {} {}\n".format(*v) for v in SQUARE) + apex + faces
+    text = (
+        "mtllib none.mtl\n\n"
+        + "".join("v {} {} {}\n".format(*v) for v in SQUARE)
+        + apex
+        + faces
+    )
     mesh = load_mesh(write(tmp_path, "pyramid.obj", change(text)))
     closed = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert len(mesh.faces) == 6
@@ -221,16 +239,30 @@ def test_obj_as_it_is_found_in_the_wild(tmp_path, faces, change):
 def test_parts_of_a_glb_stand_where_its_nodes_put_them(tmp_path):
     """A chain of nodes that rotate, scale and move, computed by hand."""
     # x to y, y to z, z to x
-    first = {"translation": [1, 2, 3], "rotation": [0.5, 0.5, 0.5, 0.5], "scale": [2, 3, 4]}
-    nodes = [first | {"children": [1, 2]}, {"mesh": 0}, {"mesh": 0, "scale": [0.5, 0.5, 0.5]}]
-    mesh = load_mesh(write(tmp_path, "chain.glb", glb(one_triangle(nodes=nodes), TRIANGLE)), up="z")
+    first = {
+        "translation": [1, 2, 3],
+        "rotation": [0.5, 0.5, 0.5, 0.5],
+        "scale": [2, 3, 4],
+    }
+    nodes = [
+        first | {"children": [1, 2]},
+        {"mesh": 0},
+        {"mesh": 0, "scale": [0.5, 0.5, 0.5]},
+    ]
+    mesh = load_mesh(
+        write(tmp_path, "chain.glb", glb(one_triangle(nodes=nodes), TRIANGLE)),
+        up="z",
+    )
     plain = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 1.0]])
     expected = [
-        np.add(np.roll(scale * plain * (2, 3, 4), 1, axis=1), (1, 2, 3)) for scale in (1, 0.5)
+        np.add(np.roll(scale * plain * (2, 3, 4), 1, axis=1), (1, 2, 3))
+        for scale in (1, 0.5)
     ]
     found = (mesh.vertices * mesh.radius + mesh.centre)[mesh.faces]
     np.testing.assert_allclose(
-        sorted(found.round(9).tolist()), sorted(np.round(expected, 9).tolist()), atol=1e-6
+        sorted(found.round(9).tolist()),
+        sorted(np.round(expected, 9).tolist()),
+        atol=1e-6,
     )
 
 
@@ -244,14 +276,22 @@ def test_parts_of_a_glb_stand_where_its_nodes_put_them(tmp_path):
     st.sampled_from([0.0, 1.0, -100.0, 1e5]),
 )
 def test_the_object_frame(shape, scale, offset):
-    positions = (np.vstack([shape, np.eye(3)]) + offset) * scale  # one face at least has an area
-    mesh = make_mesh(positions, [[0, 1, 2], [2, 3, 4], [4, 5, 6], [6, 7, 0], [8, 9, 10]])
+    positions = (
+        np.vstack([shape, np.eye(3)]) + offset
+    ) * scale  # one face at least has an area
+    mesh = make_mesh(
+        positions,
+        [[0, 1, 2], [2, 3, 4], [4, 5, 6], [6, 7, 0], [8, 9, 10]],
+    )
     assume(len(mesh.vertices) == len(positions))  # no triangle is a copy of another one
     np.testing.assert_allclose(mesh.vertices.min(0), -mesh.vertices.max(0), atol=1e-7)
     assert np.linalg.norm(mesh.vertices, axis=1).max() == pytest.approx(1)
     rounding = 1e-12 * scale * max(abs(offset), 1)
     np.testing.assert_allclose(
-        mesh.vertices * mesh.radius + mesh.centre, positions, rtol=0, atol=rounding
+        mesh.vertices * mesh.radius + mesh.centre,
+        positions,
+        rtol=0,
+        atol=rounding,
     )
 
 
@@ -264,7 +304,10 @@ def test_a_mesh_is_the_same_with_copies_of_its_triangles():
         ball.faces[:, ::-1],
         ball.faces + len(ball.vertices),
     ]
-    doubled = make_mesh(np.concatenate([ball.vertices, ball.vertices]), np.concatenate(copies))
+    doubled = make_mesh(
+        np.concatenate([ball.vertices, ball.vertices]),
+        np.concatenate(copies),
+    )
     np.testing.assert_array_equal(doubled.faces, plain.faces)
     np.testing.assert_array_equal(doubled.vertices, plain.vertices)
 
@@ -273,22 +316,37 @@ def test_a_mesh_is_the_same_with_copies_of_its_triangles():
 
 
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
-MANY_TIMES = one_triangle(scenes=[{"nodes": list(range(101))}], nodes=101 * [{"mesh": 0}])
+MANY_TIMES = one_triangle(
+    scenes=[{"nodes": list(range(101))}],
+    nodes=101 * [{"mesh": 0}],
+)
 BROKEN = {
     "no faces": ("a.off", "OFF\n3 0 0\n" + GOOD, "holds 3 points and no faces"),
     "index too high": ("a.off", off(GOOD, "3 0 1 3"), "outside of the 3"),
     "too few corners": ("a.off", off(GOOD, "3 0 1"), "face 0 has 2 of 3 corners"),
-    "NaN": ("a.off", off("0 0 nan\n1 0 0\n0 1 0", "3 0 1 2"), "1 vertices are NaN or infinite"),
+    "NaN": (
+        "a.off",
+        off("0 0 nan\n1 0 0\n0 1 0", "3 0 1 2"),
+        "1 vertices are NaN or infinite",
+    ),
     "too large": (
         "a.off",
         off("-1.7e308 -1.7e308 0\n1.7e308 0 0\n0 1.7e308 0", "3 0 1 2"),
         "too large",
     ),
     "one place": ("a.off", off("5 5 5\n5 5 5\n5 5 5", "3 0 1 2"), "no extent"),
-    "a slanted line": ("a.off", off("0.1 0.1 0.1\n0.2 0.3 0.4\n0.3 0.5 0.7", "3 0 1 2"), "no area"),
+    "a slanted line": (
+        "a.off",
+        off("0.1 0.1 0.1\n0.2 0.3 0.4\n0.3 0.5 0.7", "3 0 1 2"),
+        "no area",
+    ),
     "another format": ("a.off", "solid x\nendsolid x\n", "does not begin with OFF"),
     "unknown suffix": ("a.xyz", "0 0 0\n", "not a mesh format"),
-    "cut in its faces": ("a.off", PYRAMID[: PYRAMID.index("3 3 0")], "cut short.*6 faces.*5 found"),
+    "cut in its faces": (
+        "a.off",
+        PYRAMID[: PYRAMID.index("3 3 0")],
+        "cut short.*6 faces.*5 found",
+    ),
     "cut where the numbers come out even": (
         "a.off",
         "COFF\n3 3 0\n3 0 0 1 0 0 0\n1 0 3 0 1 2 3\n0 1 2 3 0 1 2\n",
@@ -305,7 +363,11 @@ BROKEN = {
         off(GOOD, "3 0 1 2\n" * 101),
         "101 triangles, more than 100; --max-faces",
     ),
-    "OBJ index too high": ("a.obj", OBJ + "f 1 2 4\n", "vertex 4, but there are only 3"),
+    "OBJ index too high": (
+        "a.obj",
+        OBJ + "f 1 2 4\n",
+        "vertex 4, but there are only 3",
+    ),
     "OBJ index of no vertex yet": ("a.obj", f"f -1 1 2\n{OBJ}", "0 come before it"),
     "OBJ cut in a face": ("a.obj", OBJ + "f 1 2 3\nf 1 2", "cut short"),
     "PLY index too high": ("a.ply", ply(1, GOOD + "\n3 0 1 3\n"), "vertex 3"),
@@ -314,8 +376,16 @@ BROKEN = {
         trimesh.PointCloud(np.eye(3)).export(file_type="ply"),
         "holds 3 points and no faces",
     ),
-    "PLY of more rows than lines": ("a.ply", ply(BIG, GOOD + "\n3 0 1 2\n"), "cut short"),
-    "PLY of a list longer than the file": ("a.ply", ply(1, GOOD + f"\n{BIG} 0 1 2\n"), ""),
+    "PLY of more rows than lines": (
+        "a.ply",
+        ply(BIG, GOOD + "\n3 0 1 2\n"),
+        "cut short",
+    ),
+    "PLY of a list longer than the file": (
+        "a.ply",
+        ply(1, GOOD + f"\n{BIG} 0 1 2\n"),
+        "",
+    ),
     "STL cut in its second solid": (
         "a.stl",
         2 * exported(wedge(), "stl_ascii")[:-30] + b"\n",
@@ -326,14 +396,22 @@ BROKEN = {
         glb(one_triangle({"bufferView": None, "count": BIG}), TRIANGLE),
         "than its bytes",
     ),
-    "GLB of more positions than bytes": ("a.glb", glb(one_triangle({"count": BIG}), TRIANGLE), ""),
+    "GLB of more positions than bytes": (
+        "a.glb",
+        glb(one_triangle({"count": BIG}), TRIANGLE),
+        "",
+    ),
     "GLB view beyond the buffer": (
         "a.glb",
         glb(one_triangle(view={"byteOffset": 1 << 40}), TRIANGLE),
         "",
     ),
     "GLB sparse": ("a.glb", glb(one_triangle({"sparse": {}}), TRIANGLE), "sparse"),
-    "GLB quantised": ("a.glb", glb(one_triangle({"normalized": True}), TRIANGLE), "fractions"),
+    "GLB quantised": (
+        "a.glb",
+        glb(one_triangle({"normalized": True}), TRIANGLE),
+        "fractions",
+    ),
     "GLB elsewhere": (
         "a.glb",
         glb(one_triangle(buffers=[{"uri": "x.bin"}])),
@@ -361,7 +439,10 @@ def test_a_broken_file_gets_one_sentence_in_little_memory(tmp_path, case, capfd)
     name, content, part = BROKEN[case]
     path = write(tmp_path, name, content)
     tracemalloc.start()
-    with pytest.raises(MeshError, match=f"^{re.escape(str(path))}: .*{part}") as refusal:
+    with pytest.raises(
+        MeshError,
+        match=f"^{re.escape(str(path))}: .*{part}",
+    ) as refusal:
         load_mesh(path, max_faces=100)
     assert tracemalloc.get_traced_memory()[1] < 10e6
     tracemalloc.stop()
@@ -373,12 +454,22 @@ HARMLESS = {
     "a texture that is none": (
         "a.glb",
         glb(
-            one_triangle(images=[{"uri": "x.png"}], textures=[{"source": 0}], materials=[{}]),
+            one_triangle(
+                images=[{"uri": "x.png"}],
+                textures=[{"source": 0}],
+                materials=[{}],
+            ),
             TRIANGLE,
         ),
     ),
-    "a Latin-1 name": ("a.stl", f"solid T\xfcr\n{FACET}endsolid T\xfcr\n".encode("latin-1")),
-    "copies": ("a.off", "OFF\n3 200000 0\n" + GOOD + "\n" + "3 0 1 2\n3 2 1 0\n" * 100_000),
+    "a Latin-1 name": (
+        "a.stl",
+        f"solid T\xfcr\n{FACET}endsolid T\xfcr\n".encode("latin-1"),
+    ),
+    "copies": (
+        "a.off",
+        "OFF\n3 200000 0\n" + GOOD + "\n" + "3 0 1 2\n3 2 1 0\n" * 100_000,
+    ),
     "a binary STL that begins with solid": (
         "a.stl",
         b"solid".ljust(80)
@@ -421,7 +512,9 @@ def test_a_file_cut_anywhere_is_refused(tmp_path, kind):
 
 
 @settings(
-    deadline=None, max_examples=80, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    deadline=None,
+    max_examples=80,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(st.sampled_from(["off", "obj", "ply", "ply ascii", "stl", "glb"]), st.data())
 def test_damaged_bytes_never_give_another_error(tmp_path, kind, data):

@@ -30,7 +30,10 @@ def assert_is_the_house(mesh) -> None:
     """See that a mesh is the house, which is closed, in the units of the file."""
     assert len(mesh.vertices) in (10, 3 * len(mesh.faces))
     a, b, c = (mesh.vertices[corner] * mesh.radius for corner in mesh.faces.T)
-    assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(AREA, rel=1e-5)
+    assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(
+        AREA,
+        rel=1e-5,
+    )
     np.testing.assert_allclose(mesh.centre, (1.5, 1, 1), atol=1e-6)
 
 
@@ -55,10 +58,18 @@ def as_off(name="") -> str:
 def as_ply(name="") -> str:
     header = [f"ply\nformat ascii 1.0\ncomment {name}\nelement vertex {len(POINTS)}"]
     header += [f"property float {axis}" for axis in "xyz"]
-    header += [f"element face {len(FACES)}", "property list uchar int vertex_indices", "end_header"]
+    header += [
+        f"element face {len(FACES)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    ]
     return (
         "\n".join(
-            [*header, *map(numbers, POINTS), *(numbers([len(face), *face]) for face in FACES)]
+            [
+                *header,
+                *map(numbers, POINTS),
+                *(numbers([len(face), *face]) for face in FACES),
+            ]
         )
         + "\n"
     )
@@ -66,7 +77,8 @@ def as_ply(name="") -> str:
 
 def as_stl(name="", end="endsolid", normal="facet normal 0 0 0") -> str:
     loops = [
-        "\n".join(f"vertex {numbers(POINTS[i])}" for i in triangle) for triangle in triangles()
+        "\n".join(f"vertex {numbers(POINTS[i])}" for i in triangle)
+        for triangle in triangles()
     ]
     facets = [f"{normal}\nouter loop\n{loop}\nendloop\nendfacet" for loop in loops]
     return "\n".join([f"solid {name}", *facets, f"{end} {name}"]) + "\n"
@@ -92,14 +104,21 @@ ENCODINGS = {
 def test_a_text_in_any_encoding_is_the_same_mesh(tmp_path, kind, encoding, ends):
     mark, codec = ENCODINGS[encoding]
     path = tmp_path / f"house.{kind}"
-    path.write_bytes(mark + TEXTS[kind]("B\xfcro \xb5").replace("\n", ends).encode(codec))
+    path.write_bytes(
+        mark + TEXTS[kind]("B\xfcro \xb5").replace("\n", ends).encode(codec)
+    )
     assert_is_the_house(load_mesh(path))
 
 
 @pytest.mark.parametrize("kind", TEXTS)
-def test_a_text_that_is_not_in_the_encoding_that_it_announces_is_refused(tmp_path, kind):
+def test_a_text_that_is_not_in_the_encoding_that_it_announces_is_refused(
+    tmp_path,
+    kind,
+):
     path = tmp_path / f"house.{kind}"
-    path.write_bytes(codecs.BOM_UTF16_LE + TEXTS[kind]().encode("utf-16-le") + b"\x00\xd8\x20")
+    path.write_bytes(
+        codecs.BOM_UTF16_LE + TEXTS[kind]().encode("utf-16-le") + b"\x00\xd8\x20"
+    )
     with pytest.raises(MeshError, match="begins as UTF-16-LE text, but is none"):
         load_mesh(path)
 
@@ -108,7 +127,13 @@ def test_a_text_that_is_not_in_the_encoding_that_it_announces_is_refused(tmp_pat
 
 
 def binary_ply(
-    order="<", count="u1", index="i4", extra=(), lists=(), faces=FACES, points=POINTS
+    order="<",
+    count="u1",
+    index="i4",
+    extra=(),
+    lists=(),
+    faces=FACES,
+    points=POINTS,
 ) -> bytes:
     """The house in binary, with columns beside those that are needed, and lists of three floats
     before the corners.
@@ -130,8 +155,13 @@ def binary_ply(
     header += [
         f"element camera 2\nproperty list {names[count]} short pixels\nproperty double focal"
     ]
-    header += [f"element vertex {len(points)}", *(f"property float {axis}" for axis in "xyz")]
-    header += [f"property uchar {name}" for name in extra] + [f"element face {len(faces)}"]
+    header += [
+        f"element vertex {len(points)}",
+        *(f"property float {axis}" for axis in "xyz"),
+    ]
+    header += [f"property uchar {name}" for name in extra] + [
+        f"element face {len(faces)}"
+    ]
     header += [f"property list {names[count]} float {name}" for name in lists]
     header += [f"property list {names[count]} {names[index]} vertex_index"]
     header += [f"property uchar {name}" for name in extra] + ["end_header\n"]
@@ -140,7 +170,8 @@ def binary_ply(
         return np.array(values, order + kind).tobytes()
 
     body = b"".join(
-        column([n], count) + column(range(n), "i2") + column([1.5], "f8") for n in (2, 3)
+        column([n], count) + column(range(n), "i2") + column([1.5], "f8")
+        for n in (2, 3)
     )
     body += b"".join(column(point, "f4") + bytes(len(extra)) for point in points)
     for face in faces:
@@ -190,7 +221,8 @@ def test_numbers_beside_lists_of_different_lengths(tmp_path, order):
         f" {len(POINTS)}\n"
     )
     header += (
-        "property float x\nproperty list uchar short faces\nproperty double y\nproperty float z\n"
+        "property float x\nproperty list uchar short faces\n"
+        "property double y\nproperty float z\n"
     )
     header += f"element face {len(FACES)}\nproperty list int ushort vertex_indices\nend_header\n"
     body = b""
@@ -200,10 +232,14 @@ def test_numbers_beside_lists_of_different_lengths(tmp_path, order):
             + bytes([k % 3])
             + np.arange(k % 3, dtype=f"{order}i2").tobytes()
         )
-        body += np.array([y], f"{order}f8").tobytes() + np.array([z], f"{order}f4").tobytes()
+        body += (
+            np.array([y], f"{order}f8").tobytes()
+            + np.array([z], f"{order}f4").tobytes()
+        )
     for face in FACES:
         body += (
-            np.array([len(face)], f"{order}i4").tobytes() + np.array(face, f"{order}u2").tobytes()
+            np.array([len(face)], f"{order}i4").tobytes()
+            + np.array(face, f"{order}u2").tobytes()
         )
     path = tmp_path / "house.ply"
     path.write_bytes(header.encode() + body)
@@ -219,18 +255,26 @@ STRIP_TRIANGLES = [(0, 1, 2), (2, 1, 3), (3, 2, 4), (4, 5, 6), (4, 6, 7)]
 def test_triangle_strips(tmp_path, text):
     points = np.array([(k, k % 2, k * k / 9) for k in range(8)], float)
     header = f"ply\nformat {'ascii' if text else 'binary_little_endian'} 1.0\nelement vertex 8\n"
-    header += "property double x\nproperty double y\nproperty double z\nelement tristrips 2\n"
+    header += (
+        "property double x\nproperty double y\nproperty double z\nelement tristrips 2\n"
+    )
     header += "property list int int vertex_indices\nend_header\n"
-    body = "\n".join([*map(numbers, points), *(numbers([len(s), *s]) for s in STRIPS)]).encode()
+    body = "\n".join(
+        [*map(numbers, points), *(numbers([len(s), *s]) for s in STRIPS)]
+    ).encode()
     if not text:
-        body = points.tobytes() + b"".join(np.array([len(s), *s], "<i4").tobytes() for s in STRIPS)
+        body = points.tobytes() + b"".join(
+            np.array([len(s), *s], "<i4").tobytes() for s in STRIPS
+        )
     path = tmp_path / "strips.ply"
     path.write_bytes(header.encode() + body)
     mesh = load_mesh(path)
     found = (mesh.vertices * mesh.radius + mesh.centre)[mesh.faces]
     for triangle, corners in zip(STRIP_TRIANGLES, found, strict=True):
         np.testing.assert_allclose(
-            corners, [(k, k % 2, round(k * k / 9, 5)) for k in triangle], atol=1e-4
+            corners,
+            [(k, k % 2, round(k * k / 9, 5)) for k in triangle],
+            atol=1e-4,
         )
 
 
@@ -295,7 +339,10 @@ REFUSED = {
         header_of(*XYZ, "element face 1", CORNERS) + "3 0 one 2\n",
         "something other than numbers",
     ),
-    "less than no rows": (header_of(*XYZ, "element face -1", CORNERS), "announces -1 rows"),
+    "less than no rows": (
+        header_of(*XYZ, "element face -1", CORNERS),
+        "announces -1 rows",
+    ),
     "rows that are no number": (
         header_of(*XYZ, "element face many", CORNERS),
         "the line 'element face many'",
@@ -304,7 +351,10 @@ REFUSED = {
         header_of(*XYZ, "element face", CORNERS),
         "the line 'element face'",
     ),
-    "two elements of one name": (header_of(*XYZ, "element vertex 3", *XYZ), "two elements vertex"),
+    "two elements of one name": (
+        header_of(*XYZ, "element vertex 3", *XYZ),
+        "two elements vertex",
+    ),
     "a column of nothing": (
         "ply\nformat ascii 1.0\nproperty float x\nend_header\n0\n",
         "before any element",
@@ -313,7 +363,10 @@ REFUSED = {
         header_of(*XYZ, "element face 1", "property list int vertex_indices"),
         "property list int",
     ),
-    "no format": ("ply\nelement vertex 1\nend_header\n0\n", "binary_big_endian, not missing"),
+    "no format": (
+        "ply\nelement vertex 1\nend_header\n0\n",
+        "binary_big_endian, not missing",
+    ),
     "a binary file saved as text": (
         codecs.BOM_UTF16_LE + binary_ply().decode("latin-1").encode("utf-16-le"),
         "binary file that was saved as UTF-16-LE text",
@@ -336,10 +389,20 @@ def test_a_ply_that_is_no_mesh_is_called_what_it_is(tmp_path, case, capfd):
 
 @pytest.mark.parametrize("end", ["endsolid", "end solid", "  ENDSOLID", "EndSolid"])
 @pytest.mark.parametrize(
-    "name", ["", "vertex", "a vertex 1 2 3", "endsolid", "my endsolid endloop", "solid solid"]
+    "name",
+    ["", "vertex", "a vertex 1 2 3", "endsolid", "my endsolid endloop", "solid solid"],
 )
-@pytest.mark.parametrize("normal", ["facet normal 0 0 1", "facet normal nan nan nan", "facet", ""])
-def test_stl_texts_with_any_name_and_without_normals(tmp_path, name, end, normal, capfd):
+@pytest.mark.parametrize(
+    "normal",
+    ["facet normal 0 0 1", "facet normal nan nan nan", "facet", ""],
+)
+def test_stl_texts_with_any_name_and_without_normals(
+    tmp_path,
+    name,
+    end,
+    normal,
+    capfd,
+):
     path = tmp_path / "house.stl"
     path.write_text(as_stl(name, end, normal))
     assert_is_the_house(load_mesh(path))
@@ -358,7 +421,8 @@ def binary_stl(header=b"", after=b"", announced=None) -> bytes:
 
 
 @pytest.mark.parametrize(
-    "header", [b"", b"solid", b"solid with a vertex", b"\xfe\xff", b"s\0o\0l\0i\0d\0"]
+    "header",
+    [b"", b"solid", b"solid with a vertex", b"\xfe\xff", b"s\0o\0l\0i\0d\0"],
 )
 @pytest.mark.parametrize("after", [b"", b"\n", b"end of the file"])
 def test_binary_stl_with_any_header_and_bytes_after_its_end(tmp_path, header, after):
@@ -394,14 +458,26 @@ def test_a_signalling_nan_in_single_precision_is_refused_like_any_other(tmp_path
     # converting it sets the processor's flag of invalid operations
     numbers.view("<u4")[5] = 0x7F81_0000
     if kind == "stl":
-        data = bytes(80) + (1).to_bytes(4, "little") + bytes(12) + numbers.tobytes() + bytes(2)
+        data = (
+            bytes(80)
+            + (1).to_bytes(4, "little")
+            + bytes(12)
+            + numbers.tobytes()
+            + bytes(2)
+        )
     else:
         columns = "".join(f"property float {axis}\n" for axis in "xyz")
         header = (
-            f"ply\nformat binary_little_endian 1.0\nelement vertex 3\n{columns}element face 1\n"
+            "ply\nformat binary_little_endian 1.0\nelement "
+            f"vertex 3\n{columns}element face 1\n"
         )
         header += "property list uchar int vertex_indices\nend_header\n"
-        data = header.encode() + numbers.tobytes() + b"\3" + np.arange(3, dtype="<i4").tobytes()
+        data = (
+            header.encode()
+            + numbers.tobytes()
+            + b"\3"
+            + np.arange(3, dtype="<i4").tobytes()
+        )
     path = tmp_path / f"nan.{kind}"
     path.write_bytes(data)
     with pytest.raises(MeshError, match="finite"):
@@ -411,7 +487,9 @@ def test_a_signalling_nan_in_single_precision_is_refused_like_any_other(tmp_path
 # Dialects, and files that are something else
 
 
-BARE = "\n".join([*map(numbers, POINTS), *(numbers([len(face), *face]) for face in FACES)])
+BARE = "\n".join(
+    [*map(numbers, POINTS), *(numbers([len(face), *face]) for face in FACES)]
+)
 COLOURED = "\n".join(
     [
         *(f"{numbers(p)} 0.5 0.25 1 1" for p in POINTS),
@@ -458,7 +536,11 @@ FOREIGN = {
         f"4OFF\n{COUNTS} 0\n{COLOURED}",
         "begins with 4OFF, a kind of OFF that",
     ),
-    "OFF of any dimension": ("a.off", f"nOFF 3\n{COUNTS} 0\n{BARE}", "begins with nOFF"),
+    "OFF of any dimension": (
+        "a.off",
+        f"nOFF 3\n{COUNTS} 0\n{BARE}",
+        "begins with nOFF",
+    ),
     "OFF in binary": ("a.off", b"OFF BINARY\n" + bytes(60), "begins with OFF BINARY"),
     "gzip": ("a.obj", gzip.compress(as_obj().encode()), "packed with gzip; unpack"),
     "bzip2": ("a.ply", bz2.compress(as_ply().encode()), "packed with bzip2"),
@@ -500,15 +582,25 @@ def test_a_file_that_is_something_else_is_called_what_it_is(tmp_path, case):
     name, content, sentence = FOREIGN[case]
     path = tmp_path / name
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    with pytest.raises(MeshError, match=f"{name}: not a readable .*{re.escape(sentence)}"):
+    with pytest.raises(
+        MeshError,
+        match=f"{name}: not a readable .*{re.escape(sentence)}",
+    ):
         load_mesh(path)
 
 
 @pytest.mark.parametrize("kind", TEXTS)
 def test_decimal_commas_are_named(tmp_path, kind):
     path = tmp_path / f"house.{kind}"
-    halves = re.sub(r"(?m)^(v |vertex )?(\d) (\d) (\d)$", r"\g<1>\2,5 \3,0 \4,0", TEXTS[kind]())
+    halves = re.sub(
+        r"(?m)^(v |vertex )?(\d) (\d) (\d)$",
+        r"\g<1>\2,5 \3,0 \4,0",
+        TEXTS[kind](),
+    )
     assert ",5 " in halves
     path.write_text(halves)
-    with pytest.raises(MeshError, match=r"decimal commas \(\d,5\); export it with points"):
+    with pytest.raises(
+        MeshError,
+        match=r"decimal commas \(\d,5\); export it with points",
+    ):
         load_mesh(path)

@@ -47,7 +47,11 @@ def ground(side: float, steps: int = 60) -> trimesh.Trimesh:
     points = np.stack([x, y, 0.001 * NOISE.standard_normal(x.shape)], -1).reshape(-1, 3)
     corner = (np.arange(steps - 1)[:, None] * steps + np.arange(steps - 1)).ravel()
     faces = np.concatenate(
-        [[corner, corner + 1, corner + steps], [corner + 1, corner + steps + 1, corner + steps]], 1
+        [
+            [corner, corner + 1, corner + steps],
+            [corner + 1, corner + steps + 1, corner + steps],
+        ],
+        1,
     )
     return trimesh.Trimesh(points, faces.T, process=False)
 
@@ -69,7 +73,11 @@ def saved(path, shape: trimesh.Trimesh):
 
 
 SCANS = {
-    "a loose piece": ((thing(), thing(0.004).apply_translation((0.5, 0, 0.1))), False, "2 parts"),
+    "a loose piece": (
+        (thing(), thing(0.004).apply_translation((0.5, 0, 0.1))),
+        False,
+        "2 parts",
+    ),
     "crumbs around": (
         (thing(), *(thing(0.001).apply_translation((x, 0.4, 0)) for x in (-0.4, 0.4))),
         False,
@@ -93,18 +101,23 @@ def test_what_does_not_belong_to_an_object_is_asked_about(tmp_path, name, kind, 
     parts, connected, sentence = SCANS[name]
     shape = joined(*parts, connected=connected)
     if turn:  # a scanner's own axes
-        shape.vertices = shape.vertices @ Rotation.from_euler("xyz", (0.4, -1.1, 2)).as_matrix().T
+        shape.vertices = (
+            shape.vertices @ Rotation.from_euler("xyz", (0.4, -1.1, 2)).as_matrix().T
+        )
     doubts = mesh_warnings(load_mesh(saved(tmp_path / f"scan.{kind}", shape)))
     assert len(doubts) == 1
     assert sentence in doubts[0]
 
     if not connected:
         mesh = load_mesh(tmp_path / f"scan.{kind}", largest_part=True)
-        alone = make_mesh(*(np.asarray(each) for each in (shape.vertices, parts[0].faces)))
+        alone = make_mesh(
+            *(np.asarray(each) for each in (shape.vertices, parts[0].faces))
+        )
         assert len(mesh.faces) == len(parts[0].faces)
         assert mesh.radius == pytest.approx(alone.radius, rel=1e-5)
         assert re.fullmatch(
-            r"the largest of its \d parts was taken, \d+% of the surface", *mesh_warnings(mesh)
+            r"the largest of its \d parts was taken, \d+% of the surface",
+            *mesh_warnings(mesh),
         )
 
 
@@ -142,13 +155,15 @@ def test_nothing_is_asked_about_an_object(shape):
 
 def test_a_plate_alone_is_its_own_largest_part(tmp_path):
     path = saved(
-        tmp_path / "plate.ply", joined(disc(0.2), thing(0.002).apply_translation((0.5, 0, 0)))
+        tmp_path / "plate.ply",
+        joined(disc(0.2), thing(0.002).apply_translation((0.5, 0, 0))),
     )
     assert len(load_mesh(path, largest_part=True).faces) == len(disc(0.2).faces)
 
 
 @pytest.mark.parametrize(
-    "content", ["v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n"]
+    "content",
+    ["v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n"],
 )
 def test_a_broken_file_is_refused_with_the_option_too(tmp_path, content):
     (tmp_path / "broken.obj").write_text(content)
@@ -167,7 +182,10 @@ def test_a_mesh_of_one_part_is_the_same_with_the_option(tmp_path):
 @pytest.mark.parametrize(("unit", "radius"), [("m", 70), ("mm", 0.5)])
 def test_an_odd_size_is_asked_about(unit, radius):
     egg = thing(radius)
-    assert f"is its unit {unit}?" in mesh_warnings(make_mesh(egg.vertices, egg.faces, unit=unit))[0]
+    assert (
+        f"is its unit {unit}?"
+        in mesh_warnings(make_mesh(egg.vertices, egg.faces, unit=unit))[0]
+    )
     assert mesh_warnings(make_mesh(egg.vertices, egg.faces)) == ()
 
 
@@ -176,7 +194,8 @@ def test_an_odd_size_is_asked_about(unit, radius):
 
 @pytest.mark.parametrize("kind", ["ply", "stl", "obj"])
 @pytest.mark.parametrize(
-    ("offset", "lost"), [(1e3, False), (1e4, False), (1e6, True), (-4e6, True)]
+    ("offset", "lost"),
+    [(1e3, False), (1e4, False), (1e6, True), (-4e6, True)],
 )
 def test_a_scan_far_from_its_origin_in_single_precision(tmp_path, kind, offset, lost):
     egg = thing()
@@ -190,13 +209,20 @@ def test_a_scan_far_from_its_origin_in_single_precision(tmp_path, kind, offset, 
             load_mesh(path)
     else:
         assert load_mesh(path).radius == pytest.approx(
-            make_mesh(thing().vertices, thing().faces).radius, rel=0.05
+            make_mesh(thing().vertices, thing().faces).radius,
+            rel=0.05,
         )
 
 
-@pytest.mark.parametrize("exact", [True, False], ids=["whole metres", "double precision"])
+@pytest.mark.parametrize(
+    "exact",
+    [True, False],
+    ids=["whole metres", "double precision"],
+)
 def test_a_building_in_a_country_s_coordinates_has_its_shape(tmp_path, exact):
-    house = trimesh.creation.box((8, 6, 4)).apply_translation((0 if exact else 0.123, 0, 0))
+    house = trimesh.creation.box((8, 6, 4)).apply_translation(
+        (0 if exact else 0.123, 0, 0)
+    )
     house.vertices += (4_400_004, 5_300_003, 2)
     text = "".join("v {!r} {!r} {!r}\n".format(*map(float, p)) for p in house.vertices)
     text += "".join("f {} {} {}\n".format(*(face + 1)) for face in house.faces)
@@ -225,7 +251,9 @@ def test_a_store_keeps_what_its_meshes_were_cut_to(tmp_path):
             )
         )
         assert list(done.values()) == [None]
-        radii.append(float(ViewStore.open(tmp_path / f"{largest}.zarr").array("radius")[0]))
+        radii.append(
+            float(ViewStore.open(tmp_path / f"{largest}.zarr").array("radius")[0])
+        )
     assert radii[0] / radii[1] == pytest.approx(0.4 / 0.065, rel=0.2)
     with pytest.raises(DatasetError, match="begun with other largest_part"):
         list(
@@ -257,7 +285,9 @@ def test_render_says_which_meshes_look_odd(tmp_path, caplog, monkeypatch):
     saved(scans / "plain.ply", thing())
     for name in ("a", "b", "c"):
         saved(scans / f"{name}.ply", joined(thing(), disc(0.4)))
-    done = dict(render(scans.parent, tmp_path / "x.zarr", ViewSphere.named("12"), 32, workers=0))
+    done = dict(
+        render(scans.parent, tmp_path / "x.zarr", ViewSphere.named("12"), 32, workers=0)
+    )
     assert set(done.values()) == {None}
     said = [record.getMessage() for record in caplog.records]
     assert [line.partition(":")[0] for line in said[:2]] == [
@@ -273,17 +303,24 @@ def test_recognise_warns_and_takes_the_largest_part(tmp_path):
     path = saved(tmp_path / "scan.ply", joined(thing(), disc(0.4)))
     with pytest.warns(UserWarning, match=r"scan\.ply: it has 2 parts"):
         whole = nextview.recognise(path, start=9)
-    with pytest.warns(UserWarning, match=r"scan\.ply: the largest of its 2 parts was taken"):
+    with pytest.warns(
+        UserWarning,
+        match=r"scan\.ply: the largest of its 2 parts was taken",
+    ):
         part = nextview.recognise(path, start=9, largest_part=True)
     alone = nextview.recognise(saved(tmp_path / "egg.ply", thing()), start=9)
     first = [result.views[0].observation.depth for result in (part, alone, whole)]
     assert (
-        ((first[0] > 0) != (first[1] > 0)).mean() < 0.01 < ((first[0] > 0) != (first[2] > 0)).mean()
+        ((first[0] > 0) != (first[1] > 0)).mean()
+        < 0.01
+        < ((first[0] > 0) != (first[2] > 0)).mean()
     )
 
 
 def test_what_is_taught_of_a_scan_says_what_is_odd_about_it(tmp_path, monkeypatch):
-    def no_embeddings(observations):  # what they are does not matter here, and they take time
+    def no_embeddings(
+        observations,
+    ):  # what they are does not matter here, and they take time
         return np.zeros((len(observations), 4), np.float32)
 
     monkeypatch.setattr(thing_views, "embeddings", no_embeddings)
@@ -294,7 +331,9 @@ def test_what_is_taught_of_a_scan_says_what_is_odd_about_it(tmp_path, monkeypatc
         (True, "the largest of its 2 parts was taken"),
     ):
         taught = thing_views.teach(
-            path, "egg", thing_views.TeachingOptions(unit="m", upright=True, largest_part=largest)
+            path,
+            "egg",
+            thing_views.TeachingOptions(unit="m", upright=True, largest_part=largest),
         )
         assert taught["doubts"].tobytes().decode().startswith(sentence)
         radii.append(float(taught["radii"][0]))

@@ -67,7 +67,10 @@ def doors(call, names, **sound):
 
 
 DOORS = {
-    "recognise": lambda system, junk: system.recognise(sample_mesh("chair"), sensor=junk),
+    "recognise": lambda system, junk: system.recognise(
+        sample_mesh("chair"),
+        sensor=junk,
+    ),
     "session start": lambda system, junk: system.session(start=junk),
     "session seed": lambda system, junk: system.session(seed=junk),
     "session object": lambda system, junk: system.session(object=junk),
@@ -85,7 +88,12 @@ DOORS = {
     ),
     **doors(nextview.make_policy, "sphere", name="lem"),
     **doors(nextview.Stopping, "threshold max_views threshold_decay"),
-    **doors(nextview.ViewSphere, "azimuths distance", elevations=(0.0, 30.0), azimuths=8),
+    **doors(
+        nextview.ViewSphere,
+        "azimuths distance",
+        elevations=(0.0, 30.0),
+        azimuths=8,
+    ),
     **doors(nextview.Directions, "directions distance", directions=np.eye(3)),
     **doors(nextview.Directions.fibonacci, "n"),
     **doors(
@@ -93,7 +101,11 @@ DOORS = {
         "depth pose intrinsics radius image",
         **{name: getattr(SEEN, name) for name in ("depth", "pose", "intrinsics")},
     ),
-    **doors(nextview.SimulatedCamera, "size distance intrinsics", mesh=sample_mesh("chair")),
+    **doors(
+        nextview.SimulatedCamera,
+        "size distance intrinsics",
+        mesh=sample_mesh("chair"),
+    ),
     **doors(CAMERA.observe, "pose"),
     **doors(
         Frame,
@@ -103,7 +115,13 @@ DOORS = {
     ),
     **doors(ObservedObject, "up point"),
     **doors(Box, "low high axes", low=[0, 0, 0], high=[1, 1, 1]),
-    **doors(ObjectFrame, "centre radius axes", centre=[0, 0, 0], radius=1.0, axes=np.eye(3)),
+    **doors(
+        ObjectFrame,
+        "centre radius axes",
+        centre=[0, 0, 0],
+        radius=1.0,
+        axes=np.eye(3),
+    ),
     **doors(Sensor, "noise height"),
 }
 

@@ -14,7 +14,12 @@ from nextview.files import sha256_of
 from nextview.geometry.observation import Observation, pinhole
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.inference import MapNetwork, NetworkRecogniser
-from nextview.recognition.model_card import bundled_cards, find_card, read_card, write_card
+from nextview.recognition.model_card import (
+    bundled_cards,
+    find_card,
+    read_card,
+    write_card,
+)
 
 CLASSES = [f"class{k}" for k in range(10)]
 
@@ -25,13 +30,15 @@ def test_cards_are_read_as_they_were_written(tmp_path):
     for card in bundled_cards().values():
         write_card(tmp_path / "card.json", card)
         assert read_card(tmp_path / "card.json") == replace(
-            card, path=tmp_path / f"card{card.path.suffix}"
+            card,
+            path=tmp_path / f"card{card.path.suffix}",
         )
 
 
 def test_a_model_that_is_not_there():
     with pytest.raises(
-        ModelError, match="no bundled model is called 'resnet'; there are features, lcm-"
+        ModelError,
+        match="no bundled model is called 'resnet'; there are features, lcm-",
     ):
         find_card("resnet")
     with pytest.raises(ModelError, match=r"gone\.json: no such file"):
@@ -45,7 +52,10 @@ def test_a_card_of_other_classes_or_inputs_than_its_network_is_refused_when_that
     for values, sentence in (
         ({"classes": CLASSES[:9]}, r"has logits \(batch, 10\) .*, not \(batch, 9\)"),
         ({"azimuth_bins": 4}, r"has sides \(batch, 10, 8\)"),
-        ({"input": {"kind": "geometry", "size": 32}}, r"has input \(batch, 4, 16, 16\)"),
+        (
+            {"input": {"kind": "geometry", "size": 32}},
+            r"has input \(batch, 4, 16, 16\)",
+        ),
         ({"input": {"kind": "image", "size": 16}}, r"has input \(batch, 4, 16, 16\)"),
     ):
         before = card.read_text()
@@ -64,7 +74,9 @@ def test_a_card_of_other_classes_or_inputs_than_its_network_is_refused_when_that
 
 
 SEEN = Observation(
-    np.pad(np.full((16, 16), 2.5, np.float32), 8), ViewSphere.named("40").poses[3], pinhole(32, 3.5)
+    np.pad(np.full((16, 16), 2.5, np.float32), 8),
+    ViewSphere.named("40").poses[3],
+    pinhole(32, 3.5),
 )
 
 
@@ -97,8 +109,12 @@ def two_inputs(model: onnx.ModelProto) -> None:
 def one_answer(model: onnx.ModelProto) -> None:
     """Of the first view alone, however many there are."""
     model.graph.node[-1].output[0] = "all"
-    model.graph.initializer.extend(numpy_helper.from_array(np.array([k]), f"at{k}") for k in (0, 1))
-    model.graph.node.append(helper.make_node("Slice", ["all", "at0", "at1"], ["logits"]))
+    model.graph.initializer.extend(
+        numpy_helper.from_array(np.array([k]), f"at{k}") for k in (0, 1)
+    )
+    model.graph.node.append(
+        helper.make_node("Slice", ["all", "at0", "at1"], ["logits"])
+    )
 
 
 def no_numbers(model: onnx.ModelProto) -> None:
@@ -118,7 +134,12 @@ def no_numbers(model: onnx.ModelProto) -> None:
         (no_numbers, "gives logits that are not finite numbers"),
     ],
 )
-def test_a_file_that_is_not_what_its_card_promises(tmp_path, monkeypatch, change, sentence):
+def test_a_file_that_is_not_what_its_card_promises(
+    tmp_path,
+    monkeypatch,
+    change,
+    sentence,
+):
     monkeypatch.chdir(tmp_path)  # ONNX Runtime would find weights here
     (tmp_path / "models").mkdir()
     for folder in (tmp_path, tmp_path / "models"):

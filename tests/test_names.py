@@ -45,10 +45,18 @@ def test_a_picture_of_an_episode(tmp_path):
     trimesh.creation.box([1, 2, 3]).export(mesh)
     with matplotlib.rc_context({"svg.fonttype": "none"}):
         main(
-            ["recognise", str(mesh), "--max-views", "1", "--figure", str(tmp_path / "episode.svg")]
+            [
+                "recognise",
+                str(mesh),
+                "--max-views",
+                "1",
+                "--figure",
+                str(tmp_path / "episode.svg"),
+            ]
         )
     assert any(
-        text.startswith(f"{MATH}.off: ") for text in texts((tmp_path / "episode.svg").read_text())
+        text.startswith(f"{MATH}.off: ")
+        for text in texts((tmp_path / "episode.svg").read_text())
     )
 
 
@@ -71,7 +79,13 @@ def strange(tmp_path_factory):
         valley_classes={"lem": ()},
     )
     p.save(folder / "p.npz")
-    benchmark(folder / "p.npz", folder / "out", thresholds=(0.8, 0.97), runs=2, samples=50)
+    benchmark(
+        folder / "p.npz",
+        folder / "out",
+        thresholds=(0.8, 0.97),
+        runs=2,
+        samples=50,
+    )
     report(folder / "out")
     return folder
 
@@ -106,12 +120,14 @@ def test_a_terminal_gets_a_name_as_it_is(tmp_path, name, shown, capsys):
 
 
 @pytest.mark.parametrize(
-    "name", ["a\nb", "a\x1b[1m", b"caf\xe9".decode("utf-8", "surrogateescape")]
+    "name",
+    ["a\nb", "a\x1b[1m", b"caf\xe9".decode("utf-8", "surrogateescape")],
 )
 def test_a_dataset_with_names_that_cannot_be_printed_is_refused(tmp_path, name):
     (tmp_path / name).mkdir()
     (tmp_path / name / "box.off").write_text("OFF\n")
     with pytest.raises(
-        DatasetError, match=r"left out: \S+( b)?: its name cannot be printed; rename it"
+        DatasetError,
+        match=r"left out: \S+( b)?: its name cannot be printed; rename it",
     ):
         list_dataset(tmp_path)

@@ -14,11 +14,24 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from nextview.errors import ModelError
-from nextview.training.architectures import InvertedBottleneck, LiteNet, PointNet, ResNet
+from nextview.training.architectures import (
+    InvertedBottleneck,
+    LiteNet,
+    PointNet,
+    ResNet,
+)
 from nextview.training.export import export_onnx
 from nextview.training.runs import start_from
 
-LITE0 = ((16, 3, 1), (24, 3, 2), (40, 5, 2), (80, 3, 3), (112, 5, 3), (192, 5, 4), (320, 3, 1))
+LITE0 = (
+    (16, 3, 1),
+    (24, 3, 2),
+    (40, 5, 2),
+    (80, 3, 3),
+    (112, 5, 3),
+    (192, 5, 4),
+    (320, 3, 1),
+)
 """Width, kernel and blocks of the stages of EfficientNet-Lite0."""
 BLOCKS = {
     18: (2, 2, 2, 2),
@@ -27,7 +40,13 @@ BLOCKS = {
     101: (3, 4, 23, 3),
     152: (3, 8, 36, 3),
 }
-PUBLISHED = {18: 11_689_512, 34: 21_797_672, 50: 25_557_032, 101: 44_549_160, 152: 60_192_808}
+PUBLISHED = {
+    18: 11_689_512,
+    34: 21_797_672,
+    50: 25_557_032,
+    101: 44_549_160,
+    152: 60_192_808,
+}
 """Parameters at 1,000 classes, from torchvision's table of models."""
 
 
@@ -48,7 +67,8 @@ def torchvisions_shapes(depth, classes=1000, channels=3, counts_batches=True):
     norm("bn1", 64)
     before = 64
     for stage, (blocks, width) in enumerate(
-        zip(BLOCKS[depth], (64, 128, 256, 512), strict=True), 1
+        zip(BLOCKS[depth], (64, 128, 256, 512), strict=True),
+        1,
     ):
         after = width if depth < 50 else 4 * width
         # (inner convolutions, each: outputs, inputs, side)
@@ -76,7 +96,9 @@ def checkpoint(path, depth=18, **what):
     state = {}
     for name, shape in torchvisions_shapes(depth, **what).items():
         counts = name.endswith("num_batches_tracked")
-        state[name] = torch.tensor(7) if counts else torch.rand(shape, generator=generator) * 0.1
+        state[name] = (
+            torch.tensor(7) if counts else torch.rand(shape, generator=generator) * 0.1
+        )
     torch.save(state, path)
     return state
 
@@ -102,7 +124,8 @@ def test_a_torchvision_checkpoint_loads_whole(tmp_path, depth):
 
 @pytest.mark.parametrize("channels", [1, 4])
 def test_other_channels_answer_grey_images_as_before_and_other_classes_keep_the_last_layer(
-    tmp_path, channels
+    tmp_path,
+    channels,
 ):
     state = checkpoint(tmp_path / "rgb.pth", classes=5)
     rgb, ours = ResNet(18, 5, 3), ResNet(18, 10, channels)
@@ -115,7 +138,10 @@ def test_other_channels_answer_grey_images_as_before_and_other_classes_keep_the_
     with torch.no_grad():
         expected = rgb.conv1(grey.expand(-1, 3, -1, -1))
         assert torch.allclose(
-            ours.conv1(grey.expand(-1, channels, -1, -1)), expected, rtol=1e-4, atol=1e-5
+            ours.conv1(grey.expand(-1, channels, -1, -1)),
+            expected,
+            rtol=1e-4,
+            atol=1e-5,
         )
 
 
@@ -139,12 +165,27 @@ BROKEN = {
         pickle.dumps(Bomb(path.parent / "executed"))
     ),
     "cannot be a pickle inside torch's own file": lambda path: torch.save(
-        {"x": Bomb(path.parent / "executed")}, path
+        {"x": Bomb(path.parent / "executed")},
+        path,
     ),
-    "truncated": lambda path: (checkpoint(path), path.write_bytes(path.read_bytes()[: 2 << 20])),
-    "another network": lambda path: torch.save({"features.0.weight": torch.zeros(3)}, path),
-    "wrong shape": lambda path: damaged(path, "layer2.0.conv1.weight", torch.zeros(128, 64, 1, 1)),
-    "not finite": lambda path: damaged(path, "layer1.0.bn1.weight", torch.full((64,), torch.nan)),
+    "truncated": lambda path: (
+        checkpoint(path),
+        path.write_bytes(path.read_bytes()[: 2 << 20]),
+    ),
+    "another network": lambda path: torch.save(
+        {"features.0.weight": torch.zeros(3)},
+        path,
+    ),
+    "wrong shape": lambda path: damaged(
+        path,
+        "layer2.0.conv1.weight",
+        torch.zeros(128, 64, 1, 1),
+    ),
+    "not finite": lambda path: damaged(
+        path,
+        "layer1.0.bn1.weight",
+        torch.full((64,), torch.nan),
+    ),
 }
 
 
@@ -158,7 +199,9 @@ def test_broken_and_foreign_files_are_refused_and_nothing_is_executed(tmp_path, 
         start_from(network, path)
     assert "\n" not in str(refusal.value)
     assert not (tmp_path / "executed").exists()
-    assert all(torch.equal(before[name], value) for name, value in network.state_dict().items())
+    assert all(
+        torch.equal(before[name], value) for name, value in network.state_dict().items()
+    )
 
 
 def lite_checkpoint(path: Path, classes: int = 1000, seed: int = 0) -> dict:
@@ -174,7 +217,9 @@ def lite_checkpoint(path: Path, classes: int = 1000, seed: int = 0) -> dict:
 
     def norm(name, width):
         for part in ("weight", "bias", "running_mean"):
-            state[f"{name}.{part}"] = torch.randn(width, generator=rng) / 10 + (part == "weight")
+            state[f"{name}.{part}"] = torch.randn(width, generator=rng) / 10 + (
+                part == "weight"
+            )
         state[f"{name}.running_var"] = torch.rand(width, generator=rng) + 0.5
         state[f"{name}.num_batches_tracked"] = torch.tensor(7)
 
@@ -209,10 +254,15 @@ def test_it_is_as_large_as_published():
         if isinstance(part, torch.nn.Conv2d | torch.nn.Linear):
             weights = part.weight.numel()
             part.register_forward_hook(
-                lambda _, __, out, weights=weights: products.append(weights * out[0, 0].numel())
+                lambda _, __, out, weights=weights: products.append(
+                    weights * out[0, 0].numel()
+                )
             )
     network(torch.zeros(1, 3, 224, 224))
-    assert sum(p.numel() for p in network.parameters()) == pytest.approx(4.7e6, rel=0.02)
+    assert sum(p.numel() for p in network.parameters()) == pytest.approx(
+        4.7e6,
+        rel=0.02,
+    )
     assert sum(products) == pytest.approx(407e6, rel=0.06)
 
 
@@ -224,9 +274,13 @@ def test_a_published_checkpoint_loads_whole(tmp_path):
     assert len(ours) == len(state)
     assert torch.equal(ours["stem.weight"], state["_conv_stem.weight"])
     assert torch.equal(
-        ours["stages.15.depthwise.weight"], state["_blocks.15._depthwise_conv.weight"]
+        ours["stages.15.depthwise.weight"],
+        state["_blocks.15._depthwise_conv.weight"],
     )
-    assert torch.equal(ours["stages.3.norm2.running_var"], state["_blocks.3._bn2.running_var"])
+    assert torch.equal(
+        ours["stages.3.norm2.running_var"],
+        state["_blocks.3._bn2.running_var"],
+    )
     assert torch.equal(ours["norm1.bias"], state["_bn1.bias"])
     assert torch.equal(ours["fc.weight"], state["_fc.weight"])
 
@@ -252,7 +306,11 @@ def test_pointnet_ignores_the_order_of_points_and_begins_with_identities():
     assert predicted.shape == (3, 5, 3)
     assert torch.allclose(a, torch.eye(3).expand(3, 3, 3))
     assert torch.allclose(b, torch.eye(64).expand(3, 64, 64))
-    assert torch.allclose(network(cloud[:, torch.randperm(200)])[0], predicted, atol=1e-5)
+    assert torch.allclose(
+        network(cloud[:, torch.randperm(200)])[0],
+        predicted,
+        atol=1e-5,
+    )
 
 
 def test_export_keeps_the_answers(tmp_path):
@@ -265,29 +323,46 @@ def test_export_keeps_the_answers(tmp_path):
     more = torch.rand(3, 4, 64, 64)  # another batch size than the example's
     with torch.no_grad():
         expected = network(more)
-    for ours, theirs in zip(session.run(None, {"input": more.numpy()}), expected, strict=True):
+    for ours, theirs in zip(
+        session.run(None, {"input": more.numpy()}),
+        expected,
+        strict=True,
+    ):
         assert np.abs(ours - theirs.numpy()).max() < 0.01 * theirs.abs().max()
     assert (
-        sys.modules[ResNet.__module__].__file__.encode() not in (tmp_path / "net.onnx").read_bytes()
+        sys.modules[ResNet.__module__].__file__.encode()
+        not in (tmp_path / "net.onnx").read_bytes()
     )
     full = sum(p.numel() for p in network.parameters()) * 4
     assert (tmp_path / "net.onnx").stat().st_size < 0.6 * full
 
 
-def test_eight_bits_a_weight_are_enough_for_the_answers_and_nearly_halve_the_file_again(tmp_path):
+def test_eight_bits_a_weight_are_enough_for_the_answers_and_nearly_halve_the_file_again(
+    tmp_path,
+):
     torch.manual_seed(0)
     network = ResNet(18, 10, 4).eval()
     with torch.no_grad():  # every row of another magnitude, as in trained networks
-        network.layer4[1].conv1.weight *= torch.logspace(-2, 1, 512)[:, None, None, None]
+        network.layer4[1].conv1.weight *= torch.logspace(-2, 1, 512)[
+            :,
+            None,
+            None,
+            None,
+        ]
     x = np.random.default_rng(0).random((2, 4, 64, 64)).astype(np.float32)
     output = {}
     for bits in (16, 8):
         export_onnx(network, x, "input", ["logits"], tmp_path / f"{bits}.onnx", bits)
         session = ort.InferenceSession(
-            tmp_path / f"{bits}.onnx", providers=["CPUExecutionProvider"]
+            tmp_path / f"{bits}.onnx",
+            providers=["CPUExecutionProvider"],
         )
         output[bits] = session.run(["logits"], {"input": x})[0]
     true = network(torch.from_numpy(x))[0].detach().numpy()
     assert np.abs(output[8] - true).max() < 0.02 * np.abs(true).max()
-    assert np.abs(output[8] - true).max() > np.abs(output[16] - true).max()  # so they do have fewer
-    assert (tmp_path / "8.onnx").stat().st_size < 0.55 * (tmp_path / "16.onnx").stat().st_size
+    assert (
+        np.abs(output[8] - true).max() > np.abs(output[16] - true).max()
+    )  # so they do have fewer
+    assert (tmp_path / "8.onnx").stat().st_size < 0.55 * (
+        tmp_path / "16.onnx"
+    ).stat().st_size

@@ -40,7 +40,8 @@ def features(logits, seen=None, azimuth_bins=None) -> Evidence:
 
 
 @pytest.mark.parametrize(
-    "calibration", [Calibration(), Calibration(0.7, 0.5), Calibration(0.7, 1.0, None, 2.0)]
+    "calibration",
+    [Calibration(), Calibration(0.7, 0.5), Calibration(0.7, 1.0, None, 2.0)],
 )
 def test_episodes_are_believed_as_if_their_empty_views_had_not_been_taken(calibration):
     """Each of 40 episodes has empty views of its own; alone and without them it believes the
@@ -50,11 +51,18 @@ def test_episodes_are_believed_as_if_their_empty_views_had_not_been_taken(calibr
     logits, empty = rng.normal(size=(b, k, 3)), rng.random((b, k)) < 0.4
     empty[0], empty[1] = True, False
     azimuth_bins = (
-        np.log(rng.dirichlet(np.ones(8), (b, k, 3))) if calibration.bin_correlation else None
+        np.log(rng.dirichlet(np.ones(8), (b, k, 3)))
+        if calibration.bin_correlation
+        else None
     )
     sure = Stopping(1.0, k)
     together = Episodes(
-        SPHERE, Unidirectional(SPHERE), np.arange(b), sure, np.random.default_rng(0), calibration
+        SPHERE,
+        Unidirectional(SPHERE),
+        np.arange(b),
+        sure,
+        np.random.default_rng(0),
+        calibration,
     )
     for observation in range(k):
         unread = np.where(empty[:, observation, None], np.nan, logits[:, observation])
@@ -71,10 +79,19 @@ def test_episodes_are_believed_as_if_their_empty_views_had_not_been_taken(calibr
             zero = np.zeros((3, 8))  # by the azimuth of the object's azimuth bin 0
             for k, side in product(kept, range(8)):
                 zero[:, (SPHERE.azimuth_index[views[e, k]] - side) % 8] += azimuth_bins[
-                    e, k, :, side
+                    e,
+                    k,
+                    :,
+                    side,
                 ]
-            total = total + np.log(np.exp(zero / (1 + 2.0 * (max(len(kept), 1) - 1))).sum(1))
-        np.testing.assert_allclose(together.steps[-1].belief[e], softmax(total), atol=1e-12)
+            total = total + np.log(
+                np.exp(zero / (1 + 2.0 * (max(len(kept), 1) - 1))).sum(1)
+            )
+        np.testing.assert_allclose(
+            together.steps[-1].belief[e],
+            softmax(total),
+            atol=1e-12,
+        )
     np.testing.assert_array_equal(together.steps[-1].belief[0], np.full(3, 1 / 3))
 
 
@@ -95,7 +112,11 @@ def test_an_empty_view_is_taken_but_never_confident(threshold):
 def test_a_threshold_that_comes_down_does_not_come_down_by_empty_views():
     stopping = Stopping(0.9, 6, threshold_decay=2.0)
     episodes = Episodes(
-        SPHERE, Unidirectional(SPHERE), np.array([0]), stopping, np.random.default_rng(0)
+        SPHERE,
+        Unidirectional(SPHERE),
+        np.array([0]),
+        stopping,
+        np.random.default_rng(0),
     )
     logits = np.array([[1.5, 0.0]])
     assert softmax(logits[0]).max() > stopping.threshold_at(2)
@@ -117,9 +138,15 @@ def test_every_kind_of_policy_goes_on_past_an_empty_view(name):
         def observe(self, pose):
             self.taken += 1
             view = camera.observe(pose)
-            return view if self.taken > 2 else replace(view, depth=np.zeros_like(view.depth))
+            return (
+                view
+                if self.taken > 2
+                else replace(view, depth=np.zeros_like(view.depth))
+            )
 
-    result = Session(system.models, system.policy, SPHERE, 9, Stopping(1.0, 5)).run(Covered())
+    result = Session(system.models, system.policy, SPHERE, 9, Stopping(1.0, 5)).run(
+        Covered()
+    )
     assert len({view.index for view in result.views}) == 5
     np.testing.assert_array_equal(result.views[1].belief, np.full(10, 0.1))
     # the first that counts
@@ -158,7 +185,10 @@ def test_two_boxes_far_apart_are_nothing(gap):
     """Most of their bounding sphere is empty; the networks would name what they see of it a
     table, confidently.
     """
-    found = nextview.recognise(meshed(*(box((1, 1, 1), (x, 0, 0)) for x in (0, gap + 1))), start=9)
+    found = nextview.recognise(
+        meshed(*(box((1, 1, 1), (x, 0, 0)) for x in (0, gap + 1))),
+        start=9,
+    )
     assert (found.answer, found.confident) == (None, False)
 
 
@@ -178,7 +208,15 @@ def test_predictions_and_cameras_have_one_idea_of_nothing(tmp_path):
     looks = [Observation(depth, pose, store.intrinsics) for depth, pose in both]
     assert min(look.visible for look in looks) > 0.006 * 112**2
     card = make_recogniser(tmp_path, ["ball"])
-    list(predict(tmp_path / "store.zarr", tmp_path / "said.npz", read_card(card), {}, workers=0))
+    list(
+        predict(
+            tmp_path / "store.zarr",
+            tmp_path / "said.npz",
+            read_card(card),
+            {},
+            workers=0,
+        )
+    )
     said = Predictions.load(tmp_path / "said.npz").logits[0].any(1)
     np.testing.assert_array_equal(said, [look.seen for look in looks])
     assert not said.all()
@@ -188,7 +226,8 @@ def test_predictions_and_cameras_have_one_idea_of_nothing(tmp_path):
 def test_the_command_has_no_answer_about_next_to_nothing(tmp_path, capsys, json_too):
     path = tmp_path / "specks.off"
     specks = [
-        trimesh.creation.box((1e-4, 1e-4, 1e-4)).apply_translation((x, x, x)) for x in (-1, 1)
+        trimesh.creation.box((1e-4, 1e-4, 1e-4)).apply_translation((x, x, x))
+        for x in (-1, 1)
     ]
     trimesh.util.concatenate(specks).export(path)
     said = refused(capsys, "recognise", path, "--threshold", "0", *json_too)

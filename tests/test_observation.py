@@ -12,7 +12,12 @@ from pipeline import meshed
 
 from nextview.data.samples import sample_mesh
 from nextview.errors import ObservationError
-from nextview.geometry.observation import LEAST_PIXELS, LEAST_VISIBLE_SHARE, Observation, pinhole
+from nextview.geometry.observation import (
+    LEAST_PIXELS,
+    LEAST_VISIBLE_SHARE,
+    Observation,
+    pinhole,
+)
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.simulation.simulated import SimulatedCamera
 
@@ -24,7 +29,9 @@ VIEW = CHAIR.observe(POSE)
 
 
 def observe(**other) -> Observation:
-    return Observation(**({"depth": VIEW.depth, "pose": POSE, "intrinsics": INTRINSICS} | other))
+    return Observation(
+        **({"depth": VIEW.depth, "pose": POSE, "intrinsics": INTRINSICS} | other)
+    )
 
 
 # Taking
@@ -32,7 +39,9 @@ def observe(**other) -> Observation:
 
 @pytest.mark.parametrize("name", ["chair", "ball"])
 def test_without_an_image_the_depth_is_lit_as_the_renderer_lights_the_mesh(name):
-    mesh = meshed(trimesh.creation.icosphere(5)) if name == "ball" else sample_mesh(name)
+    mesh = (
+        meshed(trimesh.creation.icosphere(5)) if name == "ball" else sample_mesh(name)
+    )
     camera = SimulatedCamera(mesh, 224)
     for pose in ViewSphere.named("40").poses[::7]:
         view = camera.observe(pose)
@@ -80,7 +89,10 @@ FAR[0, 3] = 1500.0
 NOISY = VIEW.depth * 450
 NOISY[np.nonzero(NOISY)[0][:3], np.nonzero(NOISY)[1][:3]] = 7
 BAD = {
-    "depth of one row": ({"depth": VIEW.depth[0]}, "the depth is one image of the shape"),
+    "depth of one row": (
+        {"depth": VIEW.depth[0]},
+        "the depth is one image of the shape",
+    ),
     "pose 3x4": ({"pose": POSE[:3]}, "not (3, 4)"),
     "pose of NaN": ({"pose": np.full((4, 4), np.nan)}, "NaN or infinity"),
     "pose transposed": ({"pose": POSE.T}, "transposed"),
@@ -89,8 +101,14 @@ BAD = {
     "position in millimetres": ({"pose": FAR}, "is its position in millimetres"),
     "intrinsics of NaN": ({"intrinsics": np.full((3, 3), np.nan)}, "NaN, infinity"),
     "intrinsics transposed": ({"intrinsics": INTRINSICS.T}, "transposed"),
-    "negative focal length": ({"intrinsics": np.diag([60.0, -60, 1])}, "not 60 and -60"),
-    "focal length in metres": ({"intrinsics": np.diag([0.0036, 0.0036, 1])}, "numbers of pixels"),
+    "negative focal length": (
+        {"intrinsics": np.diag([60.0, -60, 1])},
+        "not 60 and -60",
+    ),
+    "focal length in metres": (
+        {"intrinsics": np.diag([0.0036, 0.0036, 1])},
+        "numbers of pixels",
+    ),
     "image of another size": ({"image": np.zeros((32, 32), np.uint8)}, "not (32, 32)"),
     "image from 0 to 1": ({"image": VIEW.image / 255}, "not float64"),
     "no size": ({"radius": 0.0}, "radius is a positive number"),
@@ -99,7 +117,10 @@ BAD = {
         {"depth": np.rint(VIEW.depth * 450).astype(np.uint16)},
         "looks like millimetres",
     ),
-    "millimetres with a few pixels of noise": ({"depth": NOISY}, "looks like millimetres"),
+    "millimetres with a few pixels of noise": (
+        {"depth": NOISY},
+        "looks like millimetres",
+    ),
 }
 
 
@@ -139,7 +160,12 @@ def test_what_is_written_into_the_callers_arrays_later_changes_no_observation():
     seen = Observation(depth, pose, intrinsics, image=image)
     for array in (depth, pose, intrinsics, image):
         array[:] = 1
-    assert (seen.depth[0, 0], seen.pose[0, 1], seen.intrinsics[0, 1], seen.image[0, 0]) == (
+    assert (
+        seen.depth[0, 0],
+        seen.pose[0, 1],
+        seen.intrinsics[0, 1],
+        seen.image[0, 0],
+    ) == (
         3,
         0,
         0,

@@ -62,7 +62,9 @@ def test_a_ball_leaves_unseen_what_lies_behind_its_face():
     hidden, slack = hidden_by_ball(middles, EYE, radius), GRID.pitch * np.sqrt(3) / 2
     # Exact but for voxels that the surface, or the border of the shadow, passes through.
     near = hidden_by_ball(middles, EYE, radius + slack) & ~hidden_by_ball(
-        middles, EYE, radius - slack
+        middles,
+        EYE,
+        radius - slack,
     )
     near |= np.abs(np.linalg.norm(middles, axis=1) - radius) < slack
     assert near.mean() < 0.15
@@ -75,7 +77,9 @@ def test_occupied_are_the_voxels_that_the_visible_cap_passes_through():
     occupied = after(look_at_origin(0, 0), radius=radius).cells == OBJECT
     x, y, z = (m.reshape(occupied.shape) for m in GRID.middles)
     distance = np.sqrt(x * x + y * y + z * z)
-    assert np.abs(distance - radius)[occupied].max() <= GRID.pitch * np.sqrt(3) / 2 + 1e-6
+    assert (
+        np.abs(distance - radius)[occupied].max() <= GRID.pitch * np.sqrt(3) / 2 + 1e-6
+    )
     rim = radius**2 / 3  # the tangents from the eye touch the ball there
     assert x[occupied].min() > rim - GRID.pitch
     # Where the surface passes the very middle of a voxel and is not seen at too low an angle, that
@@ -89,7 +93,11 @@ def test_object_and_occluder_are_kept_apart():
     pose = look_at_origin(0, 0)
     ball, wall = ball_depth(pose, K, 224, 0.4), wall_depth(pose, 0.8, 0.2)
     depth = np.where(wall > 0, wall, ball)
-    cells = Occupancy.unseen(GRID).seen(depth, pose, K, object_mask=(wall == 0) & (ball > 0)).cells
+    cells = (
+        Occupancy.unseen(GRID)
+        .seen(depth, pose, K, object_mask=(wall == 0) & (ball > 0))
+        .cells
+    )
     x = GRID.middles[0].reshape(cells.shape)
     assert (cells == OCCLUDER).any()
     assert (cells == OBJECT).any()
@@ -102,10 +110,14 @@ def test_object_and_occluder_are_kept_apart():
 
 @settings(deadline=None, max_examples=25)
 @given(st.lists(st.integers(0, 39), min_size=2, max_size=4), st.permutations(range(4)))
-def test_more_views_never_make_seen_space_unseen_and_their_order_counts_for_nothing(views, order):
+def test_more_views_never_make_seen_space_unseen_and_their_order_counts_for_nothing(
+    views,
+    order,
+):
     small = pinhole(32, 3.0)
     frames = [
-        (ball_depth(SPHERE.poses[v], small, 32, 0.5, (0.2, 0, 0.1)), SPHERE.poses[v]) for v in views
+        (ball_depth(SPHERE.poses[v], small, 32, 0.5, (0.2, 0, 0.1)), SPHERE.poses[v])
+        for v in views
     ]
 
     def seen(frames):
@@ -131,7 +143,12 @@ def test_more_views_never_make_seen_space_unseen_and_their_order_counts_for_noth
     st.tuples(*[st.floats(-5, 5)] * 3),
     st.sampled_from([0.25, 1.0, 10.0]),
 )
-def test_nothing_changes_if_all_moves_or_is_measured_in_another_unit(view, quarters, shift, unit):
+def test_nothing_changes_if_all_moves_or_is_measured_in_another_unit(
+    view,
+    quarters,
+    shift,
+    unit,
+):
     """The scene, the cameras and the grid turned by quarters about z, moved, and in another
     unit.
     """

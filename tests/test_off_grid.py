@@ -9,7 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nextview.errors import UsageError
-from nextview.geometry.viewsphere import Directions, ViewSphere, look_at_origin, viewpoints_of
+from nextview.geometry.viewsphere import (
+    Directions,
+    ViewSphere,
+    look_at_origin,
+    viewpoints_of,
+)
 from nextview.policies.base import EpisodeState, Evidence
 from nextview.policies.maps import MapPeak, SpherePeak
 from nextview.policies.off_grid import OffGrid, anywhere
@@ -74,7 +79,9 @@ def test_a_list_of_directions_or_poses_gives_its_views(angles, distance):
     ):
         assert len(layout) == len(angles)
         np.testing.assert_allclose(
-            layout.poses[:, :3, 3], 3 * poses[:, :3, 3] / distance, atol=1e-9
+            layout.poses[:, :3, 3],
+            3 * poses[:, :3, 3] / distance,
+            atol=1e-9,
         )
         np.testing.assert_allclose(layout.poses[:, :3, 2], poses[:, :3, 2], atol=1e-9)
         cosines = np.einsum("id,jd->ij", layout.directions, layout.directions)
@@ -82,12 +89,18 @@ def test_a_list_of_directions_or_poses_gives_its_views(angles, distance):
 
 
 def test_travel_of_directions_is_counted_in_the_cells_of_the_40_views():
-    np.testing.assert_allclose(Directions(SPHERE.directions).travel, SPHERE.travel, atol=1e-9)
-    assert SPHERE.travel_between(direction(27, 350), direction(36, 10)) == pytest.approx(
-        np.hypot(0.5, 20 / 45)
+    np.testing.assert_allclose(
+        Directions(SPHERE.directions).travel,
+        SPHERE.travel,
+        atol=1e-9,
     )
+    assert SPHERE.travel_between(
+        direction(27, 350),
+        direction(36, 10),
+    ) == pytest.approx(np.hypot(0.5, 20 / 45))
     assert viewpoints_of("12").travel_between(
-        direction(45, 5), direction(45, 350)
+        direction(45, 5),
+        direction(45, 350),
     ) == pytest.approx(0.5)
 
 
@@ -116,7 +129,8 @@ def state_at(sphere, place, rng, visited=(), reachable=None) -> EpisodeState:
 
 
 @pytest.mark.parametrize(
-    "name", ["gain", "visible-gain", "lem-peak", "class-table", "class-table-local"]
+    "name",
+    ["gain", "visible-gain", "lem-peak", "class-table", "class-table-local"],
 )
 def test_on_views_that_happen_to_be_the_grid_the_interpolation_is_the_policy(name):
     """The 40 views as a mere list of directions: the same decisions and values as on the grid
@@ -126,16 +140,32 @@ def test_on_views_that_happen_to_be_the_grid_the_interpolation_is_the_policy(nam
     off = OffGrid(policy, SPHERE, Directions(SPHERE.directions))
     for k in range(40):
         state = state_at(
-            SPHERE, SPHERE.directions[k], rng, rng.integers(0, 40, 6), rng.random((1, 40)) < 0.7
+            SPHERE,
+            SPHERE.directions[k],
+            rng,
+            rng.integers(0, 40, 6),
+            rng.random((1, 40)) < 0.7,
         )
         assert off.next_views(state, rng) == policy.next_views(state, rng)
         if name in ("gain", "visible-gain", "lem-peak"):
-            np.testing.assert_allclose(off.view_values(state), policy.view_values(state), atol=1e-9)
-        assert anywhere(policy, SPHERE).next_views(state, rng) == policy.next_views(state, rng)
+            np.testing.assert_allclose(
+                off.view_values(state),
+                policy.view_values(state),
+                atol=1e-9,
+            )
+        assert anywhere(policy, SPHERE).next_views(state, rng) == policy.next_views(
+            state,
+            rng,
+        )
 
 
 @settings(deadline=None, max_examples=40)
-@given(st.floats(-20, 89), st.floats(0, 360), st.sampled_from(LAYOUTS), st.integers(0, 99))
+@given(
+    st.floats(-20, 89),
+    st.floats(0, 360),
+    st.sampled_from(LAYOUTS),
+    st.integers(0, 99),
+)
 def test_values_lie_between_those_of_the_turned_grid(elevation, azimuth, layout, seed):
     """Bilinear in elevation and in azimuth from the camera, written out for each view."""
 
@@ -150,9 +180,15 @@ def test_values_lie_between_those_of_the_turned_grid(elevation, azimuth, layout,
         def next_views(self, state, rng):
             raise AssertionError
 
-    sphere, rng = Directions(viewpoints_of(layout).directions), np.random.default_rng(seed)
+    sphere, rng = (
+        Directions(viewpoints_of(layout).directions),
+        np.random.default_rng(seed),
+    )
     state = state_at(
-        sphere, direction(elevation, azimuth), rng, reachable=rng.random((1, len(sphere))) < 0.5
+        sphere,
+        direction(elevation, azimuth),
+        rng,
+        reachable=rng.random((1, len(sphere))) < 0.5,
     )
     travel = rng.random((1, len(sphere)))
     state = replace(state, travel=travel)
@@ -178,14 +214,24 @@ def test_values_lie_between_those_of_the_turned_grid(elevation, azimuth, layout,
 
 
 @settings(deadline=None, max_examples=150)
-@given(st.data(), st.sampled_from(LAYOUTS), st.sampled_from(NAMES), st.integers(0, 10**6))
+@given(
+    st.data(),
+    st.sampled_from(LAYOUTS),
+    st.sampled_from(NAMES),
+    st.integers(0, 10**6),
+)
 def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(
-    data, layout, name, seed
+    data,
+    layout,
+    name,
+    seed,
 ):
     sphere = viewpoints_of(layout)
     policy = make_policy_anywhere(name, sphere)
     policy = anywhere(
-        replace(policy, sphere=SPHERE) if isinstance(policy, MapPeak | SpherePeak) else policy,
+        replace(policy, sphere=SPHERE)
+        if isinstance(policy, MapPeak | SpherePeak)
+        else policy,
         sphere,
     )
     share = data.draw(st.sampled_from([0.1, 0.5, 1.0]))
@@ -194,21 +240,32 @@ def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(
     for _ in range(2):
         rng = np.random.default_rng(seed)
         reachable = rng.random(len(sphere)) < share
-        first, rule, draws = np.array([0]), FixedLength(max_views=8), np.random.default_rng(seed)
+        first, rule, draws = (
+            np.array([0]),
+            FixedLength(max_views=8),
+            np.random.default_rng(seed),
+        )
         episodes = Episodes(sphere, policy, first, rule, draws, Calibration(0.8, 0.5))
         places, path = [], []
         while len(episodes.running):
-            place = sphere.directions[episodes.current] + jitter * rng.normal(size=(1, 3))
+            place = sphere.directions[episodes.current] + jitter * rng.normal(
+                size=(1, 3)
+            )
             place /= np.linalg.norm(place)
             places.append(place[0])
             step = episodes.update(
-                evidence(rng), place, partial(replace, reachable=reachable[None])
+                evidence(rng),
+                place,
+                partial(replace, reachable=reachable[None]),
             )
             assert step.belief.sum() == pytest.approx(1)
             to = int(step.next_views[0])
             path.append(to)
             angles = np.arccos(np.clip(np.array(places) @ sphere.directions.T, -1, 1))
-            visited = {*angles.argmin(1), *np.flatnonzero((angles < VISITED_ANGLE - 1e-6).any(0))}
+            visited = {
+                *angles.argmin(1),
+                *np.flatnonzero((angles < VISITED_ANGLE - 1e-6).any(0)),
+            }
             free = set(np.flatnonzero(reachable)) - visited
             if to >= 0:
                 assert to in free
@@ -220,9 +277,13 @@ def test_every_policy_goes_to_a_view_that_is_free_and_believes_all_in_all_one(
     assert paths[0] == paths[1]
 
 
-@pytest.mark.parametrize("layout", ["fibonacci:99999", "rings:0,10,20,30x2000", np.ones((5001, 3))])
+@pytest.mark.parametrize(
+    "layout",
+    ["fibonacci:99999", "rings:0,10,20,30x2000", np.ones((5001, 3))],
+)
 def test_more_views_than_their_distances_fit_into_memory_are_refused(layout):
     with pytest.raises(
-        UsageError, match="the number of viewpoints is a whole number from 1 to 5000"
+        UsageError,
+        match="the number of viewpoints is a whole number from 1 to 5000",
     ):
         viewpoints_of(layout)

@@ -71,14 +71,25 @@ OWN_ONLY = {"scenes", "render", "train recogniser", "train map", "benchmark-thin
 
 
 @pytest.fixture(scope="session")
-def made(furniture, views, models, predictions, results, knobs, knobs_memory, tmp_path_factory):
+def made(
+    furniture,
+    views,
+    models,
+    predictions,
+    results,
+    knobs,
+    knobs_memory,
+    tmp_path_factory,
+):
     """What the commands work on; the store is a copy."""
     folder = tmp_path_factory.mktemp("made")
     training, own = folder / "p.npz", folder / "views.zarr"
     Predictions.load(predictions).of_split("train").save(training)
     shutil.copytree(views, own)
     can = load_mesh(knobs / "can.ply", unit="m")
-    list(write_capture(can, folder / "capture", ViewSphere((40.0,), 3), 0.07, table=True))
+    list(
+        write_capture(can, folder / "capture", ViewSphere((40.0,), 3), 0.07, table=True)
+    )
     return {
         "capture": folder / "capture",
         "furniture": furniture,
@@ -107,10 +118,16 @@ def test_no_command_is_forgotten():
         "export recogniser",
         "export map",
     }
-    assert {name.partition(" --")[0] for name in WRITES} == COMMANDS.keys() - FITS - others
+    assert {
+        name.partition(" --")[0] for name in WRITES
+    } == COMMANDS.keys() - FITS - others
 
 
-def test_the_demo_draws_over_its_own_picture_and_no_other(tmp_path, monkeypatch, capsys):
+def test_the_demo_draws_over_its_own_picture_and_no_other(
+    tmp_path,
+    monkeypatch,
+    capsys,
+):
     monkeypatch.chdir(tmp_path)
     for _ in range(2):
         main(["demo"])
@@ -124,13 +141,21 @@ def test_the_demo_draws_over_its_own_picture_and_no_other(tmp_path, monkeypatch,
 
 @pytest.mark.parametrize("name", WRITES)
 def test_what_exists_is_refused_and_overwritten_on_demand_only(
-    name, made, tmp_path, monkeypatch, capsys
+    name,
+    made,
+    tmp_path,
+    monkeypatch,
+    capsys,
 ):
     if name.startswith("train"):
         pytest.importorskip("torch")
     monkeypatch.chdir(tmp_path)
     before, out, *after = WRITES[name]
-    command = [*before.format(**made).split(), out, *" ".join(after).format(**made).split()]
+    command = [
+        *before.format(**made).split(),
+        out,
+        *" ".join(after).format(**made).split(),
+    ]
     main(command)
     written = contents(tmp_path)
     assert written
@@ -139,7 +164,11 @@ def test_what_exists_is_refused_and_overwritten_on_demand_only(
     assert all(top.startswith(Path(out).stem) for top in tops), tops
 
     folder = (tmp_path / out).is_dir()
-    mine = dict.fromkeys(written, b"mine") if not folder else {tmp_path / out / "mine.txt": b"mine"}
+    mine = (
+        dict.fromkeys(written, b"mine")
+        if not folder
+        else {tmp_path / out / "mine.txt": b"mine"}
+    )
     for path in tmp_path.iterdir():
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     for path, content in mine.items():
@@ -183,21 +212,32 @@ def test_a_run_writes_nothing_in_the_home_folder(job, tmp_path):
     home = tmp_path / "home"
     home.mkdir()
     code = f"SAMPLE, FOLDER = {SAMPLE!r}, {str(Path(SAMPLE).parent)!r}\n{HOMELY[job]}"
-    hidden = ("ORT_DISABLE_TELEMETRY", "MPLCONFIGDIR", "XDG_CACHE_HOME", "XDG_CONFIG_HOME")
-    environment = {name: value for name, value in os.environ.items() if name not in hidden} | {
-        "HOME": str(home)
-    }
+    hidden = (
+        "ORT_DISABLE_TELEMETRY",
+        "MPLCONFIGDIR",
+        "XDG_CACHE_HOME",
+        "XDG_CONFIG_HOME",
+    )
+    environment = {
+        name: value for name, value in os.environ.items() if name not in hidden
+    } | {"HOME": str(home)}
     done = run_python(code, env=environment, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    written = {path.relative_to(home).parts[:2] for path in home.rglob("*") if path.is_file()}
+    written = {
+        path.relative_to(home).parts[:2] for path in home.rglob("*") if path.is_file()
+    }
     # its list of fonts
-    assert written <= ({(".cache", "matplotlib")} if job in ("a figure", "learn") else set())
+    assert written <= (
+        {(".cache", "matplotlib")} if job in ("a figure", "learn") else set()
+    )
 
 
 def test_who_wants_telemetry_keeps_it():
     code = "import os, nextview; print(os.environ['ORT_DISABLE_TELEMETRY'])"
     environment = {
-        name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"
+        name: value
+        for name, value in os.environ.items()
+        if name != "ORT_DISABLE_TELEMETRY"
     }
     assert run_python(code, env=environment).stdout.strip() == "1"
     tops = ("src", "benchmarks", "research", "examples", "docs", "workflow")

@@ -48,7 +48,11 @@ class NearestPoints:
 
 def turn(angle: float) -> np.ndarray:
     return np.array(
-        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+        [
+            [np.cos(angle), -np.sin(angle), 0],
+            [np.sin(angle), np.cos(angle), 0],
+            [0, 0, 1],
+        ]
     )
 
 
@@ -71,7 +75,12 @@ class Filled:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_geometric_matcher_of_ones_own_judges_all_views(name):
-    system = nextview.load(recogniser=NearestPoints(), threads=1, threshold=0.9, max_views=3)
+    system = nextview.load(
+        recogniser=NearestPoints(),
+        threads=1,
+        threshold=0.9,
+        max_views=3,
+    )
     assert system.classes == NAMES
     assert "NearestPoints" in repr(system)
     result = system.recognise(sample_mesh(name), seed=4)
@@ -85,7 +94,10 @@ def test_what_views_speak_for_adds_up():
     system = nextview.load(recogniser=Filled(), threads=1, threshold=1.0, max_views=2)
     result = system.recognise(sample_mesh("table"), seed=0)
     logits = Filled()([view.observation for view in result.views]).sum(0)
-    np.testing.assert_allclose(result.views[-1].belief, np.exp(logits) / np.exp(logits).sum())
+    np.testing.assert_allclose(
+        result.views[-1].belief,
+        np.exp(logits) / np.exp(logits).sum(),
+    )
 
 
 def test_poses_of_ones_own_arrive_in_the_result():
@@ -96,10 +108,20 @@ def test_poses_of_ones_own_arrive_in_the_result():
         def belief(self, observations):
             found = super().belief(observations)
             best = int(found.argmax())
-            candidate = PoseCandidate(NAMES[best], best, pose, 1.0, degrees=3.0, millimetres=4.0)
+            candidate = PoseCandidate(
+                NAMES[best],
+                best,
+                pose,
+                1.0,
+                degrees=3.0,
+                millimetres=4.0,
+            )
             return JointBelief(found, (candidate,), p_value=0.5)
 
-    result = nextview.load(recogniser=Posed(), threads=1).recognise(sample_mesh("chair"), seed=1)
+    result = nextview.load(recogniser=Posed(), threads=1).recognise(
+        sample_mesh("chair"),
+        seed=1,
+    )
     np.testing.assert_array_equal(result.pose, pose)
     assert (result.pose_uncertainty.degrees, result.novelty) == (3.0, 0.5)
 
@@ -132,7 +154,8 @@ def test_for_the_goal_pose_a_session_goes_on_until_the_pose_is_sure():
                 PoseCandidate(NAMES[0], 0, turned, second),
             )
             return JointBelief(
-                np.array([0.99, *[0.01 / (len(NAMES) - 1)] * (len(NAMES) - 1)]), poses
+                np.array([0.99, *[0.01 / (len(NAMES) - 1)] * (len(NAMES) - 1)]),
+                poses,
             )
 
     system = nextview.load(recogniser=Unsure(), threads=1)
@@ -161,17 +184,28 @@ class Fails(Filled):
 
 
 def says(value, **more):
-    return type("Says", (), {"classes": ("a", "b"), "__call__": lambda self, seen: value, **more})()
+    return type(
+        "Says",
+        (),
+        {"classes": ("a", "b"), "__call__": lambda self, seen: value, **more},
+    )()
 
 
 def believes(value):
-    return type("Believes", (), {"classes": ("a", "b"), "belief": lambda self, seen: value})()
+    return type(
+        "Believes",
+        (),
+        {"classes": ("a", "b"), "belief": lambda self, seen: value},
+    )()
 
 
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
-        (Fails(), "recogniser Fails raised ZeroDivisionError: .*test_own_recogniser.py"),
+        (
+            Fails(),
+            "recogniser Fails raised ZeroDivisionError: .*test_own_recogniser.py",
+        ),
         (
             says(np.zeros((1, 3))),
             r"gives logits of \(1, 2\) numbers, not float64 of the shape \(1, 3\)",
@@ -181,24 +215,41 @@ def believes(value):
         (says([[1], [1, 2]]), r"gives logits of \(1, 2\) numbers"),
         (says(np.array([[0, np.nan]])), "gives logits that are not finite"),
         (says(Evidence(np.zeros((1, 2)))), None),
-        (says(Evidence(np.zeros((1, 2))), azimuth_bins=8), r"gives azimuth bins of \(1, 2, 8\)"),
-        (believes([0.5, 0.6]), "probabilities of the classes, which sum to 1, not to 1.1"),
+        (
+            says(Evidence(np.zeros((1, 2))), azimuth_bins=8),
+            r"gives azimuth bins of \(1, 2, 8\)",
+        ),
+        (
+            believes([0.5, 0.6]),
+            "probabilities of the classes, which sum to 1, not to 1.1",
+        ),
         (believes([-0.5, 1.5]), "probabilities of the classes"),
         (believes([1.0]), r"gives a belief of \(2,\) numbers"),
         (believes(None), r"gives a belief of \(2,\) numbers"),
-        (believes(JointBelief(np.array([0.5, 0.5]), p_value=2.0)), "a p-value is 0 to 1"),
+        (
+            believes(JointBelief(np.array([0.5, 0.5]), p_value=2.0)),
+            "a p-value is 0 to 1",
+        ),
         (
             believes(JointBelief(np.array([0.5, 0.5]), ("here",))),
             "a pose is a PoseCandidate, not a str",
         ),
         (
             believes(
-                JointBelief(np.array([0.5, 0.5]), (PoseCandidate("a", 0, 2 * np.eye(4), 1.0),))
+                JointBelief(
+                    np.array([0.5, 0.5]),
+                    (PoseCandidate("a", 0, 2 * np.eye(4), 1.0),),
+                )
             ),
             "not a rigid motion",
         ),
         (
-            believes(JointBelief(np.array([0.5, 0.5]), (PoseCandidate("a", 5, np.eye(4), 1.0),))),
+            believes(
+                JointBelief(
+                    np.array([0.5, 0.5]),
+                    (PoseCandidate("a", 5, np.eye(4), 1.0),),
+                )
+            ),
             "of class 5",
         ),
         *(
@@ -206,12 +257,24 @@ def believes(value):
                 believes(
                     JointBelief(
                         np.array([0.5, 0.5]),
-                        (PoseCandidate("a", 0, np.eye(4), 1.0, displacements=displacements),),
+                        (
+                            PoseCandidate(
+                                "a",
+                                0,
+                                np.eye(4),
+                                1.0,
+                                displacements=displacements,
+                            ),
+                        ),
                     )
                 ),
                 r"displacements of a pose are \(views, 3\) finite numbers",
             )
-            for displacements in (np.zeros(3), np.zeros((1, 2)), np.full((1, 3), np.nan))
+            for displacements in (
+                np.zeros(3),
+                np.zeros((1, 2)),
+                np.full((1, 3), np.nan),
+            )
         ),
     ],
 )
@@ -227,7 +290,11 @@ def test_what_it_says_is_checked(given, sentence):
 @pytest.mark.parametrize(
     ("given", "error", "sentence"),
     [
-        (object(), ModelError, "can be called with observations, or has a method belief"),
+        (
+            object(),
+            ModelError,
+            "can be called with observations, or has a method belief",
+        ),
         (SimpleNamespace(belief=print), ModelError, "has no classes .AttributeError"),
         (
             SimpleNamespace(belief=print, classes="chair"),
@@ -235,8 +302,16 @@ def test_what_it_says_is_checked(given, sentence):
             "are a tuple of names, not 'chair'",
         ),
         (SimpleNamespace(belief=print, classes=()), ModelError, "are a tuple of names"),
-        (SimpleNamespace(belief=print, classes=("a", 2)), ModelError, "are a tuple of names"),
-        (SimpleNamespace(belief=print, classes=("a", "a")), ModelError, "have the same name"),
+        (
+            SimpleNamespace(belief=print, classes=("a", 2)),
+            ModelError,
+            "are a tuple of names",
+        ),
+        (
+            SimpleNamespace(belief=print, classes=("a", "a")),
+            ModelError,
+            "have the same name",
+        ),
         (
             SimpleNamespace(belief=print, classes=("a",), calibration=2),
             ModelError,
@@ -286,9 +361,17 @@ class Painted:
         return np.array(logits)
 
 
-@pytest.mark.parametrize(("answer", "rgb"), [("red", (200, 30, 20)), ("blue", (10, 40, 180))])
+@pytest.mark.parametrize(
+    ("answer", "rgb"),
+    [("red", (200, 30, 20)), ("blue", (10, 40, 180))],
+)
 @pytest.mark.parametrize("table", [False, True])
-def test_a_recogniser_of_ones_own_sees_the_colours_of_captured_images(tmp_path, table, answer, rgb):
+def test_a_recogniser_of_ones_own_sees_the_colours_of_captured_images(
+    tmp_path,
+    table,
+    answer,
+    rgb,
+):
     """The background is of the other colour, which must not reach the recogniser."""
     folder = tmp_path / "captured"
     sphere = nextview.ViewSphere.named("12")
@@ -305,6 +388,8 @@ def test_a_recogniser_of_ones_own_sees_the_colours_of_captured_images(tmp_path, 
     for view in result.views:
         shown = view.observation.depth > 0
         pure = (view.observation.colour[shown] == rgb).all(1)
-        assert pure.mean() > 0.95  # but for edges, where a facet lies over several pixels
+        assert (
+            pure.mean() > 0.95
+        )  # but for edges, where a facet lies over several pixels
         assert not view.observation.colour[~shown].any()
         assert not view.observation.colour.flags.writeable

@@ -33,7 +33,10 @@ def there(tmp_path, monkeypatch):
 @pytest.mark.parametrize("page", ["add_a_measure", "add_a_policy", "add_a_recogniser"])
 def test_a_page_does_what_it_says(page):
     try:
-        failed, tried = doctest.testfile(str(ROOT / f"docs/{page}.md"), module_relative=False)
+        failed, tried = doctest.testfile(
+            str(ROOT / f"docs/{page}.md"),
+            module_relative=False,
+        )
     finally:
         sys.modules.pop("spread", None)
     assert tried > 10
@@ -45,7 +48,10 @@ def test_an_example_names_what_it_sees(name, monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "examples"))
     example = importlib.import_module(name)
     kind = example.Arm if name == "arm_and_object" else example.Turntable
-    robot = kind(nextview.load_mesh(SAMPLE_FILES / "table.off"), np.random.default_rng(1))
+    robot = kind(
+        nextview.load_mesh(SAMPLE_FILES / "table.off"),
+        np.random.default_rng(1),
+    )
     result = example.recognise(robot)
     assert result.answer == "table"
     assert result.confident
@@ -65,9 +71,15 @@ def test_a_grasp_point_arrives_where_the_handle_is(monkeypatch, capsys):
 
 def test_tests_that_a_page_names_are_there():
     tests = [
-        path for folder in ("tests", "research/tests") for path in (ROOT / folder).glob("test_*.py")
+        path
+        for folder in ("tests", "research/tests")
+        for path in (ROOT / folder).glob("test_*.py")
     ]
-    names = {name for path in tests for name in re.findall(r"def (test_\w+)", path.read_text())}
+    names = {
+        name
+        for path in tests
+        for name in re.findall(r"def (test_\w+)", path.read_text())
+    }
     for page in (ROOT / "docs").glob("*.md"):
         text = page.read_text()
         for path in re.findall(r"`((?:research/)?tests/\w+\.py)`", text):
@@ -82,7 +94,9 @@ def test_tests_that_a_page_names_are_there():
 
 def test_each_page_has_commands_and_each_reason_not_to_run_one_holds():
     steps = [
-        step for page in documented_commands.PAGES for step in documented_commands.steps_of(page)
+        step
+        for page in documented_commands.PAGES
+        for step in documented_commands.steps_of(page)
     ]
     assert {"README.md", "docs/arm.md", "docs/training.md", "research/README.md"} <= {
         step.page for step in steps
@@ -119,8 +133,13 @@ def test_each_page_names_what_its_commands_need():
             for wanted in step.needs if step.why_not is None else ():
                 project, _, extra = wanted.rstrip("]").partition("[")
                 name = r"(nextview|\.)" if project == "nextview" else r"\./research"
-                said = re.search(name + (rf"\[[\w,-]*\b{extra}\b" if extra else ""), text)
-                assert said, f"{page}:{step.line} needs {wanted}, which the page does not name"
+                said = re.search(
+                    name + (rf"\[[\w,-]*\b{extra}\b" if extra else ""),
+                    text,
+                )
+                assert said, (
+                    f"{page}:{step.line} needs {wanted}, which the page does not name"
+                )
                 needed.add(wanted)
     assert needed == set(documented_commands.NEEDS.values())
 
@@ -131,11 +150,16 @@ def test_a_command_has_nothing_but_what_it_needs(tmp_path):
     status, said, _ = environments.run(asked, tmp_path)
     assert status == 1
     assert "pip install 'nextview[train]'" in said
-    status, said, _ = environments.run("nextview --version && python -c 'import pandas'", tmp_path)
+    status, said, _ = environments.run(
+        "nextview --version && python -c 'import pandas'",
+        tmp_path,
+    )
     assert said.startswith("nextview 0")
     assert "No module named 'pandas'" in said
     status, said, _ = environments.run(
-        "python -c 'import pandas'", tmp_path, frozenset(["nextview[benchmark]"])
+        "python -c 'import pandas'",
+        tmp_path,
+        frozenset(["nextview[benchmark]"]),
     )
     assert (status, said) == (0, "")
 
@@ -150,13 +174,19 @@ def test_ci_runs_the_commands_of_all_pages():
 
 @pytest.mark.long  # it teaches three things, as CI's job for the commands of all pages does
 def test_the_example_prints_what_the_readme_shows(there, capsys):
-    code, shown = re.search(r"```python\n(.*?)```\n\n```\n(.*?)```", README, re.S).groups()
+    code, shown = re.search(
+        r"```python\n(.*?)```\n\n```\n(.*?)```",
+        README,
+        re.S,
+    ).groups()
     names: dict = {}
     exec(code, names)
     said, pose = capsys.readouterr().out.split("\n", 1)
     said_there, pose_there = shown.split("\n", 1)
     assert said.partition(", at ")[0] == said_there.partition(", at ")[0]
-    numbers = [np.array(re.findall(r"-?\d+\.\d*", text), float) for text in (pose, pose_there)]
+    numbers = [
+        np.array(re.findall(r"-?\d+\.\d*", text), float) for text in (pose, pose_there)
+    ]
     np.testing.assert_allclose(*numbers, atol=0.02)
     assert names["result"].answer == "table"
 
@@ -169,7 +199,8 @@ def test_its_session_runs(capsys):
 
 
 @pytest.mark.parametrize(
-    "line", re.findall(r"^nextview recognise samples/.*?(?=\s+#|$)", README, re.M)
+    "line",
+    re.findall(r"^nextview recognise samples/.*?(?=\s+#|$)", README, re.M),
 )
 def test_its_commands_on_the_samples_run(line, there, capsys):
     if "--models" in line:
@@ -203,13 +234,19 @@ SMALL = {
 """What makes a command of the page quick."""
 
 
-def test_making_it_ones_own_works_from_the_first_line_to_the_last(furniture, there, capsys):
+def test_making_it_ones_own_works_from_the_first_line_to_the_last(
+    furniture,
+    there,
+    capsys,
+):
     for package in ("torch", "onnx", "pandas", "jinja2"):
         pytest.importorskip(package)
     shutil.copytree(furniture, there / "data/ModelNet10")
     (part,) = re.findall(r"## Make it yours\n+```sh\n(.*?)```", README, re.S)
     lines = [line.partition("#")[0].strip() for line in part.splitlines()]
-    assert lines[0] == "nextview download modelnet10 data"  # into the folder that is there already
+    assert (
+        lines[0] == "nextview download modelnet10 data"
+    )  # into the folder that is there already
     for line in lines[1:]:
         small = next(
             (

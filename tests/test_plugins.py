@@ -51,7 +51,10 @@ def asked(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
-        ("Lines", r"raised ValueError: first second \\x1b\[31mx+\.\.\., at code_of_mine.py:8"),
+        (
+            "Lines",
+            r"raised ValueError: first second \\x1b\[31mx+\.\.\., at code_of_mine.py:8",
+        ),
         ("Leaves", "raised SystemExit: bye, at code_of_mine.py:8"),
         (
             "Values",
@@ -83,7 +86,9 @@ def test_ctrl_c_is_not_taken_for_an_error_of_a_plugin():
 
 
 @pytest.mark.parametrize("said", [None, "yes", np.nan])
-def test_a_callable_that_says_nothing_of_a_pose_is_refused_and_the_session_goes_on(said):
+def test_a_callable_that_says_nothing_of_a_pose_is_refused_and_the_session_goes_on(
+    said,
+):
     camera = nextview.SimulatedCamera(sample_mesh("chair"), 112)
     session = nextview.load(policy="spread", threads=1, threshold=1.0).session(start=3)
     for name, what in (

@@ -25,7 +25,11 @@ from nextview.policies.baselines import (
 from nextview.policies.learned_tables import ClassTable, FixedRing, FixedSequence
 from nextview.policies.maps import MapPeak, SpherePeak, local_peaks
 from nextview.policies.oracle import OracleGain, OracleValley
-from nextview.policies.policy_card import bundled_policies, read_policy_card, write_policy_card
+from nextview.policies.policy_card import (
+    bundled_policies,
+    read_policy_card,
+    write_policy_card,
+)
 from nextview.policies.registry import POLICIES, make_policy
 from nextview.recognition.belief import Calibration
 
@@ -48,22 +52,33 @@ def state_of(sphere, current, visited=None, belief=None, **local_maps) -> Episod
         seen[row, list(views)] = True
     belief = np.full((len(current), 2), 0.5) if belief is None else np.asarray(belief)
     evidence = Evidence(
-        np.zeros((len(current), 2)), {k: np.asarray(m, float) for k, m in local_maps.items()}
+        np.zeros((len(current), 2)),
+        {k: np.asarray(m, float) for k, m in local_maps.items()},
     )
     return EpisodeState(
-        current, seen, belief, evidence, int(seen.sum(1).max()), np.arange(len(current))
+        current,
+        seen,
+        belief,
+        evidence,
+        int(seen.sum(1).max()),
+        np.arange(len(current)),
     )
 
 
 def random_state(sphere, rng, episodes=50) -> EpisodeState:
     """Episodes under way, with maps whose values often tie."""
     state = state_of(
-        sphere, rng.integers(len(sphere), size=episodes), belief=rng.dirichlet([1, 1], episodes)
+        sphere,
+        rng.integers(len(sphere), size=episodes),
+        belief=rng.dirichlet([1, 1], episodes),
     )
     state.visited[:] |= rng.random(state.visited.shape) < rng.random((episodes, 1))
     cells = rng.integers(0, 4, (episodes, sphere.rings, 3)) / 4.0
     whole = rng.integers(0, 4, (episodes, sphere.rings, sphere.azimuths)) / 4.0
-    evidence = Evidence(np.zeros((episodes, 2)), {"lem": cells, "lcm": cells, "lem-sphere": whole})
+    evidence = Evidence(
+        np.zeros((episodes, 2)),
+        {"lem": cells, "lcm": cells, "lem-sphere": whole},
+    )
     return replace(state, evidence=evidence, visibility=rng.random(state.visited.shape))
 
 
@@ -73,7 +88,12 @@ def random_state(sphere, rng, episodes=50) -> EpisodeState:
 @given(st.integers(0, 2**32), st.integers(2, 7), st.integers(3, 7))
 def test_local_peaks_are_those_of_scikit_image(seed, rows, columns):
     cells = np.random.default_rng(seed).random((rows, columns))
-    expected = peak_local_max(cells, min_distance=1, threshold_abs=-1, exclude_border=False)
+    expected = peak_local_max(
+        cells,
+        min_distance=1,
+        threshold_abs=-1,
+        exclude_border=False,
+    )
     found = np.argwhere(local_peaks(cells[None])[0])
     # Of two diagonal or straight neighbours scikit-image keeps one; without ties no two peaks are
     # neighbours.
@@ -100,7 +120,11 @@ def policies(sphere, rng):
         calibration=Calibration(bin_correlation=0.1),
     )
     for scope in ("global", "local"):
-        yield FixedSequence(sphere, rng.integers(len(sphere), size=(sphere.rings, 4)), scope)
+        yield FixedSequence(
+            sphere,
+            rng.integers(len(sphere), size=(sphere.rings, 4)),
+            scope,
+        )
         yield ClassTable(sphere, rng.random((2, sphere.rings, len(sphere))), scope)
     yield FixedRing(sphere, sphere.rings - 1, 2)
 
@@ -126,7 +150,16 @@ def test_no_row_depends_on_another(sphere, seed):
     state = random_state(sphere, rng)
     for policy in policies(sphere, rng):
         if isinstance(
-            policy, (Random, RandomAll, Furthest, Spread, FixedSequence, FixedRing, MostVisible)
+            policy,
+            (
+                Random,
+                RandomAll,
+                Furthest,
+                Spread,
+                FixedSequence,
+                FixedRing,
+                MostVisible,
+            ),
         ):
             continue  # they draw, or may
         together = policy.next_views(state, rng)
@@ -137,12 +170,18 @@ def test_no_row_depends_on_another(sphere, seed):
 # Baselines
 
 
-@pytest.mark.parametrize("policy", [Random(SPHERE), RandomAll(SPHERE)], ids=["window", "all"])
+@pytest.mark.parametrize(
+    "policy",
+    [Random(SPHERE), RandomAll(SPHERE)],
+    ids=["window", "all"],
+)
 def test_random_is_uniform_over_what_is_free(policy):
     visited = [11, 3, 28, 36, 0, 25]
     state = state_of(SPHERE, np.full(20_000, 11), [visited] * 20_000)
     chosen = policy.next_views(state, np.random.default_rng(0))
-    candidates = SPHERE.windows[11].ravel() if isinstance(policy, Random) else np.arange(40)
+    candidates = (
+        SPHERE.windows[11].ravel() if isinstance(policy, Random) else np.arange(40)
+    )
     free = np.setdiff1d(candidates, visited)
     drawn = np.bincount(chosen, minlength=40)
     assert drawn[free].sum() == 20_000
@@ -158,7 +197,9 @@ def test_furthest_is_the_furthest_free_view_of_the_window(seed):
         free = [v for v in SPHERE.windows[view].ravel() if not state.visited[row, v]]
         if free:
             assert chosen[row] in free
-            assert SPHERE.travel[view, chosen[row]] == max(SPHERE.travel[view, v] for v in free)
+            assert SPHERE.travel[view, chosen[row]] == max(
+                SPHERE.travel[view, v] for v in free
+            )
 
 
 @given(spheres, st.data())
@@ -167,16 +208,20 @@ def test_unidirectional_walks_the_ring(sphere, data):
     state, walked = state_of(sphere, start), [start]
     for _ in range(sphere.azimuths - 1):
         state = replace(
-            state, current=Unidirectional(sphere).next_views(state, np.random.default_rng(0))
+            state,
+            current=Unidirectional(sphere).next_views(state, np.random.default_rng(0)),
         )
         state.visited[0, state.current] = True
         walked.append(int(state.current[0]))
     ring, first = divmod(start, sphere.azimuths)
     assert walked == [
-        ring * sphere.azimuths + (first + k) % sphere.azimuths for k in range(sphere.azimuths)
+        ring * sphere.azimuths + (first + k) % sphere.azimuths
+        for k in range(sphere.azimuths)
     ]
     if sphere.rings > 1:  # round: on to the ring next to it
-        following = int(Unidirectional(sphere).next_views(state, np.random.default_rng(0))[0])
+        following = int(
+            Unidirectional(sphere).next_views(state, np.random.default_rng(0))[0]
+        )
         assert sphere.ring[following] != ring
 
 
@@ -187,9 +232,14 @@ def test_spread_is_the_free_view_farthest_from_all_visited(sphere, scope, seed):
     state = random_state(sphere, rng)
     chosen = Spread(sphere, scope).next_views(state, rng)
     for row, view in enumerate(state.current):
-        reachable = range(len(sphere)) if scope == "global" else sphere.windows[view].ravel()
+        reachable = (
+            range(len(sphere)) if scope == "global" else sphere.windows[view].ravel()
+        )
         seen = sphere.directions[state.visited[row]]
-        apart = {v: np.arccos(np.clip(seen @ sphere.directions[v], -1, 1)).min() for v in reachable}
+        apart = {
+            v: np.arccos(np.clip(seen @ sphere.directions[v], -1, 1)).min()
+            for v in reachable
+        }
         free = {v: arc for v, arc in apart.items() if not state.visited[row, v]}
         if free:
             assert free[chosen[row]] >= max(free.values()) - 1e-5
@@ -201,11 +251,23 @@ def test_spread_is_the_free_view_farthest_from_all_visited(sphere, scope, seed):
 def test_a_fixed_ring_is_entered_where_the_camera_is_and_walked_in_its_steps():
     policy, state, walked = FixedRing(SPHERE, 3, 3), state_of(SPHERE, 6), []
     for _ in range(9):
-        state = replace(state, current=policy.next_views(state, np.random.default_rng(0)))
+        state = replace(
+            state,
+            current=policy.next_views(state, np.random.default_rng(0)),
+        )
         state.visited[0, state.current] = True
         walked.append(SPHERE.angles(int(state.current[0])))
     assert [e for e, _ in walked[:8]] == [54.0] * 8
-    assert [a for _, a in walked[:8]] == [270.0, 45.0, 180.0, 315.0, 90.0, 225.0, 0.0, 135.0]
+    assert [a for _, a in walked[:8]] == [
+        270.0,
+        45.0,
+        180.0,
+        315.0,
+        90.0,
+        225.0,
+        0.0,
+        135.0,
+    ]
     assert walked[8][0] != 54.0  # round: on to another
 
 
@@ -221,14 +283,24 @@ def test_a_class_table_takes_the_best_free_cell_of_the_believed_class(scope):
         for other in reachable:
             if not state.visited[row, other]:
                 steps = (other % 8 - view % 8) % 8
-                of[other] = values[state.belief[row].argmax(), view // 8, other // 8 * 8 + steps]
+                of[other] = values[
+                    state.belief[row].argmax(),
+                    view // 8,
+                    other // 8 * 8 + steps,
+                ]
         if of:
             assert chosen[row] == max(of, key=of.get)
 
 
 # Maps
 
-HILLS = [[0.1, 0.9, 0.1], [0.2, 0.3, 0.2], [0.4, 0.2, 0.1], [0.5, 0.3, 0.2], [0.8, 0.6, 0.7]]
+HILLS = [
+    [0.1, 0.9, 0.1],
+    [0.2, 0.3, 0.2],
+    [0.4, 0.2, 0.1],
+    [0.5, 0.3, 0.2],
+    [0.8, 0.6, 0.7],
+]
 """Around view 11: peaks at the top left (0.8), the bottom middle (0.9) and the top right (0.7)."""
 
 
@@ -242,48 +314,76 @@ def test_map_peak_is_the_highest_free_peak_of_scikit_image(seed):
     chosen = MapPeak(SPHERE, "lem").next_views(state, rng)
     for row, window in enumerate(SPHERE.windows[state.current]):
         free = ~state.visited[row, window]
-        peaks = peak_local_max(cells[row], min_distance=1, threshold_abs=-1, exclude_border=False)
-        peaks = [tuple(p) for p in peaks if free[tuple(p)]] or [tuple(p) for p in np.argwhere(free)]
+        peaks = peak_local_max(
+            cells[row],
+            min_distance=1,
+            threshold_abs=-1,
+            exclude_border=False,
+        )
+        peaks = [tuple(p) for p in peaks if free[tuple(p)]] or [
+            tuple(p) for p in np.argwhere(free)
+        ]
         if peaks:
             assert chosen[row] == window[max(peaks, key=lambda p: cells[row][p])]
 
 
 def test_a_valley_is_chosen_by_the_believed_class():
-    state = state_of(SPHERE, [11, 11], belief=[[0.9, 0.1], [0.2, 0.8]], lem=[HILLS, HILLS])
+    state = state_of(
+        SPHERE,
+        [11, 11],
+        belief=[[0.9, 0.1], [0.2, 0.8]],
+        lem=[HILLS, HILLS],
+    )
     peak, valley = MapPeak(SPHERE, "lem", valley_classes=(1,)).next_views(
-        state, np.random.default_rng(0)
+        state,
+        np.random.default_rng(0),
     )
     assert peak == 3
-    assert HILLS[SPHERE.ring[valley]][[2, 3, 4].index(SPHERE.azimuth_index[valley])] == 0.1
-    both = MapPeak(SPHERE, "lem", valley_classes=(0, 1)).next_views(state, np.random.default_rng(0))
+    assert (
+        HILLS[SPHERE.ring[valley]][[2, 3, 4].index(SPHERE.azimuth_index[valley])] == 0.1
+    )
+    both = MapPeak(SPHERE, "lem", valley_classes=(0, 1)).next_views(
+        state,
+        np.random.default_rng(0),
+    )
     assert both.tolist() == [valley, valley]
-    assert MapPeak(SPHERE, "lem").next_views(state, np.random.default_rng(0)).tolist() == [3, 3]
+    assert MapPeak(SPHERE, "lem").next_views(
+        state,
+        np.random.default_rng(0),
+    ).tolist() == [3, 3]
 
 
 # By name
 
 
 @pytest.mark.parametrize(
-    ("name", "maps"), [("lem", ()), ("view_area", ["view_area"]), ("a:b", ["a:b"])]
+    ("name", "maps"),
+    [("lem", ()), ("view_area", ["view_area"]), ("a:b", ["a:b"])],
 )
 def test_every_map_has_policies_by_one_rule(name, maps):
     assert make_policy(name, SPHERE, [1], maps=maps) == MapPeak(SPHERE, name, (1,))
     assert make_policy(f"{name}-peak", SPHERE, [1], maps=maps) == MapPeak(SPHERE, name)
     assert make_policy(f"{name}-sphere-peak", SPHERE, [1], maps=maps) == SpherePeak(
-        SPHERE, f"{name}-sphere"
+        SPHERE,
+        f"{name}-sphere",
     )
     with pytest.raises(
-        PolicyError, match=f"is called 'best'; there are random, .*{name}-sphere-peak, .*gain"
+        PolicyError,
+        match=f"is called 'best'; there are random, .*{name}-sphere-peak, .*gain",
     ):
         make_policy("best", SPHERE, maps=maps)
     with pytest.raises(
-        PolicyError, match=rf"no policy is called|policy {name}-peak-peak cannot be made"
+        PolicyError,
+        match=rf"no policy is called|policy {name}-peak-peak cannot be made",
     ):
         make_policy(f"{name}-peak-peak", SPHERE, maps=maps)
 
 
 def test_a_name_that_is_nearly_one_is_suggested():
-    with pytest.raises(PolicyError, match=r"no policy is called 'gian'; did you mean 'gain'[?]$"):
+    with pytest.raises(
+        PolicyError,
+        match=r"no policy is called 'gian'; did you mean 'gain'[?]$",
+    ):
         make_policy("gian", SPHERE)
 
 
@@ -292,7 +392,12 @@ def test_a_card_is_written_as_it_was_read_and_a_broken_one_is_named(tmp_path):
         write_policy_card(tmp_path / f"{name}.json", read_policy_card(path))
         assert read_policy_card(tmp_path / f"{name}.json") == read_policy_card(path)
     good = json.loads((tmp_path / "fixed-ring.json").read_text())
-    wrong = ({"kind": "agent"}, {"table": {"ring": 9, "steps": 1}}, {"more": 1}, {"schema": 2})
+    wrong = (
+        {"kind": "agent"},
+        {"table": {"ring": 9, "steps": 1}},
+        {"more": 1},
+        {"schema": 2},
+    )
     for k, change in enumerate(wrong):
         (tmp_path / f"{k}.json").write_text(json.dumps(good | change))
         with pytest.raises(PolicyError, match=rf"^\S+{k}\.json: not a policy card"):

@@ -19,7 +19,16 @@ from nextview.geometry.triangles import triangulate
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.simulation.simulated import SimulatedCamera
 
-BENCH = [(0, 0), (0.1, 0), (0.1, 0.6), (1.1, 0.6), (1.1, 0), (1.2, 0), (1.2, 0.7), (0, 0.7)]
+BENCH = [
+    (0, 0),
+    (0.1, 0),
+    (0.1, 0.6),
+    (1.1, 0.6),
+    (1.1, 0),
+    (1.2, 0),
+    (1.2, 0.7),
+    (0, 0.7),
+]
 TURNS = np.linspace(0, 2 * np.pi, 12, endpoint=False)
 OUTLINES = {
     "square": [(0, 0), (1, 0), (1, 1), (0, 1)],
@@ -28,9 +37,20 @@ OUTLINES = {
     "a U clockwise": BENCH[::-1],
     "an L": [(0, 0), (3, 0), (3, 1), (1, 1), (1, 4), (0, 4)],
     "an arrow of four corners": [(0, 0), (2, 1), (0, 2), (0.5, 1)],
-    "a star": [((1 + k % 2) * np.cos(a), (1 + k % 2) * np.sin(a)) for k, a in enumerate(TURNS)],
+    "a star": [
+        ((1 + k % 2) * np.cos(a), (1 + k % 2) * np.sin(a)) for k, a in enumerate(TURNS)
+    ],
     "a comb": [(x, 5 * (x % 2)) for x in range(20)] + [(19, 6), (0, 6)],
-    "corners on its edges": [(0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2), (0, 1)],
+    "corners on its edges": [
+        (0, 0),
+        (1, 0),
+        (2, 0),
+        (2, 1),
+        (1, 1),
+        (1, 2),
+        (0, 2),
+        (0, 1),
+    ],
     "corners twice": [p for p in BENCH for _ in range(2)],
     "a frame with a slit": [
         (0, 0),
@@ -67,12 +87,19 @@ def areas(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def test_the_triangles_cover_the_polygon_and_nothing_else(name, first):
     outline = np.roll(np.array(OUTLINES[name], float), -2 * first, axis=0)
     turn = Rotation.random(rng=first).as_matrix()
-    points = np.column_stack([outline, np.zeros(len(outline))]) @ turn.T + (100, -200, 300)
+    points = np.column_stack([outline, np.zeros(len(outline))]) @ turn.T + (
+        100,
+        -200,
+        300,
+    )
     faces = cut(points)
     found = areas(points, faces)
     # All of them are wound as the polygon is, and none lies over another one: then the areas add up
     # to the polygon's.
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1).sum(), abs(shoelace(outline)))
+    np.testing.assert_allclose(
+        np.linalg.norm(found, axis=1).sum(),
+        abs(shoelace(outline)),
+    )
     np.testing.assert_allclose(found.sum(0), shoelace(outline) * turn[:, 2], atol=1e-9)
     middles = outline[faces[np.linalg.norm(found, axis=1) > 1e-9]].mean(1)
     assert Outline(outline).contains_points(middles).all()
@@ -80,7 +107,9 @@ def test_the_triangles_cover_the_polygon_and_nothing_else(name, first):
 
 @settings(deadline=None, max_examples=60)
 @given(
-    st.lists(st.floats(0.05, 1), min_size=4, max_size=60), st.floats(0, 0.02), st.integers(0, 100)
+    st.lists(st.floats(0.05, 1), min_size=4, max_size=60),
+    st.floats(0, 0.02),
+    st.integers(0, 100),
 )
 def test_any_polygon_without_crossings_bent_or_not(radii, bend, seed):
     rng = np.random.default_rng(seed)
@@ -120,9 +149,19 @@ def test_a_degenerate_polygon_breaks_nothing(points):
 
 def test_polygons_of_many_sizes_keep_their_order():
     points = np.array([(*p, 0.0) for p in [*BENCH, (9, 9)]])
-    corners = [[0, 1, 8], [0, 1, 2, 8], list(range(8)), [0, 1], [], [5, 6, 7], [8, 7, 6, 5]]
+    corners = [
+        [0, 1, 8],
+        [0, 1, 2, 8],
+        list(range(8)),
+        [0, 1],
+        [],
+        [5, 6, 7],
+        [8, 7, 6, 5],
+    ]
     together = triangulate(
-        points, np.concatenate(corners).astype(int), np.array([len(c) for c in corners])
+        points,
+        np.concatenate(corners).astype(int),
+        np.array([len(c) for c in corners]),
     )
     alone = [triangulate(points, np.array(c, int), np.array([len(c)])) for c in corners]
     np.testing.assert_array_equal(together, np.concatenate(alone))
@@ -151,7 +190,9 @@ def bench() -> tuple[np.ndarray, list[list[int]]]:
     """A prism whose ends are U-shaped polygons of eight corners, and whose sides are quads."""
     count = len(BENCH)
     points = np.array([(x, y, z) for y in (0.0, 0.5) for x, z in BENCH])
-    sides = [[k, (k + 1) % count, count + (k + 1) % count, count + k] for k in range(count)]
+    sides = [
+        [k, (k + 1) % count, count + (k + 1) % count, count + k] for k in range(count)
+    ]
     faces = [list(range(count))[::-1], *sides, list(range(count, 2 * count))]
     return points, [face[::-1] for face in faces]
 
@@ -193,8 +234,12 @@ def as_ply(points, faces, kind="ascii", order="<") -> bytes:
 
 
 def as_stl(points, faces) -> bytes:
-    loops = ["".join("vertex {} {} {}\n".format(*points[i]) for i in face) for face in faces]
-    facets = [f"facet normal 0 0 0\nouter loop\n{loop}endloop\nendfacet" for loop in loops]
+    loops = [
+        "".join("vertex {} {} {}\n".format(*points[i]) for i in face) for face in faces
+    ]
+    facets = [
+        f"facet normal 0 0 0\nouter loop\n{loop}endloop\nendfacet" for loop in loops
+    ]
     return "\n".join(["solid bench", *facets, "endsolid"]).encode()
 
 
@@ -225,7 +270,12 @@ def test_a_prism_of_polygons_is_the_solid_that_it_is_drawn_as(tmp_path: Path, na
         for size, at in [*legs, ((1.2, 0.5, 0.1), (0.6, 0.25, 0.65))]
     ]
     drawn = trimesh.util.concatenate(boxes)
-    cameras = [SimulatedCamera(each, 64) for each in (mesh, make_mesh(drawn.vertices, drawn.faces))]
+    cameras = [
+        SimulatedCamera(each, 64)
+        for each in (mesh, make_mesh(drawn.vertices, drawn.faces))
+    ]
     for pose in ViewSphere.named("12").poses:
         found, expected = (camera.observe(pose).depth for camera in cameras)
-        assert (np.abs(found - expected) > 1e-4).mean() < 0.002  # of pixels that look along an edge
+        assert (
+            np.abs(found - expected) > 1e-4
+        ).mean() < 0.002  # of pixels that look along an edge

@@ -46,7 +46,11 @@ def test_a_plain_script_without_a_guard_may_use_workers(tmp_path, way):
         "a line": ["-c", LINES],
     }[way]
     done = subprocess.run(
-        [sys.executable, *call], input=LINES, cwd=tmp_path, capture_output=True, text=True
+        [sys.executable, *call],
+        input=LINES,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
     )
     assert done.stderr == ""
     assert done.stdout == "script runs\n[1.0, 2.0, 3.0]\n"
@@ -55,7 +59,10 @@ def test_a_plain_script_without_a_guard_may_use_workers(tmp_path, way):
 def test_text_that_looks_like_the_script_is_no_reason_to_run_it(tmp_path):
     (tmp_path / "script.py").write_text(TEXT)
     done = subprocess.run(
-        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True
+        [sys.executable, "script.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
     )
     assert (done.stderr, done.stdout) == ("", "[14]\n")
 
@@ -71,7 +78,10 @@ def test_text_that_looks_like_the_script_is_no_reason_to_run_it(tmp_path):
 def test_what_a_guarded_script_defines_reaches_the_workers(tmp_path, function, items):
     (tmp_path / "script.py").write_text(OWN_CODE.format(function=function, items=items))
     done = subprocess.run(
-        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True
+        [sys.executable, "script.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
     )
     assert (done.stderr, done.stdout) == ("", "[2, 8, 18]\n")
 

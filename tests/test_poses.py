@@ -44,7 +44,12 @@ def l_block() -> trimesh.Trimesh:
     return trimesh.util.concatenate(parts)
 
 
-THINGS = {"block": l_block, "bottle": bottle, "carton": lambda: box((0.1, 0.06, 0.16)), "mug": mug}
+THINGS = {
+    "block": l_block,
+    "bottle": bottle,
+    "carton": lambda: box((0.1, 0.06, 0.16)),
+    "mug": mug,
+}
 
 
 @pytest.fixture(scope="session")
@@ -75,7 +80,10 @@ def meshes(metric_scans):
 
 def session_of(system, views: int, start: int = 0, **more) -> nextview.Session:
     """A session that does not stop before so many views."""
-    return replace(system, stopping=FixedLength(max_views=views)).session(start=start, **more)
+    return replace(system, stopping=FixedLength(max_views=views)).session(
+        start=start,
+        **more,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +106,12 @@ def placed(name: str, yaw: float, at=SPOT) -> np.ndarray:
 
 
 def frame_of(
-    name: str, pose: np.ndarray, camera: np.ndarray, seed=0, sigma=0.001, posed=True
+    name: str,
+    pose: np.ndarray,
+    camera: np.ndarray,
+    seed=0,
+    sigma=0.001,
+    posed=True,
 ) -> Frame:
     """A noisy depth frame of a scan on the table."""
     scan = THINGS[name]().apply_translation(ORIGIN).apply_transform(pose)
@@ -112,7 +125,9 @@ def off_by(found: np.ndarray, true: np.ndarray, name: str) -> tuple[float, float
     """Degrees, and millimetres at the middle of the thing, between two poses."""
     turn = Rotation.from_matrix(found[:3, :3] @ true[:3, :3].T).magnitude()
     middle = np.append(THINGS[name]().bounds.mean(0) + ORIGIN, 1)
-    return float(np.degrees(turn)), float(1000 * np.linalg.norm(((found - true) @ middle)[:3]))
+    return float(np.degrees(turn)), float(
+        1000 * np.linalg.norm(((found - true) @ middle)[:3])
+    )
 
 
 @pytest.mark.parametrize("name", ["block", "mug"])
@@ -121,7 +136,12 @@ def test_a_pose_is_where_the_thing_is_in_the_world(system, name):
     session = session_of(system, 2, distance=0.5)
     for seed, (up, around) in enumerate([(35, 20), (40, 100)]):
         session.update(
-            frame_of(name, true, pose_at(up, around, 0.5, np.add(SPOT, (0, 0, 0.03))), seed)
+            frame_of(
+                name,
+                true,
+                pose_at(up, around, 0.5, np.add(SPOT, (0, 0, 0.03))),
+                seed,
+            )
         )
         result = session.result
         assert (result.answer, result.pose_frame) == (name, "world")
@@ -145,7 +165,9 @@ def test_a_frame_without_a_pose_gives_it_in_the_cameras_frame(system):
     turn, moved = off_by(result.pose, np.linalg.inv(camera) @ true, "mug")
     assert turn < 2
     assert moved < 2
-    assert result.pose_uncertainty.millimetres < 2  # nothing is said of where the camera stands
+    assert (
+        result.pose_uncertainty.millimetres < 2
+    )  # nothing is said of where the camera stands
 
 
 @pytest.mark.parametrize("name", list(THINGS))
@@ -160,7 +182,10 @@ def test_simulated_cameras_give_it_in_the_object_frame(system, meshes, name):
     assert (result.answer, result.pose_frame) == (name, "object")
     degrees, millimetres = off_by(result.pose, true, name)
     assert millimetres < 2
-    np.testing.assert_allclose(sum(each.probability for each in result.pose_candidates), 1)
+    np.testing.assert_allclose(
+        sum(each.probability for each in result.pose_candidates),
+        1,
+    )
     if name in ("block", "mug"):
         assert degrees < 2
 
@@ -211,15 +236,23 @@ def test_without_a_scale_features_answer_and_it_says_so(system, known, meshes):
     assert result.pose is None
     assert result.pose_candidates == ()
     assert "not known in metres" in result.why_no_pose
-    plain = nextview.load(models=known, recogniser=TaughtRecogniser(known / "memory.json", 1))
+    plain = nextview.load(
+        models=known,
+        recogniser=TaughtRecogniser(known / "memory.json", 1),
+    )
     np.testing.assert_array_equal(
-        plain.recognise(mug_of_no_size, seed=2).views[0].belief, result.views[0].belief
+        plain.recognise(mug_of_no_size, seed=2).views[0].belief,
+        result.views[0].belief,
     )
 
 
 def test_what_has_no_geometry_is_known_by_features_alone(known, meshes):
     recogniser = recogniser_of(known)
-    surfaces = [each for each in recogniser.things.verifier.caster.surfaces if each.name != "mug"]
+    surfaces = [
+        each
+        for each in recogniser.things.verifier.caster.surfaces
+        if each.name != "mug"
+    ]
     recogniser.things = TaughtThings(recogniser, surfaces)
     system = nextview.load(models=known, threads=1, recogniser=recogniser)
     result = system.recognise(meshes["mug"], seed=2)
@@ -276,20 +309,31 @@ def test_what_no_scan_explains_is_unknown_with_a_p_value(known, meshes):
     stranger = trimesh.util.concatenate(
         [box((0.1, 0.1, 0.02)), box((0.02, 0.02, 0.12), (0, 0, 0.05))]
     )
-    result = system.recognise(make_mesh(stranger.vertices, stranger.faces, unit="m"), seed=1)
+    result = system.recognise(
+        make_mesh(stranger.vertices, stranger.faces, unit="m"),
+        seed=1,
+    )
     assert result.unknown
-    assert (result.answer, result.pose, result.novelty) == (None, None, pytest.approx(0.01))
+    assert (result.answer, result.pose, result.novelty) == (
+        None,
+        None,
+        pytest.approx(0.01),
+    )
     assert "1 % of taught things are explained as badly by their scans" in repr(result)
     taught = system.recognise(meshes["mug"], seed=1)
     assert (taught.answer, taught.unknown) == ("mug", False)
     assert taught.novelty > 0.5
     never = nextview.load(models=known, threads=1, recogniser=recogniser, unknown=0)
     assert not never.recognise(
-        make_mesh(stranger.vertices, stranger.faces, unit="m"), seed=1
+        make_mesh(stranger.vertices, stranger.faces, unit="m"),
+        seed=1,
     ).unknown
 
 
-@pytest.mark.parametrize("again", [deepcopy, lambda session: pickle.loads(pickle.dumps(session))])
+@pytest.mark.parametrize(
+    "again",
+    [deepcopy, lambda session: pickle.loads(pickle.dumps(session))],
+)
 def test_a_copy_of_a_session_with_geometry_goes_on_alike(system, meshes, again):
     session = session_of(system, 2, start=5)
     camera = nextview.SimulatedCamera(meshes["block"])
@@ -310,16 +354,26 @@ def test_errors_are_as_large_as_the_uncertainty_says(system):
         true = placed(name, rng.uniform(-0.8, 0.8))  # the handle is seen
         session = session_of(system, 2, distance=0.5)
         for around in rng.uniform([-50, 0], [0, 50]):
-            camera = pose_at(rng.uniform(25, 50), around, 0.5, np.add(SPOT, (0, 0, 0.04)))
+            camera = pose_at(
+                rng.uniform(25, 50),
+                around,
+                0.5,
+                np.add(SPOT, (0, 0, 0.04)),
+            )
             shown = frame_of(name, true, camera, seed=episode, sigma=0.0015)
             believed = camera.copy()
             believed[:3, :3] = (
-                camera[:3, :3] @ Rotation.from_rotvec(np.radians(rng.normal(0, 0.3, 3))).as_matrix()
+                camera[:3, :3]
+                @ Rotation.from_rotvec(np.radians(rng.normal(0, 0.3, 3))).as_matrix()
             )
             believed[:3, 3] += rng.normal(0, 0.003, 3)
             seen = np.isin(
                 cast(
-                    [THINGS[name]().apply_translation(ORIGIN).apply_transform(true), TABLE], camera
+                    [
+                        THINGS[name]().apply_translation(ORIGIN).apply_transform(true),
+                        TABLE,
+                    ],
+                    camera,
                 )[1],
                 0,
             )
@@ -358,9 +412,9 @@ def test_json_and_the_table_tell_the_pose(known, metric_scans, capsys):
     np.testing.assert_allclose((pose @ [*ORIGIN, 1])[:3], 0, atol=0.002)
     # from both sides it is the same
     assert [each["thing"] for each in printed["pose_candidates"]] == ["carton"] * 2
-    assert sum(each["probability"] for each in printed["pose_candidates"]) == pytest.approx(
-        1, abs=1e-5
-    )
+    assert sum(
+        each["probability"] for each in printed["pose_candidates"]
+    ) == pytest.approx(1, abs=1e-5)
     assert printed["pose_uncertainty"]["millimetres"] < 3
     assert printed["why_no_pose"] == ""
 
@@ -384,7 +438,11 @@ def test_the_outline_of_the_scan_is_that_of_what_was_seen(system, meshes, tmp_pa
     shown = np.isfinite(depth).reshape(seen.depth.shape)
     assert (shown & (seen.depth > 0)).sum() > 0.95 * (shown | (seen.depth > 0)).sum()
 
-    drawn = [axes for axes in result.plot(tmp_path / "mug.png").axes if axes.findobj(ContourSet)]
+    drawn = [
+        axes
+        for axes in result.plot(tmp_path / "mug.png").axes
+        if axes.findobj(ContourSet)
+    ]
     assert len(drawn) == len(result.views)
 
 
@@ -414,7 +472,12 @@ def drawn_overlaps(figure, views) -> list[float]:
 def test_outlines_are_drawn_where_displaced_cameras_see_the_thing(system, meshes, name):
     camera = nextview.SimulatedCamera(meshes[name])
     session = session_of(system, 4, start=12)
-    errors = {12: (0.006, 0, 0), 9: None, 18: (0, -0.006, 0.003), 22: (-0.004, 0.004, -0.003)}
+    errors = {
+        12: (0.006, 0, 0),
+        9: None,
+        18: (0, -0.006, 0.003),
+        22: (-0.004, 0.004, -0.003),
+    }
     for place, error in errors.items():
         observation = camera.observe(system.sphere.poses[place])
         pose = observation.pose.copy()
@@ -432,16 +495,28 @@ def test_outlines_are_drawn_where_displaced_cameras_see_the_thing(system, meshes
 
     where_seen = drawn_overlaps(result.plot(), result.views)
     elsewhere = draw_episode(
-        result.views, result.classes, result.sphere, result.stopping, "", result.posed_surface
+        result.views,
+        result.classes,
+        result.sphere,
+        result.stopping,
+        "",
+        result.posed_surface,
     )
     assert min(where_seen) > 0.93, where_seen
     assert np.mean(where_seen) > np.mean(drawn_overlaps(elsewhere, result.views)) + 0.02
 
 
-def test_displacements_of_other_views_are_not_drawn_and_it_says_so(system, meshes, caplog):
+def test_displacements_of_other_views_are_not_drawn_and_it_says_so(
+    system,
+    meshes,
+    caplog,
+):
     result = system.recognise(meshes["mug"], start=12)
     last = result.views[-1]
-    given = replace(last.joint.poses[0], displacements=np.full((len(result.views) + 1, 3), 0.01))
+    given = replace(
+        last.joint.poses[0],
+        displacements=np.full((len(result.views) + 1, 3), 0.01),
+    )
     view = replace(last, joint=replace(last.joint, poses=(given,)))
     other = replace(result, views=(*result.views[:-1], view))
     assert min(drawn_overlaps(other.plot(), other.views)) > 0.95
@@ -452,8 +527,18 @@ def test_displacements_turn_with_the_frame_of_a_pose():
     by = np.eye(4)
     by[:3, :3] = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
     by[:3, 3] = (1, 2, 3)
-    given = PoseCandidate("a", 0, np.eye(4), 1.0, displacements=np.array([[0.001, 0, 0.002]]))
-    np.testing.assert_allclose(given.moved(by).displacements, [[0, 0.001, 0.002]], atol=1e-12)
+    given = PoseCandidate(
+        "a",
+        0,
+        np.eye(4),
+        1.0,
+        displacements=np.array([[0.001, 0, 0.002]]),
+    )
+    np.testing.assert_allclose(
+        given.moved(by).displacements,
+        [[0, 0.001, 0.002]],
+        atol=1e-12,
+    )
     assert PoseCandidate("a", 0, np.eye(4), 1.0).moved(by).displacements.shape == (0, 3)
 
 
@@ -471,7 +556,8 @@ def test_an_outline_has_no_specks():
 
 def test_a_recording_shows_the_scan_where_it_was_found(system, meshes, tmp_path):
     recording = pytest.importorskip(
-        "nextview.viewers.recording", reason="the extra 'record' is not installed"
+        "nextview.viewers.recording",
+        reason="the extra 'record' is not installed",
     )
     reading = pytest.importorskip("test_recording")
     session = session_of(system, 1, start=12)
@@ -497,12 +583,25 @@ def test_the_explorer_tells_the_place(known, metric_scans):
 
 
 def candidate(
-    turn=(0, 0, 0), at=(0, 0, 0), probability=1.0, symmetry=None, degrees=0.0, millimetres=0.0
+    turn=(0, 0, 0),
+    at=(0, 0, 0),
+    probability=1.0,
+    symmetry=None,
+    degrees=0.0,
+    millimetres=0.0,
 ):
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_rotvec(np.radians(turn)).as_matrix()
     pose[:3, 3] = at
-    return PoseCandidate("thing", 0, pose, probability, degrees, millimetres, symmetry=symmetry)
+    return PoseCandidate(
+        "thing",
+        0,
+        pose,
+        probability,
+        degrees,
+        millimetres,
+        symmetry=symmetry,
+    )
 
 
 class About:
@@ -533,7 +632,11 @@ def test_the_uncertainty_is_the_root_mean_square_of_all_candidates():
         ((About((0, 0, 1), 0),), (0, 20, 0), 20),
         ((About((0, 0, 1), 0), About((1, 0, 0), 2)), (180, 0, 0), 0),
         ((About((0, 0, 1), 0), About((1, 0, 0), 2)), (0, 175, 0), 5),
-        ((About((0, 0, 1), 2), About((1, 0, 0), 2)), (0, 175, 0), 5),  # half a turn about y follows
+        (
+            (About((0, 0, 1), 2), About((1, 0, 0), 2)),
+            (0, 175, 0),
+            5,
+        ),  # half a turn about y follows
         ((About((0, 0, 1), 4), About((1, 0, 0), 4)), (90, 0, 0), 0),  # a cube
         ((About((0, 0, 1), 0), About((1, 0, 0), 0)), (10, 20, 30), 0),  # a ball
     ],
@@ -566,7 +669,11 @@ def test_the_next_view_is_chosen_by_geometry_and_views_are_ranked(system):
     assert ranked[0].words
 
     mine = np.stack(
-        [pose_at(20, 200, 0.6, SPOT), pose_at(60, 20, 0.4, SPOT), pose_at(35, 110, 0.5, SPOT)]
+        [
+            pose_at(20, 200, 0.6, SPOT),
+            pose_at(60, 20, 0.4, SPOT),
+            pose_at(35, 110, 0.5, SPOT),
+        ]
     )
     own = session.ranked(mine, goal="pose")
     assert sorted(each.index for each in own) == [0, 1, 2]
@@ -579,7 +686,10 @@ def test_nothing_is_ranked_where_nothing_can_be_foreseen(known, meshes):
     session = nextview.load(models=known, threads=1).session()
     exact = SimulatedCamera(meshes["mug"]).observe(session.pose)
     session.update(replace(exact, radius=None))
-    with pytest.raises(SessionError, match="no taught thing of known geometry explains them"):
+    with pytest.raises(
+        SessionError,
+        match="no taught thing of known geometry explains them",
+    ):
         session.ranked()
     plain = nextview.load(threads=1)
     policy = DiscriminateGeometry(plain.sphere)
@@ -593,14 +703,20 @@ def test_what_is_of_another_order_of_size_is_unknown(known, scale):
     system = nextview.load(models=known, threads=1, recogniser=recogniser, unknown=0.02)
     carton = THINGS["carton"]()
     carton.apply_scale(scale)
-    result = system.recognise(make_mesh(carton.vertices, carton.faces, unit="m"), start=10)
+    result = system.recognise(
+        make_mesh(carton.vertices, carton.faces, unit="m"),
+        start=10,
+    )
     assert result.unknown or not result.seen
     assert result.pose is None
 
 
 def test_a_pose_is_as_sure_as_those_that_look_the_same():
     half = About((0, 0, 1), 2)
-    first, opposite = candidate(probability=0.5), candidate((0, 0, 180), probability=0.3)
+    first, opposite = (
+        candidate(probability=0.5),
+        candidate((0, 0, 180), probability=0.3),
+    )
     beside = candidate((0, 0, 90), probability=0.2)
     assert share_of_likeliest([first, opposite, beside]) == pytest.approx(0.5)
     known = [replace(each, symmetry=(half,)) for each in (first, opposite, beside)]

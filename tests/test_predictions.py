@@ -41,11 +41,25 @@ def test_what_is_saved_is_what_is_loaded(tmp_path):
     )
     saved.save(tmp_path / "p.npz")
     loaded = Predictions.load(tmp_path / "p.npz")
-    for name in ("logits", "of_size", "depth_entropy", "labels", "splits", "conflicting"):
+    for name in (
+        "logits",
+        "of_size",
+        "depth_entropy",
+        "labels",
+        "splits",
+        "conflicting",
+    ):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(saved, name))
         assert getattr(loaded, name).dtype == getattr(saved, name).dtype
     np.testing.assert_array_equal(loaded.maps["lem"], saved.maps["lem"])
-    for name in ("names", "classes", "sphere", "models", "valley_classes", "calibration"):
+    for name in (
+        "names",
+        "classes",
+        "sphere",
+        "models",
+        "valley_classes",
+        "calibration",
+    ):
         assert getattr(loaded, name) == getattr(saved, name)
     assert [p.name for p in tmp_path.iterdir()] == ["p.npz"]
 
@@ -53,7 +67,10 @@ def test_what_is_saved_is_what_is_loaded(tmp_path):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"classes": ("ball", "box")}, r"logits .* has the shape \(6, 40, 3\), not \(6, 40, 2\)"),
+        (
+            {"classes": ("ball", "box")},
+            r"logits .* has the shape \(6, 40, 3\), not \(6, 40, 2\)",
+        ),
         ({"labels": np.full(6, 3)}, "not one of the 3 classes"),
         ({"names": ("a",) * 6}, "the same name"),
         ({"maps": {"lem": np.zeros((6, 40, 5, 2), np.float32)}}, "map lem"),
@@ -92,7 +109,10 @@ def test_a_flipped_bit_is_harmless_or_refused_in_one_sentence(tmp_path):
         except PredictionsError as refusal:
             refused.append(str(refusal))
     assert len(refused) > 100
-    assert all(sentence.startswith(f"{path}: ") and "\n" not in sentence for sentence in refused)
+    assert all(
+        sentence.startswith(f"{path}: ") and "\n" not in sentence
+        for sentence in refused
+    )
     with pytest.raises(PredictionsError, match="there is no such file"):
         Predictions.load(tmp_path / "q.npz")
 
@@ -103,10 +123,15 @@ def test_a_split_is_its_objects_and_nothing_else():
     assert test.names == ("thing_1", "thing_3", "thing_5")
     np.testing.assert_array_equal(test.logits, some.logits[1::2])
     np.testing.assert_array_equal(test.maps["lem"], some.maps["lem"][1::2])
-    azimuth_bins = np.random.default_rng(0).normal(size=(6, 40, 3, 8)).astype(np.float32)
+    azimuth_bins = (
+        np.random.default_rng(0).normal(size=(6, 40, 3, 8)).astype(np.float32)
+    )
     with_bins = replace(some, azimuth_bins=azimuth_bins).of_split("test")
     np.testing.assert_array_equal(with_bins.azimuth_bins, azimuth_bins[1::2])
-    with pytest.raises(PredictionsError, match="no objects of the split 'train', only of 'test'"):
+    with pytest.raises(
+        PredictionsError,
+        match="no objects of the split 'train', only of 'test'",
+    ):
         test.of_split("train")
 
 
@@ -127,17 +152,29 @@ def test_predictions_are_what_the_networks_say_of_each_look(views, models, predi
     assert found.models["lem"] == ("tiny-lem", cards(models)[1]["lem"].sha256)
     assert found.valley_classes == {"lem": ("table",)}
     i, v = 3, 17
-    observation = Observation(store.depth(i)[v], store.sphere.poses[v], store.intrinsics)
+    observation = Observation(
+        store.depth(i)[v],
+        store.sphere.poses[v],
+        store.intrinsics,
+    )
     evidence = NetworkRecogniser(models / "tiny.json")([observation])
     np.testing.assert_allclose(found.logits[i, v], evidence.logits[0], atol=1e-5)
-    np.testing.assert_allclose(found.azimuth_bins[i, v], evidence.azimuth_bins[0], atol=1e-5)
+    np.testing.assert_allclose(
+        found.azimuth_bins[i, v],
+        evidence.azimuth_bins[0],
+        atol=1e-5,
+    )
     # Here the points come from the stored depth, which is rounded; those in the store are from the
     # depth as rendered.
     lem = MapNetwork(models / "tiny-lem.json")([observation])["lem"][0]
     np.testing.assert_allclose(found.maps["lem"][i, v], lem, atol=5e-4)
 
 
-def test_logits_of_ones_own_make_the_predictions_that_the_networks_make(views, models, predictions):
+def test_logits_of_ones_own_make_the_predictions_that_the_networks_make(
+    views,
+    models,
+    predictions,
+):
     made, store = Predictions.load(predictions).by_shape(), ViewStore.open(views)
     recogniser = NetworkRecogniser(models / "tiny.json")
     logits = np.stack(
@@ -150,9 +187,17 @@ def test_logits_of_ones_own_make_the_predictions_that_the_networks_make(views, m
         assert getattr(own, name) == getattr(made, name)
     for name in ("labels", "splits", "conflicting", "depth_entropy"):
         np.testing.assert_array_equal(getattr(own, name), getattr(made, name))
-    tested = Predictions.from_logits(store, logits[made.splits == "test"], made.classes, "test")
+    tested = Predictions.from_logits(
+        store,
+        logits[made.splits == "test"],
+        made.classes,
+        "test",
+    )
     assert tested.names == made.of_split("test").names
-    with pytest.raises(PredictionsError, match="logits of these predictions has the shape"):
+    with pytest.raises(
+        PredictionsError,
+        match="logits of these predictions has the shape",
+    ):
         Predictions.from_logits(views, logits, made.classes, "test")
     with pytest.raises(DatasetError, match="does not know the class"):
         Predictions.from_logits(views, logits, ("a", "b", "c"))
@@ -160,17 +205,28 @@ def test_logits_of_ones_own_make_the_predictions_that_the_networks_make(views, m
         Predictions.from_logits(views, softmax(logits, 2), made.classes)
 
 
-def test_the_same_mesh_under_two_labels_is_marked_across_splits(furniture, models, tmp_path):
+def test_the_same_mesh_under_two_labels_is_marked_across_splits(
+    furniture,
+    models,
+    tmp_path,
+):
     for place in ("chair/test/chair_4", "table/train/twin", "monitor/test/monitor_4"):
         path = tmp_path / f"meshes/{place}.off"
         path.parent.mkdir(parents=True)
         shutil.copy(
-            furniture / f"{place.replace('table/train/twin', 'chair/test/chair_4')}.off", path
+            furniture
+            / f"{place.replace('table/train/twin', 'chair/test/chair_4')}.off",
+            path,
         )
     list(render(tmp_path / "meshes", tmp_path / "views.zarr", SPHERE, 32, workers=0))
     list(
         predict(
-            tmp_path / "views.zarr", tmp_path / "p.npz", cards(models)[0], {}, "test", workers=0
+            tmp_path / "views.zarr",
+            tmp_path / "p.npz",
+            cards(models)[0],
+            {},
+            "test",
+            workers=0,
         )
     )
     found = Predictions.load(tmp_path / "p.npz")
@@ -199,15 +255,19 @@ def test_a_killed_run_goes_on_where_it_was(views, models, predictions, tmp_path)
     out, (recogniser, maps) = tmp_path / "again.npz", cards(models)
     (tmp_path / "killed.py").write_text(KILLED)
     killed = subprocess.run(
-        [sys.executable, tmp_path / "killed.py", views, models, out], check=False
+        [sys.executable, tmp_path / "killed.py", views, models, out],
+        check=False,
     )
     assert killed.returncode == -signal.SIGKILL
     assert not out.exists()
     steps = list(predict(views, out, recogniser, maps, workers=1))
-    assert 2 <= steps[0][0] < 18  # the worker may have finished another one before it ended
+    assert (
+        2 <= steps[0][0] < 18
+    )  # the worker may have finished another one before it ended
     assert not out.with_name("again.npz.part").exists()
     np.testing.assert_array_equal(
-        Predictions.load(out).logits, Predictions.load(predictions).logits
+        Predictions.load(out).logits,
+        Predictions.load(predictions).logits,
     )
 
 
@@ -221,7 +281,8 @@ def test_an_array_that_announces_more_than_the_file_holds_is_refused_before_it_t
     np.savez_compressed(tmp_path / "zeros.npz", **(arrays | {"logits": zeros}))
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(
-        header, {"descr": "<f4", "fortran_order": False, "shape": (10**9,)}
+        header,
+        {"descr": "<f4", "fortran_order": False, "shape": (10**9,)},
     )
     with zipfile.ZipFile(tmp_path / "header.npz", "w") as file:
         file.writestr("logits.npy", header.getvalue())

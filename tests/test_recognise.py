@@ -33,24 +33,44 @@ def chair():
 
 def test_json_holds_the_whole_episode(chair, capsys):
     main(
-        ["recognise", str(chair), "--json", "--start", "3", "--threshold", "1", "--max-views", "4"]
+        [
+            "recognise",
+            str(chair),
+            "--json",
+            "--start",
+            "3",
+            "--threshold",
+            "1",
+            "--max-views",
+            "4",
+        ]
     )
     views = json.loads(capsys.readouterr().out)["views"]
     assert next(view["view"] for view in views) == 3
     assert len(views) == len({view["view"] for view in views}) == 4
-    assert [view["next_view"] for view in views] == [view["view"] for view in views[1:]] + [None]
+    assert [view["next_view"] for view in views] == [
+        view["view"] for view in views[1:]
+    ] + [None]
     for view in views:
         assert sum(view["belief"].values()) == pytest.approx(1, abs=1e-4)
         assert view["azimuth_bin"]["belief"] > 0.5
     # it stands still
-    assert len({(view["azimuth"] - view["azimuth_bin"]["degrees"]) % 360 for view in views}) == 1
+    assert (
+        len(
+            {(view["azimuth"] - view["azimuth_bin"]["degrees"]) % 360 for view in views}
+        )
+        == 1
+    )
     assert views[0]["belief"] == views[0]["alone"]
     sphere = ViewSphere.named("40")
     legs = [sphere.travel[a["view"], b["view"]] for a, b in itertools.pairwise(views)]
     assert views[-1]["travel_cells"] == pytest.approx(sum(legs), abs=1e-5)
 
 
-def test_several_are_a_line_of_json_each_and_what_cannot_be_used_is_named(chair, capsys):
+def test_several_are_a_line_of_json_each_and_what_cannot_be_used_is_named(
+    chair,
+    capsys,
+):
     table = chair.with_name("table.off")
     with pytest.raises(SystemExit) as end:
         main(
@@ -85,7 +105,10 @@ def test_several_are_a_line_of_json_each_and_what_cannot_be_used_is_named(chair,
 
 
 def test_a_rule_of_ones_own_shows_no_threshold_that_it_does_not_have(
-    chair, tmp_path, monkeypatch, capsys
+    chair,
+    tmp_path,
+    monkeypatch,
+    capsys,
 ):
     rule = "def second(seen, threshold):\n    return seen.n_views >= 2 + 0 * seen.highest\n"
     (tmp_path / "own_rule.py").write_text(rule)
@@ -97,7 +120,9 @@ def test_a_rule_of_ones_own_shows_no_threshold_that_it_does_not_have(
     assert "2 views" in shown
     assert "enough: inf" not in (tmp_path / "episode.svg").read_text()
     main([*command, "--json"])
-    assert [view["threshold"] for view in json.loads(capsys.readouterr().out)["views"]] == [
+    assert [
+        view["threshold"] for view in json.loads(capsys.readouterr().out)["views"]
+    ] == [
         None,
         None,
     ]
@@ -140,7 +165,10 @@ def test_every_bundled_policy_runs_live(chair, capsys):
         (["chair.off", "--risk", "0.000001"], "cannot promise"),
         (["chair.off", "--policy", "gian"], "did you mean 'gain'?"),
         (["chair.off", "--policy", "discriminate"], "is for taught things"),
-        (["chair.off", "--policy", "true-depth_entropy"], "runs only in nextview benchmark"),
+        (
+            ["chair.off", "--policy", "true-depth_entropy"],
+            "runs only in nextview benchmark",
+        ),
         (["chair.off", "--figure", "chair"], "ends in .png or .pdf or .svg"),
         (["."], "is a folder of meshes, not of captured views; recognise one of them"),
     ],
@@ -154,7 +182,11 @@ def test_bundled_models_are_what_their_cards_say():
     cards = bundled_cards()
     assert {card.kind for card in cards.values()} >= {"recogniser", "lem"}
     # nothing that is pickled
-    assert {path.suffix for path in BUNDLED_MODELS.iterdir()} <= {".onnx", ".json", ".safetensors"}
+    assert {path.suffix for path in BUNDLED_MODELS.iterdir()} <= {
+        ".onnx",
+        ".json",
+        ".safetensors",
+    }
     assert sum(card.path.stat().st_size for card in cards.values()) < 90e6
     for card in cards.values():
         training = card.training
@@ -164,7 +196,9 @@ def test_bundled_models_are_what_their_cards_say():
             continue
         assert training.recipes
         judged = [of.split(" (")[0] for of in card.scores]
-        assert judged == (["validation", "test", "test"] if card.size else ["validation", "test"])
+        assert judged == (
+            ["validation", "test", "test"] if card.size else ["validation", "test"]
+        )
 
 
 def test_wrong_models_are_refused():
@@ -179,7 +213,10 @@ def test_inference_never_imports_torch(chair):
         f"main(['recognise', {str(chair)!r}, '--json']); assert not {{'torch', 'onnx'}} &"
         " {*sys.modules}"
     )
-    assert run_python(f"import sys; from nextview.cli.main import main; {code}").returncode == 0
+    assert (
+        run_python(f"import sys; from nextview.cli.main import main; {code}").returncode
+        == 0
+    )
 
 
 def test_the_figure_says_what_its_colours_and_angles_mean():
@@ -192,7 +229,10 @@ def test_the_figure_says_what_its_colours_and_angles_mean():
 # Names in any script, and terminals of any encoding
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "cp1252", "latin-1", "utf-8", "ascii:strict"])
+@pytest.mark.parametrize(
+    "encoding",
+    ["ascii", "cp1252", "latin-1", "utf-8", "ascii:strict"],
+)
 def test_an_output_of_any_encoding_shows_everything(encoding, tmp_path):
     mesh = tmp_path / "椅子ü.off"
     shutil.copy(SAMPLE_FILES / "chair.off", mesh)
@@ -201,7 +241,9 @@ def test_an_output_of_any_encoding_shows_everything(encoding, tmp_path):
         " '1'])"
     )
     done = run_python(
-        code, env=os.environ | {"PYTHONIOENCODING": encoding}, encoding=encoding.partition(":")[0]
+        code,
+        env=os.environ | {"PYTHONIOENCODING": encoding},
+        encoding=encoding.partition(":")[0],
     )
     assert done.returncode == 0, done.stderr
     name = "椅子" if encoding == "utf-8" else "\\u6905\\u5b50"

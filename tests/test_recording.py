@@ -24,7 +24,9 @@ class Recording:
     def __init__(self, path):
         self.rows = {}
         # by time
-        chunks = sorted(RrdReader(path).stream().to_chunks(), key=lambda chunk: str(chunk.id))
+        chunks = sorted(
+            RrdReader(path).stream().to_chunks(), key=lambda chunk: str(chunk.id)
+        )
         for chunk in chunks:
             if chunk.is_static:
                 continue
@@ -33,9 +35,12 @@ class Recording:
                 for component, values in batch.items():
                     if ":" in component:
                         self.rows.setdefault(
-                            (chunk.entity_path.strip("/"), component), {}
+                            (chunk.entity_path.strip("/"), component),
+                            {},
                         ).setdefault(step, [])
-                        self.rows[chunk.entity_path.strip("/"), component][step].append(values[row])
+                        self.rows[chunk.entity_path.strip("/"), component][step].append(
+                            values[row]
+                        )
 
     def at(self, entity, component, step):
         return np.asarray(self.rows[entity, component][step][-1])
@@ -66,9 +71,13 @@ def test_belief_and_travel_over_the_steps(made):
         assert recording.at("threshold", "Scalars:scalars", step) == [
             session.stopping.threshold_at(step)
         ]
-        for name, values in (("belief_now", view.belief), ("this_view_alone", view.alone)):
+        for name, values in (
+            ("belief_now", view.belief),
+            ("this_view_alone", view.alone),
+        ):
             np.testing.assert_array_equal(
-                recording.at(name, "BarChart:values", step)[0]["buffer"], values
+                recording.at(name, "BarChart:values", step)[0]["buffer"],
+                values,
             )
     assert recording.steps("belief/chair", "Scalars:scalars") == steps
 
@@ -77,13 +86,17 @@ def test_candidates_values_and_choices(made):
     session, result, recording = made
     poses = session.sphere.poses[:, :3, 3]
     for step, view in enumerate(result.views, 1):
-        shown = np.array(recording.at("world/candidates", "Points3D:positions", step).tolist())
-        np.testing.assert_allclose(shown, poses, atol=1e-6)
-        chosen = np.array(recording.at("world/next", "Points3D:positions", step).tolist()).reshape(
-            -1, 3
+        shown = np.array(
+            recording.at("world/candidates", "Points3D:positions", step).tolist()
         )
+        np.testing.assert_allclose(shown, poses, atol=1e-6)
+        chosen = np.array(
+            recording.at("world/next", "Points3D:positions", step).tolist()
+        ).reshape(-1, 3)
         np.testing.assert_allclose(
-            chosen, poses[[] if view.next_view is None else [view.next_view]], atol=1e-6
+            chosen,
+            poses[[] if view.next_view is None else [view.next_view]],
+            atol=1e-6,
         )
         values = np.array(recording.at("values", "BarChart:values", step)[0]["buffer"])
         if view.values is None:
@@ -114,7 +127,9 @@ def test_frames_that_move_the_object_are_written_anew(tmp_path):
     assert moved  # else this tests nothing
     assert recording.steps("world/seen/1", "Points3D:positions") == [1, *moved]
     for step in moved:
-        points = np.array(recording.at("world/seen/1", "Points3D:positions", step).tolist())
+        points = np.array(
+            recording.at("world/seen/1", "Points3D:positions", step).tolist()
+        )
         np.testing.assert_allclose(points, seen[step - 1][0].points, atol=1e-6)
 
 
@@ -126,7 +141,9 @@ def test_a_recording_under_way_can_be_read_and_one_that_is_closed_is_complete(tm
     session.update(Observation(np.zeros_like(seen.depth), seen.pose, seen.intrinsics))
     with pytest.warns(Warning, match="no footer"):  # as long as it is not complete
         recording = Recording(path)
-    assert len(recording.at("world/seen/1", "Points3D:positions", 1)) == 0  # nothing was seen
+    assert (
+        len(recording.at("world/seen/1", "Points3D:positions", 1)) == 0
+    )  # nothing was seen
     (recorder,) = session.observers
     recorder.close()
     size = path.stat().st_size

@@ -72,7 +72,9 @@ def tf_of_an_arm(duration=3.0, step=0.1, static=True, **moving):
         said.append(("/tf_static", START, tf_message(fixed)))
     for time in np.arange(0, duration + step / 2, step):
         link = {"child": "tool", "parent": "base_link", "time": START + time} | moving
-        said.append(("/tf", START + time, tf_message(transform_message(tool_at(time), **link))))
+        said.append(
+            ("/tf", START + time, tf_message(transform_message(tool_at(time), **link)))
+        )
     return said
 
 
@@ -94,10 +96,18 @@ def images_at(times, encoding="16UC1", **more):
 
 @pytest.mark.parametrize("mcap", [True, False])
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
-def test_images_poses_and_intrinsics_are_those_that_were_recorded(tmp_path, mcap, encoding):
+def test_images_poses_and_intrinsics_are_those_that_were_recorded(
+    tmp_path,
+    mcap,
+    encoding,
+):
     """The stamps lie between those of tf; the pose there is known in closed form."""
     times = [0.05, 1.02, 2.77]
-    bag = write_bag(tmp_path / "bag", [*tf_of_an_arm(), *images_at(times, encoding)], mcap)
+    bag = write_bag(
+        tmp_path / "bag",
+        [*tf_of_an_arm(), *images_at(times, encoding)],
+        mcap,
+    )
     capture = read_capture(bag)
     assert capture.layout == "ROS 2 bag"
     assert capture.up == (0, 0, 1)
@@ -117,14 +127,20 @@ def test_compressed_depth_is_read_where_there_is_no_raw_one(tmp_path, encoding):
     given = np.rint(1000 * depth) if encoding == "16UC1" else depth
     packed = compressed_message(given, encoding, START + 1, scale=2000.0)
     said = [(f"{DEPTH}/compressedDepth", START + 1, packed)]
-    said.append((CAMERA_INFO, START + 1, info_message(header=header("optical", START + 1))))
-    (captured,) = read_capture(write_bag(tmp_path / "bag", [*tf_of_an_arm(), *said])).frames
+    said.append(
+        (CAMERA_INFO, START + 1, info_message(header=header("optical", START + 1)))
+    )
+    (captured,) = read_capture(
+        write_bag(tmp_path / "bag", [*tf_of_an_arm(), *said])
+    ).frames
     # Of floats one step of inverse depth is 2 m at 63 m, and 2 mm at 2 m.
     tolerance = 1e-6 if encoding == "16UC1" else 2e-3
     np.testing.assert_allclose(captured.read().depth, depth, atol=tolerance)
 
     raw = images_at([1.0], encoding)
-    both = read_capture(write_bag(tmp_path / "both", [*tf_of_an_arm(), *said[:1], *raw]))
+    both = read_capture(
+        write_bag(tmp_path / "both", [*tf_of_an_arm(), *said[:1], *raw])
+    )
     assert f"depth of {DEPTH}" in both.notes
 
 
@@ -140,7 +156,11 @@ def test_messages_out_of_order_are_put_into_the_order_of_their_stamps(tmp_path):
 
 
 @pytest.mark.parametrize("mcap", [True, False])
-def test_a_long_recording_is_sampled_and_never_held_in_memory(tmp_path, mcap, monkeypatch):
+def test_a_long_recording_is_sampled_and_never_held_in_memory(
+    tmp_path,
+    mcap,
+    monkeypatch,
+):
     monkeypatch.setattr(bag_reader, "MOST_FRAMES", 20)
     pixels = np.random.default_rng(0).integers(400, 2000, (480, 640))
     size = pixels.size * 2
@@ -148,8 +168,12 @@ def test_a_long_recording_is_sampled_and_never_held_in_memory(tmp_path, mcap, mo
     k = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])
     for time in np.arange(0, 5, 0.05):
         stamped = header("optical", START + time)
-        said.append((DEPTH, START + time, image_message(pixels, "16UC1", header=stamped)))
-        said.append((CAMERA_INFO, START + time, info_message(k, (480, 640), header=stamped)))
+        said.append(
+            (DEPTH, START + time, image_message(pixels, "16UC1", header=stamped))
+        )
+        said.append(
+            (CAMERA_INFO, START + time, info_message(k, (480, 640), header=stamped))
+        )
     bag = write_bag(tmp_path / "bag", said, mcap)
     assert sum(path.stat().st_size for path in bag.iterdir()) > 100 * size
     del said
@@ -165,9 +189,14 @@ def test_a_long_recording_is_sampled_and_never_held_in_memory(tmp_path, mcap, mo
 
 
 def test_one_of_several_topics_is_named_and_the_world_too(tmp_path):
-    other = [("/other/depth/image", time, said) for _, time, said in images_at([1.0])[:1]]
+    other = [
+        ("/other/depth/image", time, said) for _, time, said in images_at([1.0])[:1]
+    ]
     bag = write_bag(tmp_path / "bag", [*tf_of_an_arm(), *images_at([1.0, 2.0]), *other])
-    with pytest.raises(DatasetError, match=r"2 topics; name one with --depth-topic: /camera/depth"):
+    with pytest.raises(
+        DatasetError,
+        match=r"2 topics; name one with --depth-topic: /camera/depth",
+    ):
         read_capture(bag)
     capture = read_capture(bag, depth_topic=DEPTH, world_frame="tool")
     # in the link's own frame the camera does not move
@@ -200,11 +229,19 @@ def test_no_pose_is_made_up_in_a_gap_of_tf():
         link = transform_message(tool_at(time), "tool", time, "base_link")
         tree.add("tool", "base_link", time, *parts_of(link.transform))
     tree.sort()
-    np.testing.assert_allclose(tree.pose("tool", "base_link", 0.05), tool_at(0.05), atol=1e-9)
+    np.testing.assert_allclose(
+        tree.pose("tool", "base_link", 0.05),
+        tool_at(0.05),
+        atol=1e-9,
+    )
     with pytest.raises(DatasetError, match="tf has nothing of 'tool' in 'base_link'"):
         tree.pose("tool", "base_link", 1.0)
     # but where there is one
-    np.testing.assert_allclose(tree.pose("tool", "base_link", 2.0), tool_at(2.0), atol=1e-9)
+    np.testing.assert_allclose(
+        tree.pose("tool", "base_link", 2.0),
+        tool_at(2.0),
+        atol=1e-9,
+    )
 
 
 def two_parents():
@@ -227,7 +264,10 @@ def text():
 
 
 UNUSABLE = {
-    "no tf": (lambda: images_at([1.0]), r"tf has no frame 'optical'.*there is no tf in it"),
+    "no tf": (
+        lambda: images_at([1.0]),
+        r"tf has no frame 'optical'.*there is no tf in it",
+    ),
     "tf of others": (
         lambda: [*tf_of_an_arm(static=False), *images_at([1.0])],
         "tf has no frame 'optical', .*tf knows base_link, tool",
@@ -289,7 +329,12 @@ def overwritten(bag):
     content = bytearray(file.read_bytes())
     rng = np.random.default_rng(0)
     middle = slice(len(content) // 8, 7 * len(content) // 8)
-    content[middle] = rng.integers(0, 256, middle.stop - middle.start, np.uint8).tobytes()
+    content[middle] = rng.integers(
+        0,
+        256,
+        middle.stop - middle.start,
+        np.uint8,
+    ).tobytes()
     file.write_bytes(content)
     return bag
 
@@ -299,7 +344,9 @@ DAMAGE = {
     "cut in the middle": lambda bag: cut(bag, 0.5),
     "cut near the end": lambda bag: cut(bag, 0.99),
     "overwritten": overwritten,
-    "metadata is text": lambda bag: (bag / "metadata.yaml").write_text("nothing") and bag,
+    "metadata is text": lambda bag: (
+        (bag / "metadata.yaml").write_text("nothing") and bag
+    ),
     "metadata is cut": lambda bag: (
         (bag / "metadata.yaml").write_text("rosbag2_bagfile_inf: [") and bag
     ),
@@ -309,9 +356,16 @@ DAMAGE = {
 @pytest.mark.parametrize("mcap", [True, False])
 @pytest.mark.parametrize("what", DAMAGE)
 def test_a_damaged_bag_is_named(what, mcap, tmp_path):
-    bag = write_bag(tmp_path / "bag", [*tf_of_an_arm(), *images_at([0.5, 1.0, 2.0])], mcap)
+    bag = write_bag(
+        tmp_path / "bag",
+        [*tf_of_an_arm(), *images_at([0.5, 1.0, 2.0])],
+        mcap,
+    )
     DAMAGE[what](bag)
-    with pytest.raises(DatasetError, match=r"bag.*the bag is damaged, or its recording was cut"):
+    with pytest.raises(
+        DatasetError,
+        match=r"bag.*the bag is damaged, or its recording was cut",
+    ):
         for frame in read_capture(bag).frames:
             frame.read()
 
@@ -381,12 +435,20 @@ def views():
     return views_of(chair())
 
 
-def test_what_was_recorded_is_recognised_from_a_bag_and_from_a_folder(views, tmp_path, capsys):
+def test_what_was_recorded_is_recognised_from_a_bag_and_from_a_folder(
+    views,
+    tmp_path,
+    capsys,
+):
     system = nextview.load(threshold=1.0, max_views=3)
     of_bag = system.recognise(recorded(tmp_path / "bag", views), start=4)
     of_folder = system.recognise(written(tmp_path / "folder", views), start=4)
     assert of_bag.answer == of_folder.answer == "chair"
-    np.testing.assert_allclose(of_bag.views[-1].belief, of_folder.views[-1].belief, atol=1e-4)
+    np.testing.assert_allclose(
+        of_bag.views[-1].belief,
+        of_folder.views[-1].belief,
+        atol=1e-4,
+    )
 
 
 def things_folder(folder, views):
@@ -413,7 +475,9 @@ def test_what_was_taught_from_a_bag_is_known_again(views, tmp_path):
     folder = things_folder(tmp_path / "things", views)
     learned = learn(folder, tmp_path / "mine", unit="m", any_size=True, workers=0)
     assert not learned.left_out
-    found = nextview.load(str(tmp_path / "mine")).recognise(recorded(tmp_path / "again", views))
+    found = nextview.load(str(tmp_path / "mine")).recognise(
+        recorded(tmp_path / "again", views)
+    )
     assert found.answer == "seat"
 
 
@@ -431,7 +495,9 @@ def written(folder, views, camera=None, poses="files"):
         matrices = [pose.tolist() for _, pose in views]
         (folder / "poses.json").write_text(json.dumps(matrices))
     if poses == "names":
-        named = {f"{number:04d}": pose.tolist() for number, (_, pose) in enumerate(views)}
+        named = {
+            f"{number:04d}": pose.tolist() for number, (_, pose) in enumerate(views)
+        }
         (folder / "poses.json").write_text(json.dumps(named))
     if poses == "log":
         lines = []
@@ -439,7 +505,9 @@ def written(folder, views, camera=None, poses="files"):
             lines += [f"{number} {number} {number + 1}"]
             lines += [" ".join(map(str, row)) for row in pose.tolist()]
         (folder / "trajectory.log").write_text("\n".join(lines) + "\n")
-    camera = {"fx": 300, "fy": 300, "ppx": 159.5, "ppy": 119.5} if camera is None else camera
+    camera = (
+        {"fx": 300, "fy": 300, "ppx": 159.5, "ppy": 119.5} if camera is None else camera
+    )
     fields = {"width": 320, "height": 240, "depth_scale": 0.001} | camera
     (folder / "intrinsics.json").write_text(json.dumps(fields))
     return folder
@@ -467,7 +535,12 @@ OF_TOOLS = {
     ),
     "open3d.json": (
         json.dumps(
-            {"width": 640, "height": 480, "intrinsic_matrix": BY_COLUMNS, "depth_scale": 1000.0}
+            {
+                "width": 640,
+                "height": 480,
+                "intrinsic_matrix": BY_COLUMNS,
+                "depth_scale": 1000.0,
+            }
         ),
         0.001,
     ),
@@ -520,7 +593,10 @@ def test_intrinsics_are_read_as_tools_write_them(name, tmp_path):
         ('{"width": 640}', "holds no intrinsics; known are fx, fy"),
         ('{"k": [1, 2, 3]}', "not the intrinsics of a camera"),
         ('{"fx": "wide", "fy": 1, "cx": 1, "cy": 1}', "not the intrinsics of a camera"),
-        ('{"fx": 1, "fy": 1, "cx": 1, "cy": 1, "depth_scale": -1}', "a depth scale of -1"),
+        (
+            '{"fx": 1, "fy": 1, "cx": 1, "cy": 1, "depth_scale": -1}',
+            "a depth scale of -1",
+        ),
         ('{"fx": 1, "fy": 1, "cx": 1, "cy": 1, "coeffs": [0.1, 0]}', "distorts"),
     ],
 )
@@ -531,15 +607,27 @@ def test_what_is_no_camera_file_is_said(content, match, tmp_path):
             read_camera_file(tmp_path / name)
 
 
-def test_the_depth_scale_is_asked_for_and_a_wrong_one_is_noticed(views, tmp_path, capsys):
-    folder = written(tmp_path / "folder", views, {"fx": 300, "fy": 300, "cx": 159.5, "cy": 119.5})
+def test_the_depth_scale_is_asked_for_and_a_wrong_one_is_noticed(
+    views,
+    tmp_path,
+    capsys,
+):
+    folder = written(
+        tmp_path / "folder",
+        views,
+        {"fx": 300, "fy": 300, "cx": 159.5, "cy": 119.5},
+    )
     fields = json.loads((folder / "intrinsics.json").read_text())
     del fields["depth_scale"]
     (folder / "intrinsics.json").write_text(json.dumps(fields))
 
     assert "give --depth-scale" in refused(capsys, "recognise", str(folder))
     assert "(1000 steps a metre are 0.001)" in refused(
-        capsys, "recognise", str(folder), "--depth-scale", "1000"
+        capsys,
+        "recognise",
+        str(folder),
+        "--depth-scale",
+        "1000",
     )
     said = refused(capsys, "recognise", str(folder), "--depth-scale", "0.0001")
     assert "its steps are of 1 mm, not of 0.1 mm (--depth-scale)" in said
@@ -572,8 +660,14 @@ def one_pose_less(folder):
 
 
 INCOMPLETE = {
-    "no intrinsics": (lambda f: (f / "intrinsics.json").unlink(), "intrinsics of the depth camera"),
-    "other size": (of_another_size, "of images of 1280 x 240 pixels, and .* has 320 x 240"),
+    "no intrinsics": (
+        lambda f: (f / "intrinsics.json").unlink(),
+        "intrinsics of the depth camera",
+    ),
+    "other size": (
+        of_another_size,
+        "of images of 1280 x 240 pixels, and .* has 320 x 240",
+    ),
     "no poses": (without_poses, "has 3 depth images and no poses"),
     "too few poses": (one_pose_less, "holds 2 poses for 3 depth images"),
 }

@@ -45,7 +45,10 @@ def test_what_a_workflow_runs_is_there(workflow):
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     for target in re.findall(r"\bmake ([\w./-]+)", text):
         assert re.search(rf"^{re.escape(target)}:", makefile, re.M), target
-    for path in re.findall(r"(?<![\w./])(?:tests|workflow|samples|docs|\.ci)/[\w./-]+\w", text):
+    for path in re.findall(
+        r"(?<![\w./])(?:tests|workflow|samples|docs|\.ci)/[\w./-]+\w",
+        text,
+    ):
         assert (ROOT / path).exists(), path
     for folder, names in re.findall(r"(\.|\./research)\[([\w,-]+)\]", text):
         project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text())
@@ -54,7 +57,9 @@ def test_what_a_workflow_runs_is_there(workflow):
 
 
 def test_ci_tries_every_python_that_is_promised():
-    promised = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"]
+    promised = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "requires-python"
+    ]
     ci = (ROOT / ".github/workflows/ci.yml").read_text(encoding="utf-8")
     pythons = re.search(r"python: \[(.*?)\]", ci)
     assert pythons

@@ -38,7 +38,11 @@ for n, _ in enumerate(render(Path(dataset), Path(path), ViewSphere.named("12"), 
 def assert_same(a: Path, b: Path) -> None:
     first, second = ViewStore.open(a), ViewStore.open(b)
     for name in first.rendered:
-        np.testing.assert_array_equal(first.array(name)[:], second.array(name)[:], err_msg=name)
+        np.testing.assert_array_equal(
+            first.array(name)[:],
+            second.array(name)[:],
+            err_msg=name,
+        )
     assert not list(b.rglob("*.partial"))
     assert not b.with_name(b.name + ".part").exists()
 
@@ -47,7 +51,9 @@ def assert_same(a: Path, b: Path) -> None:
 def whole(furniture, tmp_path_factory) -> Path:
     """A store made without interruption, by one process."""
     path = tmp_path_factory.mktemp("whole") / "views.zarr"
-    assert [reason for _, reason in render(furniture, path, SPHERE, SIZE, workers=1)] == [None] * 18
+    assert [
+        reason for _, reason in render(furniture, path, SPHERE, SIZE, workers=1)
+    ] == [None] * 18
     return path
 
 
@@ -59,7 +65,10 @@ def meshes(furniture, tmp_path) -> Path:
 
 def alive(process: int) -> bool:
     try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        return (
+            Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+            != "Z"
+        )
     except OSError:
         return False
 
@@ -68,10 +77,17 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 
 
 @linux
-def test_kill_of_the_parent_loses_nothing_and_leaves_no_orphans(furniture, whole, tmp_path):
+def test_kill_of_the_parent_loses_nothing_and_leaves_no_orphans(
+    furniture,
+    whole,
+    tmp_path,
+):
     path = tmp_path / "views.zarr"
     killed = subprocess.run(
-        [sys.executable, "-c", SCRIPT, furniture, path], capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", SCRIPT, furniture, path],
+        capture_output=True,
+        text=True,
+        timeout=120,
     )
     assert killed.returncode == -signal.SIGKILL
     workers = [int(word) for word in killed.stdout.split()]
@@ -94,7 +110,9 @@ def test_a_full_disk_says_so_and_the_next_run_goes_on(furniture, whole, tmp_path
     disk.mkdir()
     if (
         os.geteuid()
-        or subprocess.run(["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", disk]).returncode
+        or subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", disk]
+        ).returncode
     ):
         pytest.skip("only root can mount a small disk")
     try:
@@ -117,18 +135,26 @@ def test_broken_meshes_are_recorded_and_tried_again(meshes, tmp_path):
     path = tmp_path / "views.zarr"
     reasons = dict(render(meshes, path, SPHERE, SIZE, workers=0))
     store = ViewStore.open(path)
-    assert store.attributes.failures == {name: reason for name, reason in reasons.items() if reason}
+    assert store.attributes.failures == {
+        name: reason for name, reason in reasons.items() if reason
+    }
     assert "cut short" in store.attributes.failures["chair_2"]
     assert "no extent" in store.attributes.failures["chair_3"]
-    assert store.done.tolist() == [name not in store.attributes.failures for name in store.names]
-    assert next(iter(render(meshes, path, SPHERE, SIZE, workers=0)))[1]  # a later run says it again
+    assert store.done.tolist() == [
+        name not in store.attributes.failures for name in store.names
+    ]
+    assert next(iter(render(meshes, path, SPHERE, SIZE, workers=0)))[
+        1
+    ]  # a later run says it again
 
 
 def test_identical_meshes_are_known_by_their_bytes(meshes, tmp_path):
     shutil.copy(meshes / "chair/train/chair_1.off", meshes / "chair/train/twin.off")
     list(render(meshes, tmp_path / "views.zarr", SPHERE, SIZE, workers=0))
     store = ViewStore.open(tmp_path / "views.zarr")
-    assert [{store.names[i] for i in group} for group in store.duplicates] == [{"chair_1", "twin"}]
+    assert [{store.names[i] for i in group} for group in store.duplicates] == [
+        {"chair_1", "twin"}
+    ]
 
 
 def test_a_box_is_stored_as_it_is_seen(tmp_path):
@@ -140,7 +166,13 @@ def test_a_box_is_stored_as_it_is_seen(tmp_path):
     path.parent.mkdir(parents=True)
     trimesh.creation.box(2 * half * 12.5).export(path)  # in any unit
     list(
-        render(tmp_path / "meshes", tmp_path / "views.zarr", ViewSphere.named("40"), 224, workers=0)
+        render(
+            tmp_path / "meshes",
+            tmp_path / "views.zarr",
+            ViewSphere.named("40"),
+            224,
+            workers=0,
+        )
     )
     store = ViewStore.open(tmp_path / "views.zarr")
     half /= np.linalg.norm(half)
@@ -182,7 +214,8 @@ sys.addaudithook(hook)
 
 
 def test_a_mesh_that_kills_its_worker_twice_is_left_out_and_listed_and_the_others_are_rendered(
-    meshes, tmp_path
+    meshes,
+    tmp_path,
 ):
     (tmp_path / "sitecustomize.py").write_text(KILLER)
     for mesh in (meshes / "chair/train").glob("chair_[23].off"):
@@ -214,12 +247,14 @@ def test_a_mesh_that_kills_its_worker_twice_is_left_out_and_listed_and_the_other
 
     store = ViewStore.open(path)
     assert store.attributes.failures.keys() == {"chair_1"}
-    assert {name for name, done in zip(store.names, store.done, strict=True) if done} == set(
-        store.names
-    ) - {"chair_1"}
+    assert {
+        name for name, done in zip(store.names, store.done, strict=True) if done
+    } == set(store.names) - {"chair_1"}
 
     # Where nothing kills the worker, the next run renders it, and its reason goes.
-    assert dict(render(meshes, path, ViewSphere.named("12"), 16, workers=0)) == {"chair_1": None}
+    assert dict(render(meshes, path, ViewSphere.named("12"), 16, workers=0)) == {
+        "chair_1": None
+    }
     assert not ViewStore.open(path).attributes.failures
 
 
@@ -227,12 +262,20 @@ def test_a_dask_cluster_renders_the_same(furniture, whole, tmp_path):
     distributed = pytest.importorskip("distributed")
     path = tmp_path / "views.zarr"
     with distributed.LocalCluster(
-        n_workers=2, processes=True, threads_per_worker=1, dashboard_address=None, silence_logs=50
+        n_workers=2,
+        processes=True,
+        threads_per_worker=1,
+        dashboard_address=None,
+        silence_logs=50,
     ) as cluster:
         names = [
             name
             for name, _ in render(
-                furniture, path, SPHERE, SIZE, scheduler=cluster.scheduler_address
+                furniture,
+                path,
+                SPHERE,
+                SIZE,
+                scheduler=cluster.scheduler_address,
             )
         ]
     assert sorted(names) == sorted(ViewStore.open(path).names)

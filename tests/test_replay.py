@@ -43,11 +43,18 @@ def evidence_of(predictions: Predictions, objects: np.ndarray):
     return observe
 
 
-@pytest.mark.parametrize(("threshold_decay", "empty"), [(0.0, False), (0.6, False), (1.0, True)])
+@pytest.mark.parametrize(
+    ("threshold_decay", "empty"),
+    [(0.0, False), (0.6, False), (1.0, True)],
+)
 @pytest.mark.parametrize("threshold", [0.0, 0.7, 0.9, 0.99])
 @pytest.mark.parametrize("name", ["lem", "lem-peak", "unidirectional"])
 def test_a_path_cut_at_a_threshold_is_the_episode_under_that_threshold(
-    specs, name, threshold, threshold_decay, empty
+    specs,
+    name,
+    threshold,
+    threshold_decay,
+    empty,
 ):
     """A view in which nothing is seen counts neither for the decay nor as the end, as in live
     use.
@@ -61,16 +68,27 @@ def test_a_path_cut_at_a_threshold_is_the_episode_under_that_threshold(
         Stopping(threshold, 5, threshold_decay),
     )
     observe, rng = evidence_of(p, specs.objects), np.random.default_rng(0)
-    episodes = run_episodes(observe, p.sphere, policy, specs.starts, stopping, rng).outcome
+    episodes = run_episodes(
+        observe,
+        p.sphere,
+        policy,
+        specs.starts,
+        stopping,
+        rng,
+    ).outcome
     paths = replay(name, specs, max_views=5, seed=0)
     ends = truncate(paths, stopping)
     for field in ("answer", "confidence", "n_views", "confident", "travel", "arc"):
         np.testing.assert_allclose(
-            getattr(ends, field), getattr(episodes, field), atol=1e-12, err_msg=field
+            getattr(ends, field),
+            getattr(episodes, field),
+            atol=1e-12,
+            err_msg=field,
         )
     taken = np.arange(5) < ends.n_views[:, None]
     np.testing.assert_array_equal(
-        np.where(taken, paths.views, -1)[:, : episodes.views.shape[1]], episodes.views
+        np.where(taken, paths.views, -1)[:, : episodes.views.shape[1]],
+        episodes.views,
     )
 
 
@@ -80,7 +98,10 @@ def uncertain(seen, threshold):
 
 
 @pytest.mark.parametrize("threshold", [0.2, 0.6])
-def test_a_stopping_rule_of_ones_own_ends_a_path_as_it_ends_the_episode(specs, threshold):
+def test_a_stopping_rule_of_ones_own_ends_a_path_as_it_ends_the_episode(
+    specs,
+    threshold,
+):
     p, rule = specs.predictions, own_stopping("test_replay:uncertain", threshold, 5)
     policy, paths = (
         make_policy("lem", p.sphere, specs.valley_classes("lem")),
@@ -89,19 +110,25 @@ def test_a_stopping_rule_of_ones_own_ends_a_path_as_it_ends_the_episode(specs, t
     episodes = Episodes(p.sphere, policy, specs.starts, rule, np.random.default_rng(0))
     observe, stopped = evidence_of(p, specs.objects), np.zeros(len(specs.starts), int)
     while len(episodes.running):
-        step = episodes.update(observe(episodes.running, episodes.current[episodes.running]))
+        step = episodes.update(
+            observe(episodes.running, episodes.current[episodes.running])
+        )
         entropy = -(step.belief * np.log2(step.belief)).sum(1)
         lead = np.subtract(*np.sort(step.belief, 1)[:, [-1, -2]].T)
         k = len(episodes.steps)
         np.testing.assert_array_equal(
-            step.stopped, (entropy < threshold) | ((k > 3) & (lead > 0.2)) | (k == 5)
+            step.stopped,
+            (entropy < threshold) | ((k > 3) & (lead > 0.2)) | (k == 5),
         )
         stopped[step.episodes] = k
     ends = truncate(paths, rule)
     np.testing.assert_array_equal(ends.n_views, stopped)
     for field in ("answer", "confidence", "confident", "travel"):
         np.testing.assert_allclose(
-            getattr(ends, field), getattr(episodes.outcome, field), atol=1e-12, err_msg=field
+            getattr(ends, field),
+            getattr(episodes.outcome, field),
+            atol=1e-12,
+            err_msg=field,
         )
     with pytest.raises(UsageError, match="beliefs=True"):
         truncate(replay("lem", specs, 5, 0), rule)
@@ -113,7 +140,10 @@ def settled(seen, threshold):
 
 
 @pytest.mark.parametrize("threshold", [0.05, 0.3])
-def test_a_rule_about_the_change_of_belief_ends_live_and_replayed_episodes_alike(specs, threshold):
+def test_a_rule_about_the_change_of_belief_ends_live_and_replayed_episodes_alike(
+    specs,
+    threshold,
+):
     p, rule = specs.predictions, own_stopping(settled, threshold, 9)
     policy = make_policy("lem", p.sphere, specs.valley_classes("lem"))
     paths = replay("lem", specs, 9, 0, beliefs=True)
@@ -122,7 +152,10 @@ def test_a_rule_about_the_change_of_belief_ends_live_and_replayed_episodes_alike
     for beliefs in paths.beliefs:
         ends = 9
         for k in range(2, 9):
-            moved = abs(beliefs[k] - beliefs[k - 1]).max(), abs(beliefs[k] - beliefs[k - 2]).max()
+            moved = (
+                abs(beliefs[k] - beliefs[k - 1]).max(),
+                abs(beliefs[k] - beliefs[k - 2]).max(),
+            )
             if max(moved) <= threshold:
                 ends = k + 1
                 break
@@ -182,11 +215,17 @@ def test_oracle_gain_takes_the_view_that_helps_the_true_class_most(specs, knows_
     calibration, likely = Calibration(0.8, 0.5), None
     if knows_bins:
         calibration = msgspec.structs.replace(calibration, bin_correlation=0.1)
-        likely = log_softmax(np.random.default_rng(3).normal(size=(30, 40, 3, 8)), axis=3).astype(
-            np.float32
-        )
+        likely = log_softmax(
+            np.random.default_rng(3).normal(size=(30, 40, 3, 8)),
+            axis=3,
+        ).astype(np.float32)
     specs = replace(
-        specs, predictions=replace(specs.predictions, calibration=calibration, azimuth_bins=likely)
+        specs,
+        predictions=replace(
+            specs.predictions,
+            calibration=calibration,
+            azimuth_bins=likely,
+        ),
     )
     p = specs.predictions
     for name, everywhere in [("oracle-gain", False), ("oracle-gain-all", True)]:
@@ -199,7 +238,10 @@ def test_oracle_gain_takes_the_view_that_helps_the_true_class_most(specs, knows_
                 for v in around
                 if v not in seen
             }
-            belief = {v: calibration.belief(total, 3, 3)[p.labels[i]] for v, total in sums.items()}
+            belief = {
+                v: calibration.belief(total, 3, 3)[p.labels[i]]
+                for v, total in sums.items()
+            }
             assert belief[views[e, 2]] == pytest.approx(max(belief.values()), abs=1e-9)
 
 
@@ -212,7 +254,8 @@ def test_each_map_has_the_valley_classes_of_its_own_card():
     specs = make_specs(replace(p, **lcm), 2, 0)
     assert (specs.valley_classes("lem"), specs.valley_classes("lcm")) == ((0,), (1,))
     peak, valley = (
-        replay(name, specs, 2, 0).views[:, 1] for name in ("lcm-peak", "lcm-oracle-valley")
+        replay(name, specs, 2, 0).views[:, 1]
+        for name in ("lcm-peak", "lcm-oracle-valley")
     )
     assert {*np.flatnonzero(peak != valley)} == {*np.flatnonzero(specs.labels == 1)}
 
@@ -224,14 +267,17 @@ def test_a_true_map_is_found_by_the_name_of_its_measure(specs):
     ]
     np.testing.assert_array_equal(*found)
     with pytest.raises(
-        EntryError, match="no true map is called 'true-depth_entrop'; there are true-lem, "
+        EntryError,
+        match="no true map is called 'true-depth_entrop'; there are true-lem, ",
     ):
         replay("true-depth_entrop", specs, max_views=4, seed=0)
 
 
 def test_fixed_views_are_the_ones_their_name_says(specs):
     p = specs.predictions
-    sure = softmax(p.logits.astype(float), axis=2)[np.arange(len(p)), :, p.labels][specs.objects]
+    sure = softmax(p.logits.astype(float), axis=2)[np.arange(len(p)), :, p.labels][
+        specs.objects
+    ]
     entropy = p.depth_entropy[specs.objects]
     by_name = {
         "best-5": sure,
@@ -242,13 +288,23 @@ def test_fixed_views_are_the_ones_their_name_says(specs):
     for name, values in by_name.items():
         paths = replay(name, specs, max_views=3, seed=0)
         taken = np.take_along_axis(values, paths.views, 1)
-        np.testing.assert_allclose(np.sort(taken), np.sort(values)[:, -5:], err_msg=name)
-        total = np.take_along_axis(p.logits[specs.objects], paths.views[..., None], 1).sum(1)
+        np.testing.assert_allclose(
+            np.sort(taken),
+            np.sort(values)[:, -5:],
+            err_msg=name,
+        )
+        total = np.take_along_axis(
+            p.logits[specs.objects],
+            paths.views[..., None],
+            1,
+        ).sum(1)
         ends = truncate(paths, Stopping(0.1))
         np.testing.assert_array_equal(ends.n_views, 5)  # whatever is believed
         np.testing.assert_array_equal(ends.answer, total.argmax(1))
         np.testing.assert_allclose(
-            ends.confidence, softmax(total.astype(float), axis=1).max(1), rtol=1e-5
+            ends.confidence,
+            softmax(total.astype(float), axis=1).max(1),
+            rtol=1e-5,
         )
 
 
@@ -273,12 +329,17 @@ class Raises(Asked):
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
-        ("Raises", r"raised RuntimeError: no idea, at test_replay.py:\d+ \(object thing_11\)"),
+        (
+            "Raises",
+            r"raised RuntimeError: no idea, at test_replay.py:\d+ \(object thing_11\)",
+        ),
         ("Missing", "cannot be made"),
     ],
 )
 def test_a_policy_that_fails_is_named_with_the_object_and_the_others_are_kept(
-    specs, name, sentence
+    specs,
+    name,
+    sentence,
 ):
     grid = Grid(specs, 4, (0.9,), 5, 0)
     path = f"test_replay:{name}"
@@ -296,14 +357,22 @@ def test_the_contestants_are_those_that_the_predictions_allow(specs):
     p = specs.predictions
     with_lcm = make_specs(replace(p, maps={**p.maps, "lcm": p.maps["lem"]}), 1, 0)
     assert {"lcm", "lcm-peak", "lcm-oracle-valley"} <= set(default_entries(with_lcm))
-    other = make_specs(replace(p, maps={"view_area": p.maps["lem"]}), 4, 0)  # of no valley classes
+    other = make_specs(
+        replace(p, maps={"view_area": p.maps["lem"]}),
+        4,
+        0,
+    )  # of no valley classes
     assert [name for name in default_entries(other) if "view_area" in name] == [
         "view_area",
         "view_area-peak",
     ]
-    for name, same in (("view_area", "lem-peak"), ("view_area-oracle-valley", "lem-peak")):
+    for name, same in (
+        ("view_area", "lem-peak"),
+        ("view_area-oracle-valley", "lem-peak"),
+    ):
         np.testing.assert_array_equal(
-            replay(name, other, 3, 0).views, replay(same, specs, 3, 0).views
+            replay(name, other, 3, 0).views,
+            replay(same, specs, 3, 0).views,
         )
     without = make_specs(replace(p, maps={}), 1, 0)
     assert not {"lem", "lem-peak", "oracle-valley"} & set(default_entries(without))
@@ -323,19 +392,29 @@ class ToItsBack:
 
     def next_views(self, state, rng):
         n, rows = self.sphere.azimuths, np.arange(len(state.current))
-        seen = (state.belief[:, :, None] * state.azimuth_bins).sum(1)  # (B, azimuth bins)
-        to = (self.sphere.azimuth_index[state.current][:, None] + n // 2 - np.arange(n)) % n
+        seen = (state.belief[:, :, None] * state.azimuth_bins).sum(
+            1
+        )  # (B, azimuth bins)
+        to = (
+            self.sphere.azimuth_index[state.current][:, None] + n // 2 - np.arange(n)
+        ) % n
         views = self.sphere.ring[state.current][:, None] * n + to
-        return views[rows, np.where(state.visited[rows[:, None], views], -1.0, seen).argmax(1)]
+        return views[
+            rows,
+            np.where(state.visited[rows[:, None], views], -1.0, seen).argmax(1),
+        ]
 
 
 def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(
-    furniture, models, predictions
+    furniture,
+    models,
+    predictions,
 ):
     p = Predictions.load(predictions).of_split("test")
     specs = make_specs(p, runs=2, seed=0)
     networks = Models(
-        NetworkRecogniser(models / "tiny.json", 1), {"lem": MapNetwork(models / "tiny-lem.json", 1)}
+        NetworkRecogniser(models / "tiny.json", 1),
+        {"lem": MapNetwork(models / "tiny-lem.json", 1)},
     )
     # A threshold that some reach: the middle of all confidences after two views.
     threshold = float(np.median(replay("lem", specs, 2, 0).confidences[:, 1]))
@@ -347,10 +426,15 @@ def test_replay_and_a_live_camera_with_the_networks_take_the_same_views(
         stopping = Stopping.of(p.calibration, threshold, max_views=5)
         ends = truncate(paths, stopping)
         for e, (i, start) in enumerate(zip(specs.objects, specs.starts, strict=True)):
-            mesh = load_mesh(furniture / p.classes[p.labels[i]] / "test" / f"{p.names[i]}.off")
+            mesh = load_mesh(
+                furniture / p.classes[p.labels[i]] / "test" / f"{p.names[i]}.off"
+            )
             camera = SimulatedCamera(mesh, 32, p.sphere.distance)
             live = Session(networks, policy, p.sphere, int(start), stopping).run(camera)
-            assert [view.index for view in live.views] == paths.views[e, : ends.n_views[e]].tolist()
+            assert [view.index for view in live.views] == paths.views[
+                e,
+                : ends.n_views[e],
+            ].tolist()
             assert live.answer == p.classes[ends.answer[e]]
             assert live.confident == ends.confident[e]
             # the store rounds

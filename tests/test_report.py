@@ -22,7 +22,13 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     p = replace(some_predictions(20, seed=1), store=str(folder / "views.zarr"))
     p.save(folder / "p.npz")
-    benchmark(folder / "p.npz", folder / "out", thresholds=(0.8, 0.97), runs=3, samples=100)
+    benchmark(
+        folder / "p.npz",
+        folder / "out",
+        thresholds=(0.8, 0.97),
+        runs=3,
+        samples=100,
+    )
     image = np.random.default_rng(0).integers(0, 255, (20, 40, 32, 32), np.uint8)
     labels, arrays = (
         np.array(p.classes)[p.labels],
@@ -71,13 +77,18 @@ def test_the_tables_show_the_numbers_of_the_results(made):
     for policy in ("random", "lem", "oracle-gain"):
         row = re.search(rf'<tr><th scope="row">{policy}\b.*?</tr>', text)[0]
         cells = re.findall(r"<td>([\d.]+)", row)
-        of = summary.query("policy == @policy and threshold == 0.97").set_index("measure")["value"]
+        of = summary.query("policy == @policy and threshold == 0.97").set_index(
+            "measure"
+        )["value"]
         assert cells[:4] == [
             f"{of[m]:.3f}" for m in ("accuracy", "clean_accuracy", "class_accuracy")
         ] + [f"{of['n_views']:.2f}"]
 
 
-def test_pictures_come_from_the_store_of_the_predictions_while_it_is_the_same(made, tmp_path):
+def test_pictures_come_from_the_store_of_the_predictions_while_it_is_the_same(
+    made,
+    tmp_path,
+):
     p = load(made / "out").predictions
     assert pictures_of(p)[0] is not None
     other = p.depth_entropy.copy()
@@ -91,10 +102,13 @@ def test_pictures_come_from_the_store_of_the_predictions_while_it_is_the_same(ma
         assert store is None
         assert why in why_not
     # as the user says
-    assert pictures_of(replace(p, depth_entropy=other), made / "views.zarr")[0] is not None
+    assert (
+        pictures_of(replace(p, depth_entropy=other), made / "views.zarr")[0] is not None
+    )
     with pytest.raises(ResultsError, match="no views of these objects"):
         pictures_of(
-            replace(p, names=tuple(f"other {name}" for name in p.names)), made / "views.zarr"
+            replace(p, names=tuple(f"other {name}" for name in p.names)),
+            made / "views.zarr",
         )
     assert (made / "out" / "report.html").read_text().count("data:image/webp") > 8
 
@@ -121,10 +135,18 @@ def test_the_page_of_scenes_compares_by_clutter_and_prints_nothing_published(sce
     for level in levels:
         # and label
         assert (
-            text.count(f"{level.capitalize()} clutter, 2 scenes: accuracy after a fixed number")
+            text.count(
+                f"{level.capitalize()} clutter, 2 scenes: accuracy after a fixed number"
+            )
             == 2
         )
-    for wrong in (">published ", "as published", "as figures 15", "of the thesis", "oracle-valley"):
+    for wrong in (
+        ">published ",
+        "as published",
+        "as figures 15",
+        "of the thesis",
+        "oracle-valley",
+    ):
         assert wrong not in text
     assert scenes.tables.summary["published"].isna().all()
     assert not re.search(r"[>(: ]-0\.0[ <)]", text)
@@ -135,7 +157,8 @@ def test_the_page_shows_levels_and_the_terminal_says_what_differs(scenes, capsys
     text = (scenes.folder / "report.html").read_text()
     heavy = text[text.index("Heavy clutter, 2 scenes") :]
     cells = re.findall(
-        r"<td>([\d.]+)", re.search(r'<tr><th scope="row">visibility.*?</tr>', heavy)[0]
+        r"<td>([\d.]+)",
+        re.search(r'<tr><th scope="row">visibility.*?</tr>', heavy)[0],
     )
     of = scenes.tables.levels.query("level == 'heavy' and policy == 'visibility'")
     assert {f"{accuracy:.3f}" for accuracy in of["accuracy"]} <= {*cells}

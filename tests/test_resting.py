@@ -27,7 +27,9 @@ def cup(height=2.0, top=1.0, bottom=0.8):
 
 
 def with_handle():
-    return Trimesh(*_joined(cup(), creation.box((0.9, 0.25, 1.2)).apply_translation((1.2, 0, 0))))
+    return Trimesh(
+        *_joined(cup(), creation.box((0.9, 0.25, 1.2)).apply_translation((1.2, 0, 0)))
+    )
 
 
 def _joined(first, second):
@@ -38,7 +40,11 @@ def _joined(first, second):
 def plate(points):
     """A sheet without thickness, cut along a polygon that is seen whole from its first corner."""
     fan = [(0, k, k + 1) for k in range(1, len(points) - 1)]
-    return Trimesh(np.pad(np.array(points, float), ((0, 0), (0, 1))), fan, process=False)
+    return Trimesh(
+        np.pad(np.array(points, float), ((0, 0), (0, 1))),
+        fan,
+        process=False,
+    )
 
 
 def test_a_box_rests_on_its_faces_and_keeps_its_size():
@@ -47,14 +53,23 @@ def test_a_box_rests_on_its_faces_and_keeps_its_size():
     found = resting_poses(brick)
     assert len(found) == 3  # of its six sides two and two look alike
     np.testing.assert_array_equal(found[0], np.eye(3))
-    np.testing.assert_allclose(sorted(np.abs(found[:, 2]).tolist()), np.eye(3)[::-1], atol=1e-6)
+    np.testing.assert_allclose(
+        sorted(np.abs(found[:, 2]).tolist()),
+        np.eye(3)[::-1],
+        atol=1e-6,
+    )
     for rotation in found:
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
-        assert rotated(brick, rotation).metres == pytest.approx(np.sqrt(14) / 2 * UNITS["cm"])
+        assert rotated(brick, rotation).metres == pytest.approx(
+            np.sqrt(14) / 2 * UNITS["cm"]
+        )
 
 
 @pytest.mark.parametrize(
-    ("shape", "tilts"),  # between the axis of the shape and the vertical, in each pose, degrees
+    (
+        "shape",
+        "tilts",
+    ),  # between the axis of the shape and the vertical, in each pose, degrees
     [
         (creation.cylinder(1, 2, sections=SIDE), [0, 90]),
         (creation.cylinder(1, 0.1, sections=SIDE), [0]),
@@ -67,7 +82,11 @@ def test_a_box_rests_on_its_faces_and_keeps_its_size():
     ],
 )
 @pytest.mark.parametrize("turn", [(0, 0, 0), (40, 30, 70)])
-def test_poses_that_look_alike_are_one_however_the_file_has_the_thing(shape, tilts, turn):
+def test_poses_that_look_alike_are_one_however_the_file_has_the_thing(
+    shape,
+    tilts,
+    turn,
+):
     away = Rotation.from_euler("zxz", turn, degrees=True)
     mesh = of(Trimesh(away.apply(shape.vertices), shape.faces, process=False))
     upwards = np.abs(resting_poses(mesh) @ away.apply((0, 0, 1)))[:, 2]
@@ -79,7 +98,8 @@ def test_poses_that_look_alike_are_one_however_the_file_has_the_thing(shape, til
 
 
 @pytest.mark.parametrize(
-    "shape", [creation.icosphere(3), creation.box((1, 1, 1)), creation.icosphere(1)]
+    "shape",
+    [creation.icosphere(3), creation.box((1, 1, 1)), creation.icosphere(1)],
 )
 def test_a_ball_and_a_die_have_one_pose(shape):
     assert len(resting_poses(of(shape))) == 1
@@ -103,7 +123,9 @@ def test_what_falls_on_its_side_in_most_throws_has_that_pose():
         hull = Trimesh(mesh.vertices).convex_hull
         landed = [_rest(hull, direction) for direction in rng.normal(size=(300, 3))]
         tilts = np.arccos(np.clip(landed @ np.array([0, 0, 1.0]), -1, 1))
-        covered = np.abs(tilts[:, None] - np.arccos(ups[:, 2])[None]).min(1) < np.radians(20)
+        covered = np.abs(tilts[:, None] - np.arccos(ups[:, 2])[None]).min(
+            1
+        ) < np.radians(20)
         assert covered.mean() > 0.7
 
 
@@ -122,7 +144,10 @@ def _rest(hull, down):
         worst = int(inside.argmin())
         pair = (hull.face_adjacency == face).any(1)
         shared = hull.face_adjacency_edges[pair]
-        ends = {tuple(np.round(corners[worst], 6)), tuple(np.round(corners[(worst + 1) % 3], 6))}
+        ends = {
+            tuple(np.round(corners[worst], 6)),
+            tuple(np.round(corners[(worst + 1) % 3], 6)),
+        }
         for faces, edge in zip(hull.face_adjacency[pair], shared, strict=True):
             if {tuple(np.round(point, 6)) for point in hull.vertices[edge]} == ends:
                 down = hull.face_normals[int(faces[faces != face][0])]

@@ -14,7 +14,13 @@ SPHERE = ViewSphere.named("40")
 def walk(knobs, knobs_memory):
     """One view of the box without a knob."""
     shown = shown_objects(knobs / "plain.ply", unit="m")
-    exploration = Exploration(shown, models=knobs_memory, sensor="wrist", start=20, threads=1)
+    exploration = Exploration(
+        shown,
+        models=knobs_memory,
+        sensor="wrist",
+        start=20,
+        threads=1,
+    )
     walk = exploration.walks[0]
     assert walk.rival_pictures(SPHERE.directions[0]) is None  # nothing was seen yet
     walk.step()
@@ -41,17 +47,25 @@ def test_the_pixels_that_differ_are_those_of_the_knob(walk):
         if facing < -0.5:
             assert found.share < 0.01, view  # the body hides it
     assert max(shares) < 0.15
-    assert walk.rival_pictures(SPHERE.directions[walk.next_view]).share > 0.6 * max(shares)
+    assert walk.rival_pictures(SPHERE.directions[walk.next_view]).share > 0.6 * max(
+        shares
+    )
 
 
 def test_the_page_shows_both_and_where_they_differ(walk):
     at = walk.next_view
     share = walk.rival_pictures(SPHERE.directions[at]).share
     shown = walk_card(walk)
-    assert f"as view {at} would show them: they differ in {share:.0%} of the pixels" in shown
+    assert (
+        f"as view {at} would show them: they differ in {share:.0%} of the pixels"
+        in shown
+    )
     for name in ("plain", "knob", "where they differ"):
         assert f"<figcaption>{name}</figcaption>" in shown
-    assert "as this camera would show them" in preview_card(walk.views[0].observation, walk)
+    assert "as this camera would show them" in preview_card(
+        walk.views[0].observation,
+        walk,
+    )
     rivals = walk.rival_pictures(SPHERE.directions[at])
     colours = differing(rivals).reshape(-1, 3)
     assert len(np.unique(colours, axis=0)) == 3

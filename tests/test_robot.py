@@ -32,7 +32,14 @@ SOFA = trimesh.util.concatenate(
 )
 
 
-def frame(pose, move=np.eye(4), scale=1.0, meshes=(TABLE, SOFA), masked=False, **more) -> Frame:
+def frame(
+    pose,
+    move=np.eye(4),
+    scale=1.0,
+    meshes=(TABLE, SOFA),
+    masked=False,
+    **more,
+) -> Frame:
     """What a camera at a pose sees of the sofa on the table; then the world is moved and scaled."""
     depth, which = cast(meshes, pose, INTRINSICS, SHAPE)
     moved = move @ pose
@@ -42,7 +49,13 @@ def frame(pose, move=np.eye(4), scale=1.0, meshes=(TABLE, SOFA), masked=False, *
 
 
 def begin(
-    models, policy=None, max_views=4, threshold=1.0, seed=0, sphere=SPHERE, **more
+    models,
+    policy=None,
+    max_views=4,
+    threshold=1.0,
+    seed=0,
+    sphere=SPHERE,
+    **more,
 ) -> Session:
     policy = policy or MapPeak(SPHERE, "lem")
     stopping = Stopping(threshold, max_views)
@@ -72,7 +85,9 @@ def snapshot(session):
         for v in session.views
     ]
     where = (
-        None if session.object is None else (len(session.object.sightings), session.object.revision)
+        None
+        if session.object is None
+        else (len(session.object.sightings), session.object.revision)
     )
     return views, session.view, session.done, where
 
@@ -96,14 +111,23 @@ def test_the_whole_way_from_frames_to_a_name():
     chair = trimesh.Trimesh(0.12 * mesh.vertices, mesh.faces)
     chair.apply_translation([0.3, -0.2, -chair.vertices[:, 2].min()])
     middle = chair.bounds.mean(0)
-    session = nextview.load().session(object=ObservedObject(life_size=False), distance=0.6)
-    run(session, pose_at(40, 77, 0.6, middle), lambda pose: frame(pose, meshes=(TABLE, chair)))
+    session = nextview.load().session(
+        object=ObservedObject(life_size=False),
+        distance=0.6,
+    )
+    run(
+        session,
+        pose_at(40, 77, 0.6, middle),
+        lambda pose: frame(pose, meshes=(TABLE, chair)),
+    )
     assert session.result.answer == "chair"
     assert session.result.confident
     assert not any(view.warnings for view in session.views)
     target = session.poses[3]
     np.testing.assert_allclose(
-        target[:3, 3] + 0.6 * target[:3, 2], session.object.object_frame.centre, atol=1e-9
+        target[:3, 3] + 0.6 * target[:3, 2],
+        session.object.object_frame.centre,
+        atol=1e-9,
     )
     assert np.linalg.norm(session.object.object_frame.centre - middle) < 0.02
 
@@ -121,15 +145,23 @@ def test_a_better_object_frame_changes_what_the_earlier_views_say(tiny):
     assert session.object.revision > 0
     assert firsts[0] is not firsts[-1]
     total, k = 0.0, len(session.views)
-    for view, observation in zip(session.views, session.object.observations, strict=True):
+    for view, observation in zip(
+        session.views,
+        session.object.observations,
+        strict=True,
+    ):
         assert view.observation is observation
         e = tiny.evidence([observation])
         x, y, _ = observation.pose[:3, 3]
         total = total + log_evidence_of(
-            e.logits, e.azimuth_bins, np.array([np.arctan2(y, x)])
+            e.logits,
+            e.azimuth_bins,
+            np.array([np.arctan2(y, x)]),
         ).astype(np.float64)
     np.testing.assert_allclose(
-        session.views[-1].belief, tiny.recogniser.calibration.belief(total, k, 3)[0], atol=1e-6
+        session.views[-1].belief,
+        tiny.recogniser.calibration.belief(total, k, 3)[0],
+        atol=1e-6,
     )
 
 
@@ -141,7 +173,11 @@ def test_a_better_object_frame_changes_what_the_earlier_views_say(tiny):
     st.tuples(*[st.floats(-2, 2)] * 3),
 )
 def test_moving_the_world_and_the_poses_together_changes_nothing(
-    tiny, elevation, azimuth, turn, shift
+    tiny,
+    elevation,
+    azimuth,
+    turn,
+    shift,
 ):
     move = np.eye(4)
     move[:3, :3] = Rotation.from_euler("z", turn).as_matrix()
@@ -165,16 +201,26 @@ def mistakes():
     good = frame(pose_at(35, 60, 0.7, (0, 0, 0.08)))
     away = frame(pose_at(35, 0, 0.7, (0, 0, 0.08)), meshes=(TABLE,))
     yield "the empty table", lambda: away, ObservationError
-    yield "an inverse pose", lambda: replace(good, pose=np.linalg.inv(good.pose)), ObservationError
+    yield (
+        "an inverse pose",
+        lambda: replace(good, pose=np.linalg.inv(good.pose)),
+        ObservationError,
+    )
     yield "no pose", lambda: replace(good, pose=None), ObservationError
-    yield "millimetres", lambda: replace(good, depth=1000 * good.depth), ObservationError
+    yield (
+        "millimetres",
+        lambda: replace(good, depth=1000 * good.depth),
+        ObservationError,
+    )
     seen = Observation(np.full((16, 16), 3.0), SPHERE.poses[0], np.diag([16, 16, 1.0]))
     yield "an observation", lambda: seen, SessionError
 
 
 @pytest.mark.parametrize("after", [0, 1, 2])
 @pytest.mark.parametrize(
-    ("what", "make", "error"), list(mistakes()), ids=lambda x: x if isinstance(x, str) else ""
+    ("what", "make", "error"),
+    list(mistakes()),
+    ids=lambda x: x if isinstance(x, str) else "",
 )
 def test_a_session_is_as_it_was_after_each_mistake(tiny, what, make, error, after):
     if what == "no pose" and after == 0:
@@ -211,7 +257,9 @@ def test_the_pose_that_was_reached_counts(tiny):
     second = session.update(camera.observe(session.pose))
     (up, round_), (to_up, to_round) = place, SPHERE.angles(second.index)
     steps = abs(to_round - round_) / 45 % 8
-    assert second.travel == pytest.approx(np.hypot((to_up - up) / 18, min(steps, 8 - steps)))
+    assert second.travel == pytest.approx(
+        np.hypot((to_up - up) / 18, min(steps, 8 - steps))
+    )
     a, b = pose[:3, 3] / 3, SPHERE.directions[second.index]
     assert second.arc == pytest.approx(np.arccos(a @ b))
 
@@ -230,15 +278,22 @@ def test_failed_and_unreachable_views_never_come(tiny, data, layout, name):
     policy = MapPeak(SPHERE, "lem") if name == "lem" else make_policy(name, sphere)
     camera = SimulatedCamera(sample_mesh("chair"), 32)
     session = begin(
-        tiny, policy, sphere=sphere, max_views=6, distance=None, seed=data.draw(st.integers(0, 99))
+        tiny,
+        policy,
+        sphere=sphere,
+        max_views=6,
+        distance=None,
+        seed=data.draw(st.integers(0, 99)),
     )
-    mask = np.random.default_rng(data.draw(st.integers(0, 999))).random(len(sphere)) < data.draw(
-        st.floats(0.05, 1)
-    )
+    mask = np.random.default_rng(data.draw(st.integers(0, 999))).random(
+        len(sphere)
+    ) < data.draw(st.floats(0.05, 1))
     assume(mask.any())
     session.reachable = mask
     if data.draw(st.booleans()):
-        session.reachable = lambda pose: mask[np.abs(sphere.poses - pose).sum((1, 2)).argmin()]
+        session.reachable = lambda pose: mask[
+            np.abs(sphere.poses - pose).sum((1, 2)).argmin()
+        ]
     failed, visited = set(), set()
     while not session.done:
         if session.views or not callable(session.reachable):
@@ -289,11 +344,17 @@ def test_travel_in_seconds_is_weighed_as_travel_in_cells(tiny):
             return np.zeros(state.visited.shape)
 
         def next_views(self, state, rng):
-            travel = SPHERE.travel[state.current] if state.travel is None else state.travel
+            travel = (
+                SPHERE.travel[state.current] if state.travel is None else state.travel
+            )
             return np.where(state.free, -self.travel_weight * travel, -np.inf).argmax(1)
 
     camera, rng = SimulatedCamera(sample_mesh("chair"), 32), np.random.default_rng(0)
-    costs = {"cells": None, "seconds": 3.5 * SPHERE.travel, "matrix": rng.random((40, 40))}
+    costs = {
+        "cells": None,
+        "seconds": 3.5 * SPHERE.travel,
+        "matrix": rng.random((40, 40)),
+    }
     costs["callable"] = lambda a, b: costs["matrix"][
         tuple(int(np.abs(SPHERE.poses - pose).sum((1, 2)).argmin()) for pose in (a, b))
     ]
@@ -335,9 +396,18 @@ def test_reach_and_cost_are_asked_in_the_world(tiny):
 
 @pytest.mark.parametrize(
     ("shift", "refused"),
-    [((1.2, 0, 0), True), ((0, -1.3, 0), True), ((0, 0, 0), False), ((0.01, 0, 0), False)],
+    [
+        ((1.2, 0, 0), True),
+        ((0, -1.3, 0), True),
+        ((0, 0, 0), False),
+        ((0.01, 0, 0), False),
+    ],
 )
-def test_frames_that_only_together_show_a_too_large_object_blame_the_poses(tiny, shift, refused):
+def test_frames_that_only_together_show_a_too_large_object_blame_the_poses(
+    tiny,
+    shift,
+    refused,
+):
     session = begin(tiny, distance=0.5)
     session.update(frame(pose_at(40, 20, 0.7), masked=True))
     before = snapshot(session)
@@ -357,11 +427,16 @@ def test_frames_that_only_together_show_a_too_large_object_blame_the_poses(tiny,
     ("distance", "words"),
     [(0.15, "outside of it: ask for a larger one.* a mask$"), (700, "in millimetres")],
 )
-def test_a_distance_that_cannot_be_is_refused_once_the_radius_is_known(tiny, distance, words):
+def test_a_distance_that_cannot_be_is_refused_once_the_radius_is_known(
+    tiny,
+    distance,
+    words,
+):
     session = begin(tiny, distance=distance)
     before = snapshot(session)
     with pytest.raises(
-        UsageError, match=f"{distance} m from the centre of an object of 0.16 m radius .*{words}"
+        UsageError,
+        match=f"{distance} m from the centre of an object of 0.16 m radius .*{words}",
     ):
         session.update(frame(pose_at(20, 30, 0.7, (0, 0, 0.08))))
     assert snapshot(session) == before
@@ -370,9 +445,15 @@ def test_a_distance_that_cannot_be_is_refused_once_the_radius_is_known(tiny, dis
 def test_only_sixteen_bits_are_blamed_for_a_distance_inside_the_object(tiny):
     seen = frame(pose_at(20, 30, 0.7, (0, 0, 0.08)))
     counted = Frame(
-        np.rint(1000 * seen.depth).astype(np.uint16), INTRINSICS, seen.pose, pixel_centre=0.5
+        np.rint(1000 * seen.depth).astype(np.uint16),
+        INTRINSICS,
+        seen.pose,
+        pixel_centre=0.5,
     )
-    with pytest.raises(UsageError, match="the steps of the uint16 depth are no millimetres"):
+    with pytest.raises(
+        UsageError,
+        match="the steps of the uint16 depth are no millimetres",
+    ):
         begin(tiny, distance=0.15).update(counted)
 
 
@@ -397,7 +478,10 @@ def test_a_frame_that_comes_again_counts_once_and_moves_no_object(tiny):
     where = session.object.object_frame
     while not session.done:
         session.update(replace(first, pose=session.target, pixel_centre=0.5))
-    assert [[w.name for w in view.warnings] for view in session.views] == [[], *[["repeated"]] * 3]
+    assert [[w.name for w in view.warnings] for view in session.views] == [
+        [],
+        *[["repeated"]] * 3,
+    ]
     for view in session.views:
         np.testing.assert_array_equal(view.belief, session.views[0].belief)
     assert session.object.object_frame == where

@@ -46,7 +46,10 @@ def tins(tmp_path_factory) -> Path:
 
 
 def built(folder: Path, meshes: Path) -> list[Room]:
-    return [build_room(RoomLayout.load(path), meshes) for path in sorted(folder.rglob("*.json"))]
+    return [
+        build_room(RoomLayout.load(path), meshes)
+        for path in sorted(folder.rglob("*.json"))
+    ]
 
 
 def a_room(folder: Path, **changed) -> Room:
@@ -56,8 +59,19 @@ def a_room(folder: Path, **changed) -> Room:
     pose[:3, :3] = np.transpose([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
     pose[:3, 3] = -2.5, 0, 0.5
     cube = Standing(path.name, mesh_hash(path), np.sqrt(0.75))
-    given = {"name": "cube@room-0", "kind": "floor", "seed": 0, "label": "cube", "target": cube}
-    given |= {"width": 6.0, "depth": 4.0, "height": 2.5, "pose": tuple(pose.ravel().tolist())}
+    given = {
+        "name": "cube@room-0",
+        "kind": "floor",
+        "seed": 0,
+        "label": "cube",
+        "target": cube,
+    }
+    given |= {
+        "width": 6.0,
+        "depth": 4.0,
+        "height": 2.5,
+        "pose": tuple(pose.ravel().tolist()),
+    }
     return build_room(RoomLayout(**given | changed), folder)
 
 
@@ -68,7 +82,10 @@ def test_a_frame_shows_the_cube_the_wall_and_the_floor_where_they_are(tmp_path):
     room = a_room(tmp_path)
     frame, shown = RoomCamera(room, SENSORS["none"]).look(room.pose)
     height, width = frame.shape
-    assert frame.depth[height // 2, width // 2] == pytest.approx(2.0, abs=0.002)  # in millimetres
+    assert frame.depth[height // 2, width // 2] == pytest.approx(
+        2.0,
+        abs=0.002,
+    )  # in millimetres
     assert shown[height // 2, width // 2]
     assert room.radius == pytest.approx(np.sqrt(0.75), abs=1e-4)
     np.testing.assert_allclose(room.centre, (0, 0, 0.5), atol=1e-6)
@@ -83,7 +100,12 @@ def test_a_frame_shows_the_cube_the_wall_and_the_floor_where_they_are(tmp_path):
     x, y, z = np.abs(places.T)
     from_surface = np.stack([z, 3 - x, 2 - y, 2.5 - z], 1)
     assert from_surface.min(1).max() < 4 * UNEVEN_HEIGHT + 0.002
-    assert {*from_surface.argmin(1)} == {0, 1, 2, 3}  # floor, the wall behind, side walls, ceiling
+    assert {*from_surface.argmin(1)} == {
+        0,
+        1,
+        2,
+        3,
+    }  # floor, the wall behind, side walls, ceiling
 
 
 def test_pixels_of_the_target_are_those_of_another_ray_caster(rooms, furniture):
@@ -104,7 +126,9 @@ def test_noise_belongs_to_the_pose_and_the_seed(tmp_path):
     first = camera.look(room.pose)[0].depth
     camera.look(other)
     np.testing.assert_array_equal(camera.look(room.pose)[0].depth, first)
-    assert (RoomCamera(room, SENSORS["stereo"], seed=2).look(room.pose)[0].depth != first).any()
+    assert (
+        RoomCamera(room, SENSORS["stereo"], seed=2).look(room.pose)[0].depth != first
+    ).any()
 
     # on the wall behind, all else equal: sigma = z^2 disparity / (focal baseline)
     sensor = SENSORS["stereo"]
@@ -150,7 +174,9 @@ def test_furniture_has_the_size_that_it_has_in_life(rooms, furniture):
 def test_nothing_overlaps_and_the_camera_is_level_in_the_room(rooms, furniture):
     for room in built(rooms, furniture):
         layout = room.layout
-        outlines = [footprint(corners) for corners, _ in room.things[: 1 + len(layout.objects)]]
+        outlines = [
+            footprint(corners) for corners, _ in room.things[: 1 + len(layout.objects)]
+        ]
         for k, one in enumerate(outlines):
             assert all(separation(one, other) > 0 for other in outlines[:k])
         half = np.array([layout.width, layout.depth]) / 2
@@ -173,7 +199,10 @@ def test_things_of_known_size_rest_on_a_table(tins, tmp_path):
         table = top.z + top.height
         assert room.target[:, 2].min() == pytest.approx(table, abs=1e-4)
         assert all(leg.z + leg.height < table for leg in legs)
-        radius = {"tin": np.hypot(0.04, 0.055), "plank": np.linalg.norm((0.09, 0.03, 0.01))}
+        radius = {
+            "tin": np.hypot(0.04, 0.055),
+            "plank": np.linalg.norm((0.09, 0.03, 0.01)),
+        }
         assert room.radius == pytest.approx(radius[room.layout.label], abs=1e-4)
         heights.add((room.layout.label, round(float(np.ptp(room.target[:, 2])), 2)))
     # the tin stands and lies, the plank lies
@@ -192,10 +221,19 @@ def test_the_same_seed_draws_the_same_bytes_and_goes_on(rooms, furniture, tmp_pa
 
 
 def test_what_no_room_can_be_made_of_is_said(tins, tmp_path, rooms, furniture, capsys):
-    with pytest.raises(UsageError, match=r"how large is a plank\? Give the files' --unit"):
+    with pytest.raises(
+        UsageError,
+        match=r"how large is a plank\? Give the files' --unit",
+    ):
         list(draw_rooms(tins, tmp_path / "out", workers=0))
     said = pipeline.refused(
-        capsys, "scenes", furniture, tmp_path / "o", "--room", "--levels", "light"
+        capsys,
+        "scenes",
+        furniture,
+        tmp_path / "o",
+        "--room",
+        "--levels",
+        "light",
     )
     assert "--levels and --held-out are for cluttered tables" in said
     said = pipeline.refused(capsys, "scenes", furniture, tmp_path / "o", "--unit", "m")
@@ -214,7 +252,9 @@ def test_what_no_room_can_be_made_of_is_said(tins, tmp_path, rooms, furniture, c
 
 def run(*arguments: object) -> subprocess.CompletedProcess:
     return subprocess.run(
-        [sys.executable, str(BENCHMARK), *map(str, arguments)], capture_output=True, text=True
+        [sys.executable, str(BENCHMARK), *map(str, arguments)],
+        capture_output=True,
+        text=True,
     )
 
 
@@ -229,7 +269,9 @@ def test_the_benchmark_goes_on_and_draws_its_mistakes(rooms, furniture, tmp_path
     assert 0.85 < ended["ratio"] < 1.15  # without noise, and by a mask
 
     # What is there is read, not run again.
-    path.write_text(json.dumps(ended | {"answer": "sofa", "taken": 1, "own": 1, "ratio": 1}))
+    path.write_text(
+        json.dumps(ended | {"answer": "sofa", "taken": 1, "own": 1, "ratio": 1})
+    )
     page = tmp_path / "page"
     again = run(rooms / "chair", furniture, out, *options, "--mistakes", page)
     assert again.returncode == 0, again.stderr
@@ -246,7 +288,12 @@ def test_the_benchmark_goes_on_and_draws_its_mistakes(rooms, furniture, tmp_path
 # What is found in rooms
 
 
-def looked_at(folder: Path, mesh: trimesh.Trimesh, distance: float, height: float) -> Room:
+def looked_at(
+    folder: Path,
+    mesh: trimesh.Trimesh,
+    distance: float,
+    height: float,
+) -> Room:
     """A thing that stands in the middle of a room, and a camera aimed at its centre."""
     path = pipeline.write_off(folder / "thing.off", mesh)
     size = float(np.linalg.norm(mesh.vertices - mesh.bounds.mean(0), axis=1).max())
@@ -256,7 +303,12 @@ def looked_at(folder: Path, mesh: trimesh.Trimesh, distance: float, height: floa
     pose = level_pose(aside / np.linalg.norm(aside), float(np.linalg.norm(aside)))
     pose[:3, 3] += centre
     given = {"name": "thing@room-0", "kind": "floor", "seed": 0, "label": "thing"}
-    given |= {"width": 8.0, "depth": 4.0, "height": 2.4, "pose": tuple(pose.ravel().tolist())}
+    given |= {
+        "width": 8.0,
+        "depth": 4.0,
+        "height": 2.4,
+        "pose": tuple(pose.ravel().tolist()),
+    }
     return build_room(RoomLayout(target=thing, **given), folder)
 
 
@@ -269,7 +321,11 @@ def found_in(room: Room, **asked) -> tuple[float, float, float]:
     thing.add(frame)
     found = thing.sightings[0].mask
     both = (found & shown).sum()
-    return both / shown.sum(), both / found.sum(), thing.object_frame.radius / room.radius
+    return (
+        both / shown.sum(),
+        both / found.sum(),
+        thing.object_frame.radius / room.radius,
+    )
 
 
 @pytest.mark.parametrize("named", ["pose", "point"])
@@ -277,7 +333,9 @@ def test_a_ceiling_is_no_part_of_what_stands_under_it(tmp_path, named):
     room = looked_at(tmp_path, trimesh.creation.box((0.5, 0.4, 0.9)), 3.5, 1.2)
     frame, shown = RoomCamera(room, SENSORS["stereo"]).look(room.pose)
     rows, columns = np.nonzero(~shown & (frame.depth > 0))
-    assert (np.abs(frame.positions(rows, columns)[:, 2] - 2.4) < 0.1).sum() > 10_000  # it is seen
+    assert (
+        np.abs(frame.positions(rows, columns)[:, 2] - 2.4) < 0.1
+    ).sum() > 10_000  # it is seen
     asked = {"point": room.centre} if named == "point" else {}
     taken, own, size = found_in(room, **asked)
     assert taken > 0.8
@@ -286,9 +344,18 @@ def test_a_ceiling_is_no_part_of_what_stands_under_it(tmp_path, named):
 
 
 @pytest.mark.parametrize("named", ["pose", "point"])
-def test_a_wide_table_that_ends_in_the_picture_is_a_thing_and_no_support(tmp_path, named):
-    legs = [pipeline.box((0.06, 0.06, 0.7), (x, y, 0.35)) for x in (-0.6, 0.6) for y in (-0.6, 0.6)]
-    table = trimesh.util.concatenate([pipeline.box((1.5, 1.5, 0.05), (0, 0, 0.725)), *legs])
+def test_a_wide_table_that_ends_in_the_picture_is_a_thing_and_no_support(
+    tmp_path,
+    named,
+):
+    legs = [
+        pipeline.box((0.06, 0.06, 0.7), (x, y, 0.35))
+        for x in (-0.6, 0.6)
+        for y in (-0.6, 0.6)
+    ]
+    table = trimesh.util.concatenate(
+        [pipeline.box((1.5, 1.5, 0.05), (0, 0, 0.725)), *legs]
+    )
     room = looked_at(tmp_path, table, 1.6, 1.25)
     asked = {"point": room.centre} if named == "point" else {}
     taken, own, size = found_in(room, **asked)

@@ -41,7 +41,11 @@ CHAIR = sample_of_size("chair", 0.9)
 CUPBOARD = box((0.4, 1.2, 0.9), (0, 0, 0.45))
 DESK = trimesh.util.concatenate(
     [box((0.8, 1.5, 0.04), (0, 0, 0.7))]
-    + [box((0.05, 0.05, 0.68), (x, y, 0.34)) for x in (-0.35, 0.35) for y in (-0.7, 0.7)]
+    + [
+        box((0.05, 0.05, 0.68), (x, y, 0.34))
+        for x in (-0.35, 0.35)
+        for y in (-0.7, 0.7)
+    ]
 )
 MUG = trimesh.creation.cylinder(0.04, 0.1).apply_translation((-0.1, 0.2, 0.77))
 MONITOR = sample_of_size("monitor", 0.45, (0, 0.1, 0.72))
@@ -71,7 +75,13 @@ def frame(meshes, pose, seed=0, sigma=0.003, mask_of=None, wide=0) -> Frame:
                 | np.roll(mask, 1, 1)
                 | np.roll(mask, -1, 1)
             )
-    return Frame(np.where(depth > 0, noisy, 0), INTRINSICS, pose, mask=mask, pixel_centre=0.5)
+    return Frame(
+        np.where(depth > 0, noisy, 0),
+        INTRINSICS,
+        pose,
+        mask=mask,
+        pixel_centre=0.5,
+    )
 
 
 def assert_is(thing: ObservedObject, mesh: trimesh.Trimesh, radius=0.15) -> None:
@@ -127,7 +137,9 @@ def test_walls_are_found_and_no_side_of_a_cupboard_is_one(walls, sigma):
     before = before_walls(seen, found, noise) & (seen.depth > 0)
     assert before[which >= 2].sum() <= 0.03 * (which >= 2).sum()
     assert before[(which == 0) & (seen.depth > 0)].mean() > 0.8
-    assert len(found) == sum((which == 2 + k).mean() > 0.03 for k in range(len(ROOMS[walls])))
+    assert len(found) == sum(
+        (which == 2 + k).mean() > 0.03 for k in range(len(ROOMS[walls]))
+    )
 
 
 def test_a_front_that_fills_the_picture_is_no_wall_where_the_object_is_behind_it():
@@ -136,7 +148,12 @@ def test_a_front_that_fills_the_picture_is_no_wall_where_the_object_is_behind_it
     seen = frame([front, FLOOR], pose)
     samples = sample(seen, seen.depth > 0, EXACT)
     assert len(find_walls(samples, Plane(UP, 0.0), np.random.default_rng(0))) == 1
-    assert not find_walls(samples, Plane(UP, 0.0), np.random.default_rng(0), place=middle_of(front))
+    assert not find_walls(
+        samples,
+        Plane(UP, 0.0),
+        np.random.default_rng(0),
+        place=middle_of(front),
+    )
 
 
 @pytest.mark.parametrize("asked", ["aim", "point"])
@@ -186,7 +203,9 @@ def test_a_monitor_stands_on_its_desk(asked, elevation):
 
 
 @pytest.mark.parametrize("height", [0.3, 0.66, 0.7, 0.72])
-def test_a_table_is_named_by_a_point_under_its_top_or_on_it_where_no_floor_is_measured(height):
+def test_a_table_is_named_by_a_point_under_its_top_or_on_it_where_no_floor_is_measured(
+    height,
+):
     scene = [DESK, NEAR_WALL]
     pose = pose_at(25, 20, 1.8, (0, 0, 0.6))
     _, which = cast(scene, pose)
@@ -198,7 +217,9 @@ def test_a_table_is_named_by_a_point_under_its_top_or_on_it_where_no_floor_is_me
 
 
 @pytest.mark.parametrize("height", [0.3, 0.6])
-def test_a_point_under_a_top_names_the_table_where_the_picture_ends_above_its_floor(height):
+def test_a_point_under_a_top_names_the_table_where_the_picture_ends_above_its_floor(
+    height,
+):
     scene = [DESK, NEAR_WALL, MUG, FLOOR]
     pose = pose_at(20, 0, 1.0, (-0.3, 0, 0.74))
     _, which = cast(scene, pose)
@@ -236,7 +257,12 @@ def test_a_wrong_pose_is_no_support_out_of_the_picture():
     """The camera's axes are OpenGL's: no plane is level, so nothing tells where the floor is."""
     pose = pose_at(25, 20, 1.8, (0, 0, 0.6))
     seen = frame([DESK, NEAR_WALL], pose)
-    wrong = Frame(seen.depth, seen.intrinsics, pose @ np.diag([1.0, -1, -1, 1]), pixel_centre=0.5)
+    wrong = Frame(
+        seen.depth,
+        seen.intrinsics,
+        pose @ np.diag([1.0, -1, -1, 1]),
+        pixel_centre=0.5,
+    )
     with pytest.raises(ObservationError):
         ObservedObject(point=(0, 0, 0.3)).add(wrong)
 
@@ -249,7 +275,11 @@ def test_a_level_part_of_the_object_is_not_its_support(mesh, asked, azimuth):
     thing = ObservedObject(point=target if asked == "point" else None)
     scene = [mesh, FLOOR, box((0.02, 12, 3), (-1.6, 0, 1.4))]
     thing.add(
-        frame(scene, pose_at(18, azimuth, 3.2, target), mask_of=0 if asked == "mask" else None)
+        frame(
+            scene,
+            pose_at(18, azimuth, 3.2, target),
+            mask_of=0 if asked == "mask" else None,
+        )
     )
     assert_is(thing, mesh)
 
@@ -265,14 +295,21 @@ def test_a_top_is_held_by_the_foot_that_shows_below_it(elevation, gap):
         [box((side, 2 * side, 0.05), (0, 0, 0.7)), box((0.2, 0.2, 0.68), (0, 0, 0.34))]
     )
     thing = ObservedObject(point=middle_of(table))
-    thing.add(frame([table, FLOOR, FAR_WALL], pose_at(elevation, 10, 2.2, middle_of(table))))
+    thing.add(
+        frame([table, FLOOR, FAR_WALL], pose_at(elevation, 10, 2.2, middle_of(table)))
+    )
     assert_is(thing, table)
 
 
 def test_what_a_nearer_thing_hides_below_is_not_held_by_it():
-    mug, carton = box((0.1, 0.3, 0.12), (0, 0, 0.06)), box((0.1, 0.2, 0.3), (-0.3, 0, 0.15))
+    mug, carton = (
+        box((0.1, 0.3, 0.12), (0, 0, 0.06)),
+        box((0.1, 0.2, 0.3), (-0.3, 0, 0.15)),
+    )
     thing = ObservedObject(point=middle_of(mug))
-    thing.add(frame([mug, carton, TABLE], pose_at(14, 0, 0.7, middle_of(mug)), sigma=0.001))
+    thing.add(
+        frame([mug, carton, TABLE], pose_at(14, 0, 0.7, middle_of(mug)), sigma=0.001)
+    )
     _, which = cast([mug, carton, TABLE], pose_at(14, 0, 0.7, middle_of(mug)))
     assert (which == 1)[thing.sightings[0].mask].mean() < 0.02
 
@@ -290,9 +327,14 @@ def test_flying_pixels_say_nothing_of_the_size(flying):
     rows, columns = np.nonzero(mask)
     rng = np.random.default_rng(2)
     chosen = rng.choice(len(rows), flying, replace=False)
-    depth[rows[chosen], columns[chosen]] += rng.uniform(0.03, 0.4, flying).astype(np.float32)
+    depth[rows[chosen], columns[chosen]] += rng.uniform(0.03, 0.4, flying).astype(
+        np.float32
+    )
     facets = fit_facets(depth, mask, INTRINSICS, denoise=False)
-    assert radius_of(without_outliers(facets, EXACT, 1), pose) == pytest.approx(clean, rel=0.03)
+    assert radius_of(without_outliers(facets, EXACT, 1), pose) == pytest.approx(
+        clean,
+        rel=0.03,
+    )
 
 
 RIM = trimesh.creation.annulus(0.11, 0.13, 0.03).apply_translation((0, 0, 0.015))
@@ -317,7 +359,10 @@ def test_what_lies_within_the_outline_of_a_thing_is_a_part_of_it(name, asked):
 
 @pytest.mark.parametrize("azimuth", [-60, -45, -30])
 def test_what_stands_in_a_corner_is_no_part_of_it(azimuth):
-    corner = [box((0.06, 1.2, 0.9), (-0.6, 0, 0.45)), box((1.2, 0.06, 0.9), (0, 0.6, 0.45))]
+    corner = [
+        box((0.06, 1.2, 0.9), (-0.6, 0, 0.45)),
+        box((1.2, 0.06, 0.9), (0, 0.6, 0.45)),
+    ]
     crate = box((0.2, 0.2, 0.25), (-0.15, 0.15, 0.125))
     thing = ObservedObject(point=middle_of(crate))
     thing.add(
@@ -332,14 +377,19 @@ def test_what_stands_in_a_corner_is_no_part_of_it(azimuth):
 @pytest.mark.parametrize("shift", [-0.8, 0.8])
 @pytest.mark.parametrize("share", [0.0, 0.004])
 def test_where_noise_is_large_few_pixels_before_and_behind_a_thing_say_nothing_of_its_size(
-    share, shift
+    share,
+    shift,
 ):
     crate = box((0.4, 0.5, 0.5), (0, 0, 0.25))
     pose = pose_at(20, 30, 3.0, middle_of(crate))
     seen = frame([crate, FLOOR], pose, sigma=0.008, mask_of=0)
     # Small groups of pixels, which no look at their neighbours tells from the noise.
     rows, columns = np.nonzero(seen.mask)
-    chosen = np.random.default_rng(1).choice(len(rows), int(share * len(rows) / 4), replace=False)
+    chosen = np.random.default_rng(1).choice(
+        len(rows),
+        int(share * len(rows) / 4),
+        replace=False,
+    )
     depth = seen.depth.copy()
     for down in (0, 1):
         for right in (0, 1):
@@ -358,7 +408,10 @@ def test_thin_things_keep_their_length(thick):
     depth = np.full((200, 300), 0.6, np.float32)
     mask = np.zeros(depth.shape, bool)
     mask[100 : 100 + thick, 40:260] = True
-    depth[mask] = np.broadcast_to(np.linspace(0.45, 0.55, 300, dtype=np.float32), depth.shape)[mask]
+    depth[mask] = np.broadcast_to(
+        np.linspace(0.45, 0.55, 300, dtype=np.float32),
+        depth.shape,
+    )[mask]
     facets = fit_facets(depth, mask, INTRINSICS, denoise=False)
     kept = without_outliers(facets, EXACT, 1)
     assert np.ptp(kept.columns) == np.ptp(facets.columns)
@@ -373,7 +426,9 @@ def test_a_handle_behind_the_edge_of_its_mug_is_kept_by_a_mask(azimuth, wide):
     handle.apply_translation((0.045, 0, 0.05))
     scene = [trimesh.util.concatenate([body, handle]), TABLE]
     thing = ObservedObject()
-    thing.add(frame(scene, pose_at(30, azimuth, 0.5, (0, 0, 0.05)), mask_of=0, wide=wide))
+    thing.add(
+        frame(scene, pose_at(30, azimuth, 0.5, (0, 0, 0.05)), mask_of=0, wide=wide)
+    )
     assert_is(thing, scene[0], radius=0.05)
 
 
@@ -385,7 +440,9 @@ def test_a_second_look_does_not_make_an_object_of_another_order_of_size(monkeypa
 
     def all_as_one(footprints, joins="by their border"):
         labels, two = parted(footprints, joins)
-        return ([np.minimum(label, 1) for label in labels] if joins == "always" else labels), two
+        return (
+            [np.minimum(label, 1) for label in labels] if joins == "always" else labels
+        ), two
 
     monkeypatch.setattr(clusters, "clusters", all_as_one)
     thing = ObservedObject()
@@ -398,7 +455,9 @@ def test_a_second_look_does_not_make_an_object_of_another_order_of_size(monkeypa
 
 
 @pytest.mark.parametrize(
-    "mesh", [BED, SOFA, DESK, CUPBOARD], ids=["bed", "sofa", "desk", "cupboard"]
+    "mesh",
+    [BED, SOFA, DESK, CUPBOARD],
+    ids=["bed", "sofa", "desk", "cupboard"],
 )
 @pytest.mark.parametrize("sigma", [0.001, 0.008])
 def test_depth_is_told_from_range_in_a_room(mesh, sigma):
@@ -412,5 +471,10 @@ def test_depth_is_told_from_range_in_a_room(mesh, sigma):
     range_image = floor.depth * np.linalg.norm(rays, axis=-1)
     with pytest.raises(ObservationError, match="a range"):
         ObservedObject().add(
-            Frame(range_image.astype(np.float32), INTRINSICS, floor.pose, pixel_centre=0.5)
+            Frame(
+                range_image.astype(np.float32),
+                INTRINSICS,
+                floor.pose,
+                pixel_centre=0.5,
+            )
         )

@@ -77,13 +77,27 @@ def recorded(folder, views):
             for topic, kind in topics.items()
         }
         for k, (image, info, transform) in enumerate(views):
-            for topic, what in (("depth", image), ("camera_info", info), ("tf", [transform])):
-                what = message("tf2_msgs/msg/TFMessage", transforms=what) if topic == "tf" else what
-                bag.write(connections[topic], k, STORE.serialize_cdr(what, topics[topic]))
+            for topic, what in (
+                ("depth", image),
+                ("camera_info", info),
+                ("tf", [transform]),
+            ):
+                what = (
+                    message("tf2_msgs/msg/TFMessage", transforms=what)
+                    if topic == "tf"
+                    else what
+                )
+                bag.write(
+                    connections[topic],
+                    k,
+                    STORE.serialize_cdr(what, topics[topic]),
+                )
     found = {topic: [] for topic in topics}
     with Reader(folder) as bag:
         for connection, _, data in bag.messages():
-            found[connection.topic].append(STORE.deserialize_cdr(data, connection.msgtype))
+            found[connection.topic].append(
+                STORE.deserialize_cdr(data, connection.msgtype)
+            )
     return list(
         zip(
             found["depth"],
@@ -97,23 +111,39 @@ def recorded(folder, views):
 @pytest.fixture(scope="module")
 def depth():
     rng = np.random.default_rng(0)
-    return np.where(rng.random(SHAPE) < 0.1, 0, rng.uniform(0.4, 2.0, SHAPE)).astype(np.float32)
+    return np.where(rng.random(SHAPE) < 0.1, 0, rng.uniform(0.4, 2.0, SHAPE)).astype(
+        np.float32
+    )
 
 
 @pytest.mark.parametrize("big", [False, True])
 @pytest.mark.parametrize("padding", [0, 12])
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
-def test_a_recorded_image_is_what_the_camera_saw(tmp_path, depth, encoding, padding, big):
+def test_a_recorded_image_is_what_the_camera_saw(
+    tmp_path,
+    depth,
+    encoding,
+    padding,
+    big,
+):
     pose = pose_at(40, 70, 0.7, (0.4, 0.1, 0.0), turn=(3, -2, 5))
     given = (
         np.rint(1000 * depth).astype(np.uint16)
         if encoding == "16UC1"
         else np.where(depth > 0, depth, np.nan)
     )
-    written = image_message(given, encoding, big, padding), info_message(), transform_message(pose)
+    written = (
+        image_message(given, encoding, big, padding),
+        info_message(),
+        transform_message(pose),
+    )
     ((image, info, transform),) = recorded(tmp_path / "bag", [written])
     frame = conversion.frame_of(image, info, transform)
-    np.testing.assert_allclose(frame.depth, depth, atol=6e-4 if encoding == "16UC1" else 0)
+    np.testing.assert_allclose(
+        frame.depth,
+        depth,
+        atol=6e-4 if encoding == "16UC1" else 0,
+    )
     np.testing.assert_allclose(frame.pose, pose, atol=1e-9)
     # the first pixel's centre is at 0.5 here
     np.testing.assert_allclose(frame.intrinsics[:2, 2], [80, 60])
@@ -122,8 +152,14 @@ def test_a_recorded_image_is_what_the_camera_saw(tmp_path, depth, encoding, padd
 def test_rectified_images_have_the_intrinsics_of_p():
     p = np.array([[250.0, 0, 81, -12.0], [0, 250, 61, 0], [0, 0, 1, 0]])
     info = info_message(d=(0.1, -0.2, 0, 0, 0), p=p)
-    np.testing.assert_array_equal(conversion.intrinsics_of(info, rectified=True), p[:, :3])
-    with pytest.raises(ObservationError, match=r"distorts \(plumb_bob\): use rectified images"):
+    np.testing.assert_array_equal(
+        conversion.intrinsics_of(info, rectified=True),
+        p[:, :3],
+    )
+    with pytest.raises(
+        ObservationError,
+        match=r"distorts \(plumb_bob\): use rectified images",
+    ):
         conversion.intrinsics_of(info)
 
 
@@ -139,7 +175,10 @@ def test_rectified_images_have_the_intrinsics_of_p():
             "frames differ: 'optical' of the image, 'depth_link'",
         ),
         ({"info": {"header": header("optical", 12.6)}}, "0.100 s apart"),
-        ({"transform": {"child_frame_id": "base_link"}}, "'base_link' of the transform"),
+        (
+            {"transform": {"child_frame_id": "base_link"}},
+            "'base_link' of the transform",
+        ),
         ({"transform": {"header": header("world", 11.5)}}, "1.000 s apart"),
     ],
 )
@@ -167,12 +206,19 @@ def test_an_episode_from_a_bag_is_that_of_the_frames(tmp_path):
     for azimuth in (20, 110, 250):
         pose = pose_at(35, azimuth, 0.6, chair.bounds.mean(0))
         depth, _ = cast(
-            (TABLE, chair), pose, k + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), shape
+            (TABLE, chair),
+            pose,
+            k + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]),
+            shape,
         )
         depth = np.rint(1000 * depth).astype(np.uint16)
         frames.append(Frame(depth, k, pose))
         messages.append(
-            (image_message(depth, "16UC1"), info_message(k, shape), transform_message(pose))
+            (
+                image_message(depth, "16UC1"),
+                info_message(k, shape),
+                transform_message(pose),
+            )
         )
     ends = []
     for given in (
@@ -186,7 +232,11 @@ def test_an_episode_from_a_bag_is_that_of_the_frames(tmp_path):
             session.update(frame)
         ends.append(session)
     assert ends[1].result.answer == "chair"
-    np.testing.assert_allclose(ends[1].views[-1].belief, ends[0].views[-1].belief, atol=1e-5)
+    np.testing.assert_allclose(
+        ends[1].views[-1].belief,
+        ends[0].views[-1].belief,
+        atol=1e-5,
+    )
 
 
 # What the node tells of an object, with stand-ins for the messages
@@ -218,7 +268,10 @@ def outputs(monkeypatch):
 
     def hypothesis():
         told = SimpleNamespace(pose=pose_message(), covariance=np.zeros(36))
-        return SimpleNamespace(hypothesis=SimpleNamespace(class_id="", score=0.0), pose=told)
+        return SimpleNamespace(
+            hypothesis=SimpleNamespace(class_id="", score=0.0),
+            pose=told,
+        )
 
     vision = SimpleNamespace(
         Detection3D=detection,
@@ -239,20 +292,37 @@ def seen_at(centre, **fields):
     from_object = np.eye(4)
     from_object[:3, 3] = centre
     return SimpleNamespace(
-        poses_in=SimpleNamespace(from_object=from_object), radius=0.05, beliefs={}, **fields
+        poses_in=SimpleNamespace(from_object=from_object),
+        radius=0.05,
+        beliefs={},
+        **fields,
     )
 
 
 def test_a_detection_holds_the_poses_of_scans_with_their_variances(outputs):
     poses = [np.eye(4), np.eye(4)]
-    poses[0][:3, :3] = Rotation.from_euler("xyz", [20, -35, 110], degrees=True).as_matrix()
+    poses[0][:3, :3] = Rotation.from_euler(
+        "xyz",
+        [20, -35, 110],
+        degrees=True,
+    ).as_matrix()
     poses[0][:3, 3] = 0.4, -0.1, 0.02  # the scan's origin, not its middle
     candidates = [
-        SimpleNamespace(thing=name, probability=share, pose=pose, degrees=3.0, millimetres=6.0)
+        SimpleNamespace(
+            thing=name,
+            probability=share,
+            pose=pose,
+            degrees=3.0,
+            millimetres=6.0,
+        )
         for name, share, pose in zip(("mug", "bowl"), (0.9, 0.1), poses, strict=True)
     ]
     unlikely = replace_in(candidates[1], thing="banana", probability=0.001)
-    seen = seen_at((0.41, -0.08, 0.07), answer="mug", pose_candidates=[*candidates, unlikely])
+    seen = seen_at(
+        (0.41, -0.08, 0.07),
+        answer="mug",
+        pose_candidates=[*candidates, unlikely],
+    )
     (told,) = outputs.detections(seen, "world").detections
     assert told.id == "mug"
     assert [one.hypothesis.class_id for one in told.results] == ["mug", "bowl"]
@@ -277,8 +347,13 @@ def test_a_detection_of_a_class_has_any_turn_and_an_unknown_one_no_hypothesis(ou
     assert [one.hypothesis.class_id for one in told.results] == ["chair", "table"]
     variances = np.diag(told.results[0].pose.covariance.reshape(6, 6))
     assert np.sqrt(variances[:3].sum()) == pytest.approx(0.05)
-    assert variances[3:] == pytest.approx([np.pi**2 / 3] * 3)  # of an even angle, +- 180 degrees
-    np.testing.assert_allclose(matrix_of(told.results[0].pose.pose)[:3, 3], (0.3, 0.2, 0.1))
+    assert variances[3:] == pytest.approx(
+        [np.pi**2 / 3] * 3
+    )  # of an even angle, +- 180 degrees
+    np.testing.assert_allclose(
+        matrix_of(told.results[0].pose.pose)[:3, 3],
+        (0.3, 0.2, 0.1),
+    )
 
     (told,) = outputs.detections(seen_at((0, 0, 0), answer=None), "world").detections
     assert (told.id, told.results) == ("unknown", [])
@@ -297,7 +372,10 @@ def node(monkeypatch):
     monkeypatch.setattr(sys.modules["rclpy.node"], "Node", object)
     monkeypatch.delitem(sys.modules, "nextview_ros.node", raising=False)
     made = object.__new__(importlib.import_module("nextview_ros.node").RecogniseNode)
-    made.session = nextview.load().session(object=ObservedObject(life_size=False), distance=0.5)
+    made.session = nextview.load().session(
+        object=ObservedObject(life_size=False),
+        distance=0.5,
+    )
     made.taken, made.begun = False, threading.Event()
     made.busy, made.ended, made.goal = threading.Lock(), threading.Event(), MagicMock()
     made.next_pose, made.value, made.get_clock = (
@@ -323,14 +401,21 @@ def test_a_pose_that_fails_before_the_first_look_is_an_answer(node):
 def test_whatever_fails_while_the_node_answers_is_an_answer(node, monkeypatch):
     # before the first look there is none
     monkeypatch.setattr(type(node), "tell", lambda self: self.session.target)
-    answer = node.answer(SimpleNamespace(success=None, message=None), lambda session: None)
+    answer = node.answer(
+        SimpleNamespace(success=None, message=None), lambda session: None
+    )
     assert answer.success is False
     assert answer.message
 
 
 def test_the_pose_of_the_thing_goes_into_a_message(node, monkeypatch):
     def empty():
-        parts = {"pose": SimpleNamespace(position=SimpleNamespace(), orientation=SimpleNamespace())}
+        parts = {
+            "pose": SimpleNamespace(
+                position=SimpleNamespace(),
+                orientation=SimpleNamespace(),
+            )
+        }
         return SimpleNamespace(header=SimpleNamespace(frame_id=""), **parts)
 
     module = sys.modules[type(node).__module__]
@@ -341,10 +426,13 @@ def test_the_pose_of_the_thing_goes_into_a_message(node, monkeypatch):
     assert message.header.frame_id == "base"
     x, y, z, w = (getattr(message.pose.orientation, part) for part in "xyzw")
     np.testing.assert_allclose(
-        Rotation.from_quat([x, y, z, w]).as_matrix(), pose[:3, :3], atol=1e-9
+        Rotation.from_quat([x, y, z, w]).as_matrix(),
+        pose[:3, :3],
+        atol=1e-9,
     )
     np.testing.assert_allclose(
-        [getattr(message.pose.position, part) for part in "xyz"], pose[:3, 3]
+        [getattr(message.pose.position, part) for part in "xyz"],
+        pose[:3, 3],
     )
     assert node.pose_of(SimpleNamespace(pose=None)).header.frame_id == ""
 
@@ -356,7 +444,9 @@ def test_the_pose_of_the_thing_goes_into_a_message(node, monkeypatch):
 def test_its_python_compiles_and_finds_what_it_takes_from_nextview(path):
     tree = ast.parse(path.read_text())
     for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("nextview."):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
+            "nextview."
+        ):
             module = __import__(node.module, fromlist=["_"])
             assert all(hasattr(module, name.name) for name in node.names)
         if (

@@ -83,18 +83,27 @@ class Robot(Node):
         self.heard = {}
         self.reset()
         self.images = self.create_publisher(Image, "depth", qos_profile_sensor_data)
-        self.infos = self.create_publisher(CameraInfo, "camera_info", qos_profile_sensor_data)
+        self.infos = self.create_publisher(
+            CameraInfo,
+            "camera_info",
+            qos_profile_sensor_data,
+        )
         self.stamped = self.create_publisher(PoseStamped, "camera_pose", 10)
         if TFMessage is not None:
             self.moving = self.create_publisher(TFMessage, "/tf", 10)
             self.fixed = self.create_publisher(TFMessage, "/tf_static", LATCHED)
-            self.fixed.publish(TFMessage(transforms=[self.transform(MOUNTED, "tool", "optical")]))
+            self.fixed.publish(
+                TFMessage(transforms=[self.transform(MOUNTED, "tool", "optical")])
+            )
         kinds = {"next_pose": PoseStamped, "next_poses": PoseArray}
         if Detection3DArray is not None:
             kinds["detections"] = Detection3DArray
         for topic, kind in kinds.items():
             self.create_subscription(
-                kind, topic, lambda given, topic=topic: self.heard.update({topic: given}), LATCHED
+                kind,
+                topic,
+                lambda given, topic=topic: self.heard.update({topic: given}),
+                LATCHED,
             )
         self.look_client = self.create_client(Trigger, "look")
         self.failed_client = self.create_client(Trigger, "failed")
@@ -124,7 +133,12 @@ class Robot(Node):
             depth, _ = cast(self.things, pose, K + half, SHAPE)
             self.depth_of[key] = np.rint(1000 * depth).astype(np.uint16)
         depth = self.depth_of[key]
-        image = Image(height=SHAPE[0], width=SHAPE[1], encoding="16UC1", step=2 * SHAPE[1])
+        image = Image(
+            height=SHAPE[0],
+            width=SHAPE[1],
+            encoding="16UC1",
+            step=2 * SHAPE[1],
+        )
         image.data = depth.tobytes()
         image.header.frame_id = "optical"
         image.header.stamp = self.get_clock().now().to_msg()
@@ -168,7 +182,12 @@ class Robot(Node):
 
     def hears(self, topic, after=None):
         """A message of a topic that is another than the one that was heard before."""
-        until(lambda: self.heard.get(topic) is not None and self.heard[topic] is not after, topic)
+        until(
+            lambda: (
+                self.heard.get(topic) is not None and self.heard[topic] is not after
+            ),
+            topic,
+        )
         return self.heard[topic]
 
     def target(self, after=None):
@@ -177,7 +196,11 @@ class Robot(Node):
         made = TransformStamped()
         made.transform.rotation = given.pose.orientation
         for axis in "xyz":
-            setattr(made.transform.translation, axis, getattr(given.pose.position, axis))
+            setattr(
+                made.transform.translation,
+                axis,
+                getattr(given.pose.position, axis),
+            )
         return pose_of(made)
 
 
@@ -199,7 +222,11 @@ class Running:
     """Node and robot, spinning in threads of their own."""
 
     def __init__(self, poses, **parameters):
-        all_parameters = {"life_size": False, "patience": 3.0, "poses": poses} | parameters
+        all_parameters = {
+            "life_size": False,
+            "patience": 3.0,
+            "poses": poses,
+        } | parameters
         rclpy.init()
         given = [Parameter(name, value=value) for name, value in all_parameters.items()]
         self.node = RecogniseNode(parameter_overrides=given)
@@ -351,7 +378,13 @@ def stale(image, info, transform):
 
 
 def other_stamp(image, info, transform):
-    info = CameraInfo(header=image.header, height=info.height, width=info.width, k=info.k, p=info.p)
+    info = CameraInfo(
+        header=image.header,
+        height=info.height,
+        width=info.width,
+        k=info.k,
+        p=info.p,
+    )
     stamp = type(image.header.stamp)(sec=image.header.stamp.sec + 5, nanosec=7)
     info.header = type(image.header)(frame_id="optical", stamp=stamp)
     return image, info, transform
@@ -368,14 +401,23 @@ def no_rotation(image, info, transform):
 
 
 WRONG = {
-    "no image": (lambda image, info, transform: (None, info, transform), "no depth image with"),
-    "no camera_info": (lambda image, info, transform: (image, None, transform), "no depth image"),
+    "no image": (
+        lambda image, info, transform: (None, info, transform),
+        "no depth image with",
+    ),
+    "no camera_info": (
+        lambda image, info, transform: (image, None, transform),
+        "no depth image",
+    ),
     "of different stamps": (other_stamp, "no depth image with its camera_info came"),
     "stale": (stale, "the images are older than the look"),
     "colour": (colour, "not 'rgb8': a colour topic"),
     "cut off": (short, "this one has 1000 bytes"),
     "of another size": (other_size, "its camera_info 640 x 240"),
-    "no pose": (lambda image, info, transform: (image, info, None), "tf (has nothing|does not)"),
+    "no pose": (
+        lambda image, info, transform: (image, info, None),
+        "tf (has nothing|does not)",
+    ),
 }
 
 
@@ -399,7 +441,9 @@ def test_images_that_come_late_are_waited_for(robot):
     robot.goal(distance=0.7)
     robot.change = lambda image, info, transform: (None, None, transform)
     time.sleep(0.3)
-    resume = threading.Timer(1.0, lambda: setattr(robot, "change", lambda *messages: messages))
+    resume = threading.Timer(
+        1.0, lambda: setattr(robot, "change", lambda *messages: messages)
+    )
     resume.start()
     answer = robot.look()
     assert answer.success, answer.message
@@ -413,7 +457,8 @@ def started(*options):
     folder = str(Path(__file__).parents[1] / "ros2" / "nextview_ros")
     path = os.pathsep.join([folder, os.environ.get("PYTHONPATH", "")])
     return subprocess.Popen(
-        [sys.executable, "-c", code, *given], env=os.environ | {"PYTHONPATH": path}
+        [sys.executable, "-c", code, *given],
+        env=os.environ | {"PYTHONPATH": path},
     )
 
 
@@ -425,7 +470,9 @@ def test_a_node_that_is_killed_and_started_again_takes_goals_again(running):
         assert second.look().success
         process.send_signal(signal.SIGKILL)
         process.wait()
-        until(lambda: not second.look_client.service_is_ready(), "the end of the service")
+        until(
+            lambda: not second.look_client.service_is_ready(), "the end of the service"
+        )
         process = started()
         handle, _ = second.goal(distance=0.7)
         assert handle.accepted

@@ -25,7 +25,8 @@ CAN = (*CUP, Symmetry((1.0, 0.0, 0.0), 2))
     ],
 )
 def test_a_turn_that_changes_nothing_is_no_error(
-    symmetries: tuple[Symmetry, ...], angles: tuple[float, float]
+    symmetries: tuple[Symmetry, ...],
+    angles: tuple[float, float],
 ) -> None:
     true = Rotation.random(rng=np.random.default_rng(0))
     error = Rotation.from_euler("x", ERROR, degrees=True)
@@ -43,5 +44,8 @@ def test_a_turn_that_shows_is_an_error() -> None:
 
 
 def test_a_ball_has_no_rotation() -> None:
-    ball = tuple(Symmetry(axis, 0) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+    ball = tuple(
+        Symmetry(axis, 0)
+        for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    )
     assert rotation_error(np.eye(3), np.eye(3), ball) is None

@@ -121,7 +121,10 @@ def test_strangers_are_unknown_and_their_size_is_told(system):
     assert thing.pose is None
     true = np.ptp(camera.table.things[0].placed, axis=0)
     assert thing.size[2] == pytest.approx(true[2], abs=0.01)
-    assert np.linalg.norm(thing.place[:2] - camera.table.things[0].placed.mean(0)[:2]) < 0.02
+    assert (
+        np.linalg.norm(thing.place[:2] - camera.table.things[0].placed.mean(0)[:2])
+        < 0.02
+    )
 
 
 def test_a_thing_that_was_taken_away_is_gone(system, meshes):
@@ -170,7 +173,9 @@ def test_a_frame_with_a_wrong_pose_is_left_out(system, meshes, wrong):
     look = scene.update(replace(frame, pose=pose, pixel_centre=0.5))
     assert not look.taken
     assert [warning.name for warning in look.warnings] == ["pose"]
-    assert {thing.number: thing.place for thing in scene.objects}.keys() == before.keys()
+    assert {
+        thing.number: thing.place for thing in scene.objects
+    }.keys() == before.keys()
 
     assert scene.update(frame).taken
     assert set(by_name(scene)) == set(NAMES)
@@ -211,7 +216,9 @@ def test_only_the_region_is_looked_at(system, meshes):
 
 def test_a_table_full_of_unknown_things(system):
     rings = []
-    for number, (radius, tube) in enumerate([(0.06, 0.022), (0.05, 0.015), (0.045, 0.02)]):
+    for number, (radius, tube) in enumerate(
+        [(0.06, 0.022), (0.05, 0.015), (0.045, 0.02)]
+    ):
         ring = trimesh.creation.torus(radius, tube)
         rings.append(make_mesh(ring.vertices, ring.faces, f"ring {number}", "m"))
     camera = camera_over(rings, gap=0.1)
@@ -243,7 +250,10 @@ def test_a_hand_over_the_table_changes_no_name(system, meshes):
 def captured(camera: TableCamera, degrees, folder) -> None:
     """Frames of a table as a folder in the layout of 7-Scenes."""
     folder.mkdir()
-    np.savetxt(folder / "camera-intrinsics.txt", camera.sensor.intrinsics - 0.5 * _CENTRE)
+    np.savetxt(
+        folder / "camera-intrinsics.txt",
+        camera.sensor.intrinsics - 0.5 * _CENTRE,
+    )
     for number, angle in enumerate(degrees):
         frame = camera.frame(view(angle))
         name = folder / f"frame-{number:06d}"
@@ -252,14 +262,26 @@ def captured(camera: TableCamera, degrees, folder) -> None:
         np.savetxt(f"{name}.pose.txt", frame.pose)
 
 
-_CENTRE = np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0.0]])  # OpenCV counts from the first pixel's
+_CENTRE = np.array(
+    [[0, 0, 1], [0, 0, 1], [0, 0, 0.0]]
+)  # OpenCV counts from the first pixel's
 
 
 def test_the_command_says_what_is_on_the_table(meshes, tmp_path, capsys):
     camera = camera_over([meshes["cracker_box"], meshes["mug"]])
     captured(camera, (20, 60), tmp_path / "table")
     figure = tmp_path / "table.png"
-    main(["look", str(tmp_path / "table"), "--up", "z", "--json", "--figure", str(figure)])
+    main(
+        [
+            "look",
+            str(tmp_path / "table"),
+            "--up",
+            "z",
+            "--json",
+            "--figure",
+            str(figure),
+        ]
+    )
     said = json.loads(capsys.readouterr().out)
     assert {thing["name"] for thing in said["objects"]} == {"cracker_box", "mug"}
     assert [frame["taken"] for frame in said["frames"]] == [True, True]

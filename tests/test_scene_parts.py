@@ -34,12 +34,19 @@ def judged_by(system):
 
     def judged(tracks):
         results = judge([track.thing for track in tracks])
-        return [replace(track, result=one) for track, one in zip(tracks, results, strict=True)]
+        return [
+            replace(track, result=one)
+            for track, one in zip(tracks, results, strict=True)
+        ]
 
     return judged
 
 
-def two_sides(system, camera, degrees=(20, 140)) -> tuple[list[list[Track]], list[Bench]]:
+def two_sides(
+    system,
+    camera,
+    degrees=(20, 140),
+) -> tuple[list[list[Track]], list[Bench]]:
     """The objects of each of two frames as objects of their own, judged, with their frames."""
     judged = judged_by(system)
     found, benches = [], []
@@ -48,19 +55,26 @@ def two_sides(system, camera, degrees=(20, 140)) -> tuple[list[list[Track]], lis
         benches.append(Bench(top, number, judged))
         of_frame = [new_track(mask, benches[-1]) for mask in top.segments()]
         found.append(
-            [replace(one, number=10 * number + k) for k, one in enumerate(judged(of_frame))]
+            [
+                replace(one, number=10 * number + k)
+                for k, one in enumerate(judged(of_frame))
+            ]
         )
     return found, benches
 
 
 def test_two_sides_of_one_thing_are_one_object_and_two_things_stay_two(system, meshes):
     found, benches = two_sides(
-        system, camera_over([meshes["tomato_soup_can"], meshes["cracker_box"]])
+        system,
+        camera_over([meshes["tomato_soup_can"], meshes["cracker_box"]]),
     )
     assert [len(tracks) for tracks in found] == [2, 2]
     every = [track for tracks in found for track in tracks]
     one_each = merged(every, benches)
-    assert sorted(track.result.answer for track in one_each) == ["cracker_box", "tomato_soup_can"]
+    assert sorted(track.result.answer for track in one_each) == [
+        "cracker_box",
+        "tomato_soup_can",
+    ]
     assert all(track.frames == (0, 1) for track in one_each)
     assert sorted(number for track in one_each for number in track.absorbed) == [10, 11]
     assert merged(found[0], benches[:1]) == found[0]
@@ -80,7 +94,9 @@ def test_a_look_tells_which_numbers_end_in_another_object(system, meshes):
     scene = nextview.Scene(system)
     scene.update(camera.frame(view(20)))
     mug = next(track for track in scene._tracks if track.result.answer == "mug")
-    scene._tracks.append(replace(mug, number=7))  # as if another frame had shown it as another one
+    scene._tracks.append(
+        replace(mug, number=7)
+    )  # as if another frame had shown it as another one
     look = scene.update(camera.frame(view(140)))
     assert look.joined == ((7, mug.number),)
     assert look.appeared == look.gone == look.moved == ()
@@ -116,7 +132,8 @@ def test_what_stands_behind_another_thing_is_not_seen(system, meshes):
     scene.update(camera.frame(view(20, elevation=65.0)))
     tracks = {track.result.most_like: track for track in scene._tracks}
     box, can = (
-        tracks[name].thing.object_frame.centre for name in ("cracker_box", "tomato_soup_can")
+        tracks[name].thing.object_frame.centre
+        for name in ("cracker_box", "tomato_soup_can")
     )
     ground = TableGround.of(scene.tops, scene._tracks)
     away = (box - can)[:2] / np.linalg.norm((box - can)[:2])
@@ -126,7 +143,10 @@ def test_what_stands_behind_another_thing_is_not_seen(system, meshes):
     assert ground.share_visible(behind_the_box, tracks["tomato_soup_can"]) < 0.5
 
 
-def test_a_thing_floats_unless_it_stands_on_the_plane_or_on_another_object(system, meshes):
+def test_a_thing_floats_unless_it_stands_on_the_plane_or_on_another_object(
+    system,
+    meshes,
+):
     camera = camera_over([meshes["mug"]])
     top = TableTop.of(camera.frame(view(20)), UP)
     whole = max(top.segments(), key=np.count_nonzero)
@@ -138,7 +158,11 @@ def test_a_thing_floats_unless_it_stands_on_the_plane_or_on_another_object(syste
     lower = replace(top.plane, offset=top.plane.offset + 0.05)
     assert floating([mug], lower) == [True]
     assert replace(mug, result=replace(mug.result, confident=True)).confident
-    assert not replace(mug, floats=True, result=replace(mug.result, confident=True)).confident
+    assert not replace(
+        mug,
+        floats=True,
+        result=replace(mug.result, confident=True),
+    ).confident
 
     scan = mug.posed.vertices @ mug.posed.pose[:3, :3].T + mug.posed.pose[:3, 3]
     middle = scan.mean(0) * (1, 1, 0)

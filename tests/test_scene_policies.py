@@ -25,7 +25,14 @@ from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, EntryError, PredictionsError
 from nextview.geometry.observation import SceneView
 from nextview.policies.base import EpisodeState, Evidence
-from nextview.policies.gain import INPUTS, VISIBILITY, Gain, features, mirrored, mirrored_features
+from nextview.policies.gain import (
+    INPUTS,
+    VISIBILITY,
+    Gain,
+    features,
+    mirrored,
+    mirrored_features,
+)
 from nextview.policies.registry import make_policy
 from nextview.recognition.belief import FixedLength
 from nextview.sensing.expected_visibility import SeenScene, expected_visibility
@@ -54,7 +61,10 @@ def looks(scene, *views: int) -> list[SceneView]:
 
 def state_of(visibility, belief=None, reachable=None) -> EpisodeState:
     """One episode after view 0."""
-    belief, bins = np.full((1, 10), 0.1) if belief is None else belief, np.full((1, 10, 8), 1 / 8)
+    belief, bins = (
+        np.full((1, 10), 0.1) if belief is None else belief,
+        np.full((1, 10, 8), 1 / 8),
+    )
     evidence = Evidence(np.log(belief), {"lem-sphere": np.zeros((1, 5, 8))}, bins)
     share = np.asarray(visibility, float).reshape(1, 40)
     known = {"azimuth_bins": bins, "reachable": reachable, "visibility": share}
@@ -66,7 +76,9 @@ def state_of(visibility, belief=None, reachable=None) -> EpisodeState:
 
 def test_a_box_hides_what_is_behind_it_as_far_as_a_camera_without_errors_says():
     scene = scene_of(BEFORE)
-    truth = np.array([OccludedCamera(scene, 64).visible_share(pose) for pose in GRID.poses])
+    truth = np.array(
+        [OccludedCamera(scene, 64).visible_share(pose) for pose in GRID.poses]
+    )
     found = expected_visibility(SeenScene.of(looks(scene, 2, 4, 14, 22, 30)), POSITIONS)
     assert found.expected[0] < 0.1
     assert found.expected[4] > 0.85
@@ -79,7 +91,8 @@ def test_a_box_hides_what_is_behind_it_as_far_as_a_camera_without_errors_says():
 def test_the_denser_unseen_space_is_taken_to_be_the_less_shows():
     seen = SeenScene.of(looks(scene_of(BEFORE), 12))
     shares = [
-        expected_visibility(seen, POSITIONS, density).expected for density in (0, 0.2, 1, 1000)
+        expected_visibility(seen, POSITIONS, density).expected
+        for density in (0, 0.2, 1, 1000)
     ]
     for more, less in pairwise(shares):
         assert (less <= more + 1e-12).all()
@@ -101,7 +114,10 @@ def test_visibility_goes_where_most_shows_and_may_go():
     near = make_policy("visibility@10", GRID).next_views(state_of(share), rng)[0]
     assert GRID.travel[0, near] == 1
     # by chance
-    assert len({int(policy.next_views(state_of(np.ones(40)), rng)[0]) for _ in range(50)}) > 10
+    assert (
+        len({int(policy.next_views(state_of(np.ones(40)), rng)[0]) for _ in range(50)})
+        > 10
+    )
 
 
 def test_the_product_goes_where_gain_goes_if_everything_shows():
@@ -113,7 +129,10 @@ def test_the_product_goes_where_gain_goes_if_everything_shows():
     assert product.travel_weight == gain.travel_weight
     for _ in range(20):
         state = state_of(np.ones(40), rng.dirichlet(np.ones(10), 1))
-        np.testing.assert_array_equal(product.next_views(state, rng), gain.next_views(state, rng))
+        np.testing.assert_array_equal(
+            product.next_views(state, rng),
+            gain.next_views(state, rng),
+        )
     assert set(product.needs) == {*gain.needs, "visibility"}
 
 
@@ -135,14 +154,22 @@ def test_the_product_shuns_what_is_hidden():
 def test_what_shows_is_told_to_networks_cell_by_cell(frame):
     rng = np.random.default_rng(0)
     state = replace(state_of(rng.random(40)), current=np.array([11]))
-    whole = features(GRID, state, (*INPUTS[:3], "lem-sphere", "azimuth_bin", VISIBILITY), frame)
+    whole = features(
+        GRID,
+        state,
+        (*INPUTS[:3], "lem-sphere", "azimuth_bin", VISIBILITY),
+        frame,
+    )
     without = features(GRID, state, (*INPUTS[:3], "lem-sphere", "azimuth_bin"), frame)
     np.testing.assert_array_equal(whole[:, :-40], without)
     alone = features(GRID, state, (VISIBILITY,), "camera")[0]
     assert alone[8] == state.visibility[0, 11]  # straight ahead on its own ring
     assert alone[9] == state.visibility[0, 12]
     np.testing.assert_array_equal(np.sort(alone), np.sort(state.visibility[0]))
-    np.testing.assert_array_equal(mirrored_features(GRID, 10, (VISIBILITY,)), mirrored(GRID))
+    np.testing.assert_array_equal(
+        mirrored_features(GRID, 10, (VISIBILITY,)),
+        mirrored(GRID),
+    )
     policy = Gain(GRID, 10, lambda seen: seen, (VISIBILITY,))
     assert policy.needs == (VISIBILITY,)
     np.testing.assert_allclose(policy.gains(state), state.visibility, atol=1e-6)
@@ -163,7 +190,9 @@ class FirstFree:
         pass
 
     def next_views(self, state, rng):
-        assert all(seen.scene is not None for views in state.observations for seen in views)
+        assert all(
+            seen.scene is not None for views in state.observations for seen in views
+        )
         return state.free.argmax(1)
 
 
@@ -180,13 +209,15 @@ def test_what_is_expected_in_a_store_is_what_its_frames_say(cluttered_views):
     found = sight.visibility(np.array([2, 2, 2]), visited)
     scene = scene_views(opened, 3)
     expected = expected_visibility(
-        SeenScene.of([scene.scene_view(3), scene.scene_view(17)]), POSITIONS
+        SeenScene.of([scene.scene_view(3), scene.scene_view(17)]),
+        POSITIONS,
     ).expected
     np.testing.assert_allclose(found[0], expected, atol=1e-6)
     np.testing.assert_array_equal(found[0], found[2])
     assert not np.allclose(found[0], found[1])
     np.testing.assert_array_equal(
-        sight.of_scenes(np.array([2, 0])).visibility(np.array([0]), visited[:1]), found[:1]
+        sight.of_scenes(np.array([2, 0])).visibility(np.array([0]), visited[:1]),
+        found[:1],
     )
     with pytest.raises(DatasetError, match="holds no scene"):
         SceneSight.of(opened, ["nothing@light-0"])
@@ -235,32 +266,55 @@ def test_gain_learns_in_scenes_what_to_make_of_what_shows(predictions, tmp_path)
     train = np.array(["train"] * len(predictions))
     replace(predictions, splits=train).save(tmp_path / "p.npz")
     recipe = GainRecipe(
-        ("belief", "place", "visibility"), "camera", epochs=1, episodes=1, networks_per_fold=1
+        ("belief", "place", "visibility"),
+        "camera",
+        epochs=1,
+        episodes=1,
+        networks_per_fold=1,
     )
     made = train_gain(
-        tmp_path / "p.npz", tmp_path / "in-scenes.json", recipe=recipe, folds=2, travel_weight=0.01
+        tmp_path / "p.npz",
+        tmp_path / "in-scenes.json",
+        recipe=recipe,
+        folds=2,
+        travel_weight=0.01,
     )
     assert made.objects == len(predictions)
-    assert make_policy(str(made.card), GRID, classes=predictions.classes).needs == ("visibility",)
+    assert make_policy(str(made.card), GRID, classes=predictions.classes).needs == (
+        "visibility",
+    )
     specs = make_specs(predictions, 1, 0)
     assert specs.scenes.reachable[
-        specs.objects[:, None], replay(str(made.card), specs, 4, 0).views
+        specs.objects[:, None],
+        replay(str(made.card), specs, 4, 0).views,
     ].all()
     replace(some_predictions(), splits=train).save(tmp_path / "alone.npz")
     with pytest.raises(PredictionsError, match="contains no scenes"):
-        train_gain(tmp_path / "alone.npz", tmp_path / "alone.json", recipe=recipe, folds=2)
+        train_gain(
+            tmp_path / "alone.npz",
+            tmp_path / "alone.json",
+            recipe=recipe,
+            folds=2,
+        )
 
 
 # Replay
 
 
-def test_scenes_without_their_store_are_not_taken_for_single_objects(predictions, tmp_path):
+def test_scenes_without_their_store_are_not_taken_for_single_objects(
+    predictions,
+    tmp_path,
+):
     lost = replace(predictions, store=str(tmp_path / "lost.zarr"))
     with pytest.raises(
-        DatasetError, match=r"of scenes, and there is no view store at .*lost.zarr any more"
+        DatasetError,
+        match=r"of scenes, and there is no view store at .*lost.zarr any more",
     ):
         make_specs(lost, 1, 0)
-    with pytest.raises(DatasetError, match="are of scenes, and name no view store; predict again"):
+    with pytest.raises(
+        DatasetError,
+        match="are of scenes, and name no view store; predict again",
+    ):
         make_specs(replace(predictions, store=""), 1, 0)
     alone = replace(lost, names=tuple(f"thing_{i}" for i in range(len(lost))))
     assert make_specs(alone, 1, 0).scenes is None
@@ -271,10 +325,14 @@ def test_scenes_around_one_target_are_drawn_together():
     weights = target_weights(names, 200, np.random.default_rng(0))
     for same in (2, 4):
         np.testing.assert_array_equal(weights[:, 0], weights[:, same])
-    np.testing.assert_array_equal(weights[:, [0, 1, 3]].sum(1), 3)  # as many targets as there are
+    np.testing.assert_array_equal(
+        weights[:, [0, 1, 3]].sum(1),
+        3,
+    )  # as many targets as there are
     plain = statistics.resample(5, 200, np.random.default_rng(0))
     np.testing.assert_array_equal(
-        target_weights(tuple("abcde"), 200, np.random.default_rng(0)), plain
+        target_weights(tuple("abcde"), 200, np.random.default_rng(0)),
+        plain,
     )
 
 
@@ -285,9 +343,14 @@ def test_what_the_script_judges_is_what_replay_believes(predictions):
     found = SCRIPT["Believed"].of(predictions, specs.objects, path.views)
     np.testing.assert_allclose(found.confidence, path.confidences, rtol=1e-6)
     sure = found.confidence > 0.11  # else all classes are alike
-    np.testing.assert_array_equal(found.right[sure], (path.answers == specs.labels[:, None])[sure])
+    np.testing.assert_array_equal(
+        found.right[sure],
+        (path.answers == specs.labels[:, None])[sure],
+    )
     np.testing.assert_allclose(
-        found.loss[found.right], -np.log(found.confidence[found.right]), rtol=1e-6
+        found.loss[found.right],
+        -np.log(found.confidence[found.right]),
+        rtol=1e-6,
     )
     assert (found.loss[~found.right] >= np.log(2)).all()
 
@@ -299,7 +362,9 @@ def test_what_the_script_judges_is_what_replay_believes(predictions):
 def test_a_robot_sees_around_a_box(named):
     crate = meshed(box([1, 1.2, 0.9]))
     scene = scene_of(Block(1.9, 0.0, 0.0, 0.3, 1.1, 1.6), target=crate)
-    truth = np.array([OccludedCamera(scene, 64).visible_share(pose) for pose in GRID.poses])
+    truth = np.array(
+        [OccludedCamera(scene, 64).visible_share(pose) for pose in GRID.poses]
+    )
     assert truth[0] < 0.6 < truth[3]
     camera = RobotCamera(scene, named=named)
     system = nextview.load(policy="visibility")

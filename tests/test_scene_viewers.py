@@ -48,7 +48,9 @@ def made(camera, tmp_path_factory):
 def rows_of(path) -> dict:
     """What a recording holds, by entity, component and frame."""
     rows = {}
-    for chunk in sorted(RrdReader(path).stream().to_chunks(), key=lambda chunk: str(chunk.id)):
+    for chunk in sorted(
+        RrdReader(path).stream().to_chunks(), key=lambda chunk: str(chunk.id)
+    ):
         if chunk.is_static:
             continue
         batch = chunk.to_record_batch().to_pydict()
@@ -74,12 +76,19 @@ def test_a_recording_has_things_and_cameras_where_they_are(made, camera):
         for frame in (1, 2, 3):
             key = (f"world/objects/{before[name]}", "Mesh3D:vertex_positions", frame)
             assert off(rows[key], camera, name) < 0.004
-        beliefs = [rows[f"belief/{before[name]}\\ {name}", "Scalars:scalars", k] for k in (1, 2, 3)]
+        beliefs = [
+            rows[f"belief/{before[name]}\\ {name}", "Scalars:scalars", k]
+            for k in (1, 2, 3)
+        ]
         (thing,) = (one for one in scene.objects if one.name == name)
         assert beliefs[-1] == pytest.approx([thing.confidence])
     for number, frame in enumerate(scene.frames, 1):
         where = rows[f"world/cameras/{number}", "Transform3D:translation", number]
-        np.testing.assert_allclose(np.ravel(where), frame.camera_to_world[:3, 3], atol=1e-6)
+        np.testing.assert_allclose(
+            np.ravel(where),
+            frame.camera_to_world[:3, 3],
+            atol=1e-6,
+        )
     assert (f"world/objects/{before['banana']}", "Clear:is_recursive", 3) in rows
 
 
@@ -89,7 +98,9 @@ def test_a_finished_scene_can_be_recorded(made, tmp_path, camera):
     rows = rows_of(tmp_path / "end.rrd")
     key = (f"world/objects/{before['mug']}", "Mesh3D:vertex_positions", 3)
     assert off(rows[key], camera, "mug") < 0.004
-    assert {frame for entity, _, frame in rows if entity.startswith("world/cameras/")} == {1, 2, 3}
+    assert {
+        frame for entity, _, frame in rows if entity.startswith("world/cameras/")
+    } == {1, 2, 3}
 
 
 def test_a_page_has_things_and_cameras_where_they_are(made, camera):
@@ -102,7 +113,11 @@ def test_a_page_has_things_and_cameras_where_they_are(made, camera):
             assert off(handle.vertices, camera, name) < 0.004
         for number, frame in enumerate(scene.frames, 1):
             handle = server.scene.get_handle_by_name(f"/cameras/{number}")
-            np.testing.assert_allclose(handle.position, frame.camera_to_world[:3, 3], atol=1e-6)
+            np.testing.assert_allclose(
+                handle.position,
+                frame.camera_to_world[:3, 3],
+                atol=1e-6,
+            )
         assert server.scene.get_handle_by_name(f"/objects/{before['banana']}") is None
     finally:
         server.stop()

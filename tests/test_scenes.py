@@ -53,11 +53,17 @@ def test_a_wall_before_one_half_hides_exactly_half():
     camera = OccludedCamera(scene_of(Block(1.6, 1.5, 0.0, 0.1, 3.0, 3.0)), 112)
     assert camera.visible_share(FRONT) == pytest.approx(0.5, abs=0.005)
     assert camera.visible_share(GRID.poses[4]) == 1  # from behind
-    seen = camera.observe(FRONT)  # x to the right in the picture is +y: looking along -x with z up
+    seen = camera.observe(
+        FRONT
+    )  # x to the right in the picture is +y: looking along -x with z up
     columns = np.flatnonzero(seen.depth.any(0))
     assert columns.max() < 56 or columns.min() >= 56
     np.testing.assert_array_equal(seen.depth > 0, seen.picture > 0)
-    assert not OccludedCamera(scene_of(Block(1.5, 0.0, 0.0, 0.2, 2.5, 2.5))).observe(FRONT).seen
+    assert (
+        not OccludedCamera(scene_of(Block(1.5, 0.0, 0.0, 0.2, 2.5, 2.5)))
+        .observe(FRONT)
+        .seen
+    )
 
 
 def test_every_pixel_has_its_owner():
@@ -65,19 +71,36 @@ def test_every_pixel_has_its_owner():
     k, pose = np.array([[40.0, 0, 40], [0, 40, 40], [0, 0, 1]]), GRID.poses[24]
     depth, owner = SceneCamera(scene, k, (80, 80)).look(pose)
     row, column = np.mgrid[:80, :80]
-    rays = np.stack([(column + 0.5 - 40) / 40, (row + 0.5 - 40) / 40, np.ones((80, 80))], -1)
+    rays = np.stack(
+        [(column + 0.5 - 40) / 40, (row + 0.5 - 40) / 40, np.ones((80, 80))],
+        -1,
+    )
     places = (depth[..., None] * rays) @ pose[:3, :3].T + pose[:3, 3]
-    np.testing.assert_allclose(np.linalg.norm(places[owner == SHOWS_TARGET], axis=-1), 1, atol=0.01)
+    np.testing.assert_allclose(
+        np.linalg.norm(places[owner == SHOWS_TARGET], axis=-1),
+        1,
+        atol=0.01,
+    )
     np.testing.assert_allclose(places[owner == SHOWS_TABLE][:, 2], -1, atol=1e-4)
     assert np.abs(places[owner == SHOWS_TABLE][:, :2]).max() <= SCENE_TABLE + 1e-4
-    assert (np.linalg.norm(places[owner == SHOWS_OTHER][:, :2] - (0, 2), axis=1) < 0.36).all()
-    assert {*np.unique(owner)} == {SHOWS_NOTHING, SHOWS_TARGET, SHOWS_OTHER, SHOWS_TABLE}
+    assert (
+        np.linalg.norm(places[owner == SHOWS_OTHER][:, :2] - (0, 2), axis=1) < 0.36
+    ).all()
+    assert {*np.unique(owner)} == {
+        SHOWS_NOTHING,
+        SHOWS_TARGET,
+        SHOWS_OTHER,
+        SHOWS_TABLE,
+    }
     np.testing.assert_array_equal(depth == 0, owner == SHOWS_NOTHING)
 
 
 def test_shares_are_those_of_another_ray_caster(cluttered, furniture):
     path = sorted(cluttered.rglob("*heavy*.json"))[0]
-    layout, k = SceneLayout.load(path), np.array([[60.0, 0, 32], [0, 60.0, 32], [0, 0, 1]])
+    layout, k = (
+        SceneLayout.load(path),
+        np.array([[60.0, 0, 32], [0, 60.0, 32], [0, 0, 1]]),
+    )
     scene = build_scene(layout, furniture)
     things = [
         trimesh.Trimesh(item.vertices, item.faces, process=False)
@@ -87,7 +110,8 @@ def test_shares_are_those_of_another_ray_caster(cluttered, furniture):
         _, alone = pipeline.cast(things[:1], GRID.poses[view], k, (64, 64))
         _, among = pipeline.cast(things, GRID.poses[view], k, (64, 64))
         assert layout.visible[view] == pytest.approx(
-            (among == 0).sum() / (alone == 0).sum(), abs=0.03
+            (among == 0).sum() / (alone == 0).sum(),
+            abs=0.03,
         )
 
 
@@ -117,7 +141,10 @@ def test_drawn_scenes_stand_on_their_table_and_never_overlap(cluttered, furnitur
         for item in scene.items:
             assert item.vertices[:, 2].min() == pytest.approx(scene.floor, abs=1e-12)
             assert np.abs(item.footprint).max() <= SCENE_TABLE
-        outlines = [footprint(scene.target.vertices), *(item.footprint for item in scene.items)]
+        outlines = [
+            footprint(scene.target.vertices),
+            *(item.footprint for item in scene.items),
+        ]
         for a, b in combinations(outlines, 2):
             assert not Outline(a).intersects_path(Outline(b), filled=True)
         assert (
@@ -125,7 +152,9 @@ def test_drawn_scenes_stand_on_their_table_and_never_overlap(cluttered, furnitur
             < SPREAD + VISIBLE_TOLERANCE + 0.03
         )
         split = path.parent.name
-        assert all(f"/{split}/" in placed.mesh for placed in (layout.target, *layout.objects))
+        assert all(
+            f"/{split}/" in placed.mesh for placed in (layout.target, *layout.objects)
+        )
         assert layout.target.mesh not in [placed.mesh for placed in layout.objects]
 
 
@@ -139,12 +168,18 @@ def test_cameras_reach_no_place_in_things_behind_walls_or_below_the_table():
     assert not there[2]
     assert not there[10]  # above it, but behind it
     assert there[[0, 4, 6, 14]].all()
-    assert scene_of(Block(0.0, 1.5, 0.0, 2.0, 0.1, 0.5)).reachable(GRID.poses[:, :3, 3]).all()
+    assert (
+        scene_of(Block(0.0, 1.5, 0.0, 2.0, 0.1, 0.5))
+        .reachable(GRID.poses[:, :3, 3])
+        .all()
+    )
     below = look_at_origin(np.radians([-10.0, -30.0]), 0.0)[:, :3, 3]
     # 0.48 above, 0.5 below
     np.testing.assert_array_equal(scene_of().reachable(below), [True, False])
     np.testing.assert_allclose(
-        inside.clearance(np.array([[3.0, 2.3, 0.0], [3.0, 0.0, 2.0]])), [1.0, 1.5], atol=0.01
+        inside.clearance(np.array([[3.0, 2.3, 0.0], [3.0, 0.0, 2.0]])),
+        [1.0, 1.5],
+        atol=0.01,
     )
 
 
@@ -154,10 +189,14 @@ def test_cameras_reach_no_place_in_things_behind_walls_or_below_the_table():
 def test_the_same_seed_draws_the_same_bytes(cluttered, furniture, tmp_path):
     files = sorted(path.relative_to(cluttered) for path in cluttered.rglob("*.json"))
     list(draw_scenes(furniture, tmp_path / "again", ["light"], 1, 3, workers=0))
-    again = sorted(path.relative_to(tmp_path / "again") for path in tmp_path.rglob("*.json"))
+    again = sorted(
+        path.relative_to(tmp_path / "again") for path in tmp_path.rglob("*.json")
+    )
     assert again == [file for file in files if "@light-" in file.name]
     for file in again:
-        assert (tmp_path / "again" / file).read_bytes() == (cluttered / file).read_bytes()
+        assert (tmp_path / "again" / file).read_bytes() == (
+            cluttered / file
+        ).read_bytes()
     with pytest.raises(DatasetError, match="another seed"):
         list(draw_scenes(furniture, tmp_path / "again", ["light"], 1, 4, workers=0))
 
@@ -165,9 +204,15 @@ def test_the_same_seed_draws_the_same_bytes(cluttered, furniture, tmp_path):
 # The store
 
 
-def test_a_store_of_scenes_holds_what_shows_and_the_scene(cluttered_views, cluttered, furniture):
+def test_a_store_of_scenes_holds_what_shows_and_the_scene(
+    cluttered_views,
+    cluttered,
+    furniture,
+):
     opened = ViewStore.open(cluttered_views)
-    assert sorted(opened.names) == sorted(path.stem for path in cluttered.rglob("*.json"))
+    assert sorted(opened.names) == sorted(
+        path.stem for path in cluttered.rglob("*.json")
+    )
     assert sorted(set(opened.splits)) == ["test", "train"]
     assert not [wrong for _, wrong in check(cluttered_views, workers=0) if wrong]
     i = opened.names.index(next(name for name in opened.names if "@heavy-" in name))
@@ -175,13 +220,24 @@ def test_a_store_of_scenes_holds_what_shows_and_the_scene(cluttered_views, clutt
     views, scene = scene_views(opened, i), build_scene(layout, furniture)
     assert views.visible_share == pytest.approx(np.array(layout.visible), abs=1e-4)
     assert np.flatnonzero(~views.reachable).tolist() == list(layout.unreachable)
-    np.testing.assert_allclose(views.clearance, scene.clearance(GRID.poses[:, :3, 3]), rtol=1e-6)
-    alone = [SimulatedCamera(scene.target, 48).observe(pose).visible for pose in GRID.poses]
+    np.testing.assert_allclose(
+        views.clearance,
+        scene.clearance(GRID.poses[:, :3, 3]),
+        rtol=1e-6,
+    )
+    alone = [
+        SimulatedCamera(scene.target, 48).observe(pose).visible for pose in GRID.poses
+    ]
     shown = np.count_nonzero(opened.depth(i), axis=(1, 2)) / alone
     assert shown == pytest.approx(views.visible_share, abs=0.05)
     # The same object fills the same part of both pictures.
-    wide = np.count_nonzero(views.owner == SHOWS_TARGET, axis=(1, 2)) / views.intrinsics[0, 0] ** 2
-    narrow = np.count_nonzero(opened.depth(i), axis=(1, 2)) / opened.intrinsics[0, 0] ** 2
+    wide = (
+        np.count_nonzero(views.owner == SHOWS_TARGET, axis=(1, 2))
+        / views.intrinsics[0, 0] ** 2
+    )
+    narrow = (
+        np.count_nonzero(opened.depth(i), axis=(1, 2)) / opened.intrinsics[0, 0] ** 2
+    )
     assert wide == pytest.approx(narrow, abs=0.1 * narrow.max())
 
 
@@ -192,7 +248,9 @@ def test_a_store_of_scenes_holds_what_shows_and_the_scene(cluttered_views, clutt
 def test_a_robot_sees_the_target_that_it_was_told_of(named):
     crate = pipeline.meshed(pipeline.box([1, 1.2, 0.9]))
     scene = scene_of(
-        Block(-1.9, 0.4, 0.2, 0.6, 0.6, 0.9), Block(0.5, 1.6, 0.5, 0.5, 0.4, 0.7), target=crate
+        Block(-1.9, 0.4, 0.2, 0.6, 0.6, 0.9),
+        Block(0.5, 1.6, 0.5, 0.5, 0.4, 0.7),
+        target=crate,
     )
     camera = RobotCamera(scene, named=named)
     frame = camera.observe(GRID.poses[16])

@@ -18,7 +18,14 @@ from nextview.data.samples import sample_mesh
 from nextview.errors import ObservationError
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.recognition.inference import NetworkRecogniser
-from nextview.sensing import Box, Frame, ObjectFrame, ObservedObject, check_observation, check_views
+from nextview.sensing import (
+    Box,
+    Frame,
+    ObjectFrame,
+    ObservedObject,
+    check_observation,
+    check_views,
+)
 from nextview.sensing.facets import fit_facets, look_again, virtual_pose
 from nextview.sensing.plausibility import check_frame, refuse_far
 
@@ -51,13 +58,17 @@ def overlap(depth, other) -> float:
 def assert_found(thing, mesh, centre, radius):
     """The object's frame is that of the mesh, up to shares of its radius."""
     true = true_frame(mesh)
-    assert np.linalg.norm(thing.object_frame.centre - true.centre) < centre * true.radius
+    assert (
+        np.linalg.norm(thing.object_frame.centre - true.centre) < centre * true.radius
+    )
     assert thing.object_frame.radius == pytest.approx(true.radius, rel=radius)
 
 
 def rendered(mesh, frame_: ObjectFrame, pose) -> Observation:
     """What a camera sees of the mesh alone, level, from three true radii."""
-    return SimulatedCamera(meshed(mesh)).observe(virtual_pose(frame_.pose_in_object(pose)))
+    return SimulatedCamera(meshed(mesh)).observe(
+        virtual_pose(frame_.pose_in_object(pose))
+    )
 
 
 def test_what_was_found_in_part_from_above_is_found_whole_in_the_same_place():
@@ -75,7 +86,10 @@ def test_what_was_found_in_part_from_above_is_found_whole_in_the_same_place():
 # The virtual view
 
 
-@pytest.mark.parametrize(("elevation", "azimuth"), [(0, 0), (20, 100), (72, 300), (-15, 40)])
+@pytest.mark.parametrize(
+    ("elevation", "azimuth"),
+    [(0, 0), (20, 100), (72, 300), (-15, 40)],
+)
 def test_the_virtual_pose_is_that_of_the_view_sphere(elevation, azimuth):
     pose = pose_at(elevation, azimuth, 5.0, turn=(4, -5, 30))
     expected = look_at_origin(np.radians(elevation), np.radians(azimuth))
@@ -140,7 +154,9 @@ def test_things_that_touch_or_nearly_touch_are_two(gap):
     """The boxes are turned, so that they meet in a concave edge."""
     turn = trimesh.transformations.rotation_matrix(np.radians(45), (0, 0, 1))
     one = box((0.1, 0.1, 0.12), (0, 0, 0.06)).apply_transform(turn)
-    other = box((0.12, 0.12, 0.08), (0, 0.0707 + 0.0849 + gap, 0.04)).apply_transform(np.eye(4))
+    other = box((0.12, 0.12, 0.08), (0, 0.0707 + 0.0849 + gap, 0.04)).apply_transform(
+        np.eye(4)
+    )
     other.apply_translation((0, 0.06 - 0.0849, 0))
     thing = ObservedObject(point=(0, 0, 0.1))
     for k, azimuth in enumerate((0, 30, -20)):
@@ -149,7 +165,10 @@ def test_things_that_touch_or_nearly_touch_are_two(gap):
 
 
 def test_what_touches_an_object_is_a_part_of_it_where_that_is_much_less_novel():
-    one, other = box((0.1, 0.1, 0.12), (0, 0, 0.06)), box((0.12, 0.12, 0.08), (0, 0.11, 0.04))
+    one, other = (
+        box((0.1, 0.1, 0.12), (0, 0, 0.06)),
+        box((0.12, 0.12, 0.08), (0, 0.11, 0.04)),
+    )
     thing = ObservedObject(point=(0, 0, 0.1))
     for k, azimuth in enumerate((60, 100, 20)):
         thing.add(frame([TABLE, one, other], pose_at(35, azimuth, 0.7), seed=k))
@@ -158,7 +177,9 @@ def test_what_touches_an_object_is_a_part_of_it_where_that_is_much_less_novel():
     def by_radius(weight):
         return lambda seen: weight * seen[-1].radius / apart
 
-    thing.reconsider(by_radius(-1))  # 1 is too little: the joint radius is less than twice as large
+    thing.reconsider(
+        by_radius(-1)
+    )  # 1 is too little: the joint radius is less than twice as large
     assert thing.object_frame.radius == apart
     thing.reconsider(by_radius(-9))
     assert thing.object_frame.radius > 1.3 * apart
@@ -177,14 +198,19 @@ def test_a_frame_that_shows_next_to_nothing_says_nothing_of_the_size():
         )
         thing.add(
             replace(
-                frame([TABLE, one], pose_at(35, azimuth, 0.7), seed=k), mask=mask, pixel_centre=0.5
+                frame([TABLE, one], pose_at(35, azimuth, 0.7), seed=k),
+                mask=mask,
+                pixel_centre=0.5,
             )
         )
         assert_found(thing, one, 0.05, 0.05)
 
 
 def test_things_of_which_only_the_tops_show_are_two():
-    one, other = box((0.12, 0.12, 0.06), (0, 0, 0.03)), box((0.12, 0.16, 0.14), (0.125, 0, 0.07))
+    one, other = (
+        box((0.12, 0.12, 0.06), (0, 0, 0.03)),
+        box((0.12, 0.16, 0.14), (0.125, 0, 0.07)),
+    )
     thing = ObservedObject(point=(0, 0, 0.05))
     thing.add(frame([TABLE, one, other], pose_at(88, 0, 0.7, (0.06, 0, 0)), seed=0))
     _, seen = cast([TABLE, one, other], pose_at(88, 0, 0.7, (0.06, 0, 0)))
@@ -213,8 +239,14 @@ def test_a_narrow_strip_of_what_is_behind_belongs_to_it(wider):
 @pytest.mark.parametrize("parts", ["handle", "back", "bowl"])
 def test_concave_edges_within_one_thing_do_not_cut_it(parts):
     made = {
-        "handle": [box((0.1, 0.1, 0.14), (0, 0, 0.07)), box((0.02, 0.06, 0.06), (0, 0.08, 0.08))],
-        "back": [box((0.16, 0.16, 0.08), (0, 0, 0.04)), box((0.03, 0.16, 0.12), (-0.065, 0, 0.14))],
+        "handle": [
+            box((0.1, 0.1, 0.14), (0, 0, 0.07)),
+            box((0.02, 0.06, 0.06), (0, 0.08, 0.08)),
+        ],
+        "back": [
+            box((0.16, 0.16, 0.08), (0, 0, 0.04)),
+            box((0.03, 0.16, 0.12), (-0.065, 0, 0.14)),
+        ],
         "bowl": [
             box((0.2, 0.2, 0.012), (0, 0, 0.006)),
             *(box((0.02, 0.2, 0.08), (x, 0, 0.04)) for x in (-0.09, 0.09)),
@@ -260,7 +292,11 @@ def test_the_object_frame_gets_better_and_earlier_views_with_it():
     assert latest is second
     assert not np.array_equal(anew.depth, first.depth)
     expected = rendered(long, true_frame(long), pose_at(4, 0, 0.8, (0, 0, 0.06)))
-    assert overlap(anew.depth, expected.depth) > 0.85 > overlap(first.depth, expected.depth)
+    assert (
+        overlap(anew.depth, expected.depth)
+        > 0.85
+        > overlap(first.depth, expected.depth)
+    )
 
 
 def test_two_parts_seen_apart_become_one_object_once_the_bridge_is_seen():
@@ -273,7 +309,9 @@ def test_two_parts_seen_apart_become_one_object_once_the_bridge_is_seen():
     thing.add(frame([TABLE, *arch], pose_at(30, 40, 0.8, (0, 0, 0.1)), seed=2))
     assert thing.object_frame.centre[1] == pytest.approx(0, abs=0.02)
     _, columns = np.nonzero(thing.observations[0].depth)
-    assert np.ptp(columns) > 120  # both legs are the object's now, in the first frame as well
+    assert (
+        np.ptp(columns) > 120
+    )  # both legs are the object's now, in the first frame as well
     assert thing.revision == 1
 
 
@@ -306,17 +344,27 @@ def test_the_table_is_no_part_of_an_object_where_the_poses_of_an_arm_err(thing, 
         believed = pose.copy()
         believed[:3, :3] = np.linalg.matrix_power(turn, sign) @ pose[:3, :3]
         believed[:3, 3] += sign * np.array([0, 0.003, raised])
-        seen.add(replace(frame([TABLE, made], pose, seed=k), pose=believed, pixel_centre=0.5))
+        seen.add(
+            replace(frame([TABLE, made], pose, seed=k), pose=believed, pixel_centre=0.5)
+        )
 
         plane = seen.sightings[-1].plane
-        on_table = np.linalg.inv(pose) @ [0.2, -0.1, 0, 1]  # a point of it, as the camera sees it
+        on_table = np.linalg.inv(pose) @ [
+            0.2,
+            -0.1,
+            0,
+            1,
+        ]  # a point of it, as the camera sees it
         stands = seen.sightings[-1].frame.camera_to_world
         assert abs(plane.height((stands @ on_table)[:3])) < 0.002
 
     assert seen.object_frame.radius == pytest.approx(true_frame(made).radius, rel=0.15)
 
 
-@pytest.mark.parametrize(("raised", "warned"), [(0.0, False), (0.08, True), (0.12, True)])
+@pytest.mark.parametrize(
+    ("raised", "warned"),
+    [(0.0, False), (0.08, True), (0.12, True)],
+)
 def test_an_object_that_becomes_another_order_of_size_is_warned_of(raised, warned):
     small = box((0.08, 0.05, 0.06), (0, 0, 0.03))
     thing = ObservedObject()
@@ -358,7 +406,10 @@ def turned(pose, axes):
     ("said", "wrong"),
     {
         "OpenGL": lambda pose: pose @ FLIP,
-        "ROS": lambda pose: turned(pose, np.array([[0, -1.0, 0], [0, 0, -1], [1, 0, 0]])),
+        "ROS": lambda pose: turned(
+            pose,
+            np.array([[0, -1.0, 0], [0, 0, -1], [1, 0, 0]]),
+        ),
         "inverse": np.linalg.inv,
     }.items(),
 )
@@ -366,7 +417,9 @@ def test_a_wrong_first_pose_is_named(said, wrong):
     pose = pose_at(40, 20, 0.7)
     seen = frame([TABLE, WEDGE], pose)
     with pytest.raises(ObservationError, match=said):
-        ObservedObject().add(replace(seen, pose=wrong(pose), axes="opencv", pixel_centre=0.5))
+        ObservedObject().add(
+            replace(seen, pose=wrong(pose), axes="opencv", pixel_centre=0.5)
+        )
 
 
 def in_millimetres(seen) -> Frame:
@@ -377,16 +430,24 @@ def in_millimetres(seen) -> Frame:
 
 
 def test_poses_in_millimetres_are_refused_where_the_target_or_another_frame_tells():
-    first, second = (frame([TABLE, WEDGE], pose_at(40, azimuth, 0.7)) for azimuth in (25, 80))
+    first, second = (
+        frame([TABLE, WEDGE], pose_at(40, azimuth, 0.7)) for azimuth in (25, 80)
+    )
     for target in (
         {"point": (0, 0, 0.1)},
         {"known": true_frame(WEDGE)},
         {"box": Box([-1, -1, 0], [1, 1, 0.2])},
     ):
-        with pytest.raises(ObservationError, match=r"the target is 700 m away.* in millimetres"):
+        with pytest.raises(
+            ObservationError,
+            match=r"the target is 700 m away.* in millimetres",
+        ):
             ObservedObject(**target).add(in_millimetres(first))
     # The camera's height over the table tells, if the world has its origin there.
-    with pytest.raises(ObservationError, match=r"0.45 m in millimetres: the pose is in milli"):
+    with pytest.raises(
+        ObservationError,
+        match=r"0.45 m in millimetres: the pose is in milli",
+    ):
         ObservedObject().add(in_millimetres(first))
 
     thing = ObservedObject()
@@ -398,7 +459,10 @@ def test_poses_in_millimetres_are_refused_where_the_target_or_another_frame_tell
     assert len(thing.observations) == 1
 
 
-@pytest.mark.parametrize(("turns", "said"), [(1, "to the left"), (-1, "to the right"), (2, "head")])
+@pytest.mark.parametrize(
+    ("turns", "said"),
+    [(1, "to the left"), (-1, "to the right"), (2, "head")],
+)
 @pytest.mark.parametrize("azimuth", [20, 110, 200])
 def test_a_picture_that_is_turned_against_its_pose_is_named(turns, said, azimuth):
     pose = pose_at(60, azimuth, 0.7)
@@ -435,7 +499,9 @@ def test_sixteen_bits_in_other_steps_are_refused_with_the_depth_scale(steps):
     alone = ObservedObject()
     alone.add(counted(25, steps))
     assert [warning.name for warning in alone.warnings] == ["unit"]
-    assert f"are the steps of the uint16 depth {steps:g} mm?" in alone.warnings[0].message
+    assert (
+        f"are the steps of the uint16 depth {steps:g} mm?" in alone.warnings[0].message
+    )
     for target in ({}, {"point": (0, 0, 0.1)}):
         thing = ObservedObject(**target)
         thing.add(counted(25, 1))
@@ -465,7 +531,13 @@ def test_an_old_pose_and_a_missing_plane_are_warned_of():
     assert "stale pose" in [warning.name for warning in thing.warnings]
     pose = pose_at(40, 25, 0.7)
     depth, seen = cast([WEDGE, TABLE], pose)
-    alone = Frame(np.where(seen == 0, depth, 0), INTRINSICS, pose, seen == 0, pixel_centre=0.5)
+    alone = Frame(
+        np.where(seen == 0, depth, 0),
+        INTRINSICS,
+        pose,
+        seen == 0,
+        pixel_centre=0.5,
+    )
     thing = ObservedObject()
     thing.add(alone)
     assert [warning.name for warning in thing.warnings] == ["support"]
@@ -475,7 +547,11 @@ def test_an_old_pose_and_a_missing_plane_are_warned_of():
 
 
 def test_the_thin_legs_of_a_thing_that_stands_alone_are_its_own():
-    legs = [box((0.01, 0.01, 0.16), (x, y, 0.08)) for x in (-0.09, 0.09) for y in (-0.09, 0.09)]
+    legs = [
+        box((0.01, 0.01, 0.16), (x, y, 0.08))
+        for x in (-0.09, 0.09)
+        for y in (-0.09, 0.09)
+    ]
     stool = trimesh.util.concatenate([box((0.2, 0.2, 0.02), (0, 0, 0.17)), *legs])
     pose = pose_at(20, 35, 0.7, (0, 0, 0.08))
     _, seen = cast([TABLE, stool], pose)
@@ -496,7 +572,10 @@ def test_a_point_may_lie_on_the_table_itself(height):
         assert thing.warnings == []
 
 
-@pytest.mark.parametrize(("point", "warned"), [((0.2, 0, 0), False), ((0.6, -0.3, 0), True)])
+@pytest.mark.parametrize(
+    ("point", "warned"),
+    [((0.2, 0, 0), False), ((0.6, -0.3, 0), True)],
+)
 def test_a_point_far_from_all_that_is_seen_is_warned_of(point, warned):
     thing = ObservedObject(point=point)
     thing.add(frame([TABLE, WEDGE], pose_at(40, 25, 0.7)))
@@ -563,7 +642,8 @@ def test_what_hid_the_object_shows_nothing_of_it_and_another_side_does(screen, s
         (
             "ros axes",
             lambda o: replace(
-                o, pose=turned(o.pose, np.array([[0, -1.0, 0], [0, 0, -1], [1, 0, 0]]))
+                o,
+                pose=turned(o.pose, np.array([[0, -1.0, 0], [0, 0, -1], [1, 0, 0]])),
             ),
         ),
         ("inverse pose", lambda o: replace(o, pose=np.linalg.inv(o.pose))),
@@ -572,7 +652,10 @@ def test_what_hid_the_object_shows_nothing_of_it_and_another_side_does(screen, s
         ("scale", lambda o: in_metres(o, 0.12)),
         (
             "outside",
-            lambda o: replace(o, pose=turned(o.pose, Rotation.from_euler("y", 1.0).as_matrix())),
+            lambda o: replace(
+                o,
+                pose=turned(o.pose, Rotation.from_euler("y", 1.0).as_matrix()),
+            ),
         ),
     ],
 )
@@ -587,7 +670,8 @@ def test_mistakes_in_observations_are_named(name, wrong):
 
 KINECT = Path(os.environ.get("NEXTVIEW_DATA", ".")) / "real_kinect"
 real = pytest.mark.skipif(
-    not (KINECT / "camera-intrinsics.txt").exists(), reason="NEXTVIEW_DATA has no real_kinect"
+    not (KINECT / "camera-intrinsics.txt").exists(),
+    reason="NEXTVIEW_DATA has no real_kinect",
 )
 UPRIGHT = np.array(
     [
@@ -603,7 +687,10 @@ def kinect(number: int) -> Frame:
     from imageio.v3 import imread  # comes with scikit-image
 
     name = f"frame-{number:06d}"
-    depth, pose = imread(KINECT / f"{name}.depth.png"), np.loadtxt(KINECT / f"{name}.pose.txt")
+    depth, pose = (
+        imread(KINECT / f"{name}.depth.png"),
+        np.loadtxt(KINECT / f"{name}.pose.txt"),
+    )
     return Frame(depth, np.loadtxt(KINECT / "camera-intrinsics.txt"), pose)
 
 
@@ -612,19 +699,32 @@ def test_a_real_chair_is_a_chair():
     """Single frames in which at least half of the chair's box is in the picture."""
     recogniser = NetworkRecogniser()
     grid = np.stack(
-        np.meshgrid(*(np.linspace(*ends, 8) for ends in zip(CHAIR.low, CHAIR.high, strict=True))),
+        np.meshgrid(
+            *(np.linspace(*ends, 8) for ends in zip(CHAIR.low, CHAIR.high, strict=True))
+        ),
         -1,
     )
     answers = []
     for number in range(0, 1000, 20):
         seen = kinect(number)
-        points = (grid.reshape(-1, 3) @ CHAIR.axes - seen.pose[:3, 3]) @ seen.pose[:3, :3]
+        points = (grid.reshape(-1, 3) @ CHAIR.axes - seen.pose[:3, 3]) @ seen.pose[
+            :3,
+            :3,
+        ]
         pixels = points @ seen.intrinsics.T
         column, row = (pixels[:, :2] / pixels[:, 2:]).T
-        inside = (points[:, 2] > 0.1) & (column > 0) & (column < 640) & (row > 0) & (row < 480)
+        inside = (
+            (points[:, 2] > 0.1)
+            & (column > 0)
+            & (column < 640)
+            & (row > 0)
+            & (row < 480)
+        )
         if inside.mean() > 0.5:
             observation = ObservedObject(box=CHAIR).add(seen)
-            answers.append(recogniser.classes[int(recogniser([observation]).logits.argmax())])
+            answers.append(
+                recogniser.classes[int(recogniser([observation]).logits.argmax())]
+            )
     assert len(answers) > 8
     assert np.mean([answer == "chair" for answer in answers]) >= 0.9
 
@@ -676,15 +776,25 @@ class Arm:
 
 def test_the_code_of_the_guide_runs(monkeypatch):
     monkeypatch.chdir(SAMPLE_FILES.parent)
-    blocks = re.findall(r"```python\n(.*?)```", Path("docs/your_camera.md").read_text(), re.S)
+    blocks = re.findall(
+        r"```python\n(.*?)```",
+        Path("docs/your_camera.md").read_text(),
+        re.S,
+    )
     # The first pixel's centre is at 0 there, and the threshold is never reached.
-    names = {"arm": Arm(), "intrinsics": INTRINSICS - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]}
+    names = {
+        "arm": Arm(),
+        "intrinsics": INTRINSICS - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]],
+    }
     exec(blocks[0].replace("load()", "load(threshold=1.0)"), names)
     session = names["session"]
     assert session.done
     assert len(session.views) == 5
     assert len(names["arm"].refused) == 1
-    assert np.linalg.norm(session.object.object_frame.centre - true_frame(WEDGE).centre) < 0.01
+    assert (
+        np.linalg.norm(session.object.object_frame.centre - true_frame(WEDGE).centre)
+        < 0.01
+    )
     simulated = [block for block in blocks if "samples/" in block]
     assert simulated
     for block in simulated:

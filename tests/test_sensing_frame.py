@@ -60,9 +60,15 @@ def two_surfaces():
 def kept(kind):
     """Which pixels are measured."""
     rows, columns = np.mgrid[:120, :160]
-    turned = np.zeros((120, 160), bool)  # a low resolution aligned to a high one, a little turned
+    turned = np.zeros(
+        (120, 160),
+        bool,
+    )  # a low resolution aligned to a high one, a little turned
     y, x = np.mgrid[:60, :80] * 2.25
-    at = np.rint(y + 0.02 * x).astype(int).ravel(), np.rint(x - 0.02 * y + 2).astype(int).ravel()
+    at = (
+        np.rint(y + 0.02 * x).astype(int).ravel(),
+        np.rint(x - 0.02 * y + 2).astype(int).ravel(),
+    )
     inside = (at[0] < 120) & (at[1] >= 0) & (at[1] < 160)
     turned[at[0][inside], at[1][inside]] = True
     return {
@@ -93,7 +99,11 @@ def test_regular_gaps_are_filled_without_making_up_depth(gaps):
     # larger than the gaps
     hole = (np.mgrid[:120, :160] - np.array([20, 20])[:, None, None]).max(0) ** 2 < 100
     measured = kept(gaps) & ~hole
-    depth = Frame(np.where(measured, np.where(where, board, wall), 0), K, pixel_centre=0.5).depth
+    depth = Frame(
+        np.where(measured, np.where(where, board, wall), 0),
+        K,
+        pixel_centre=0.5,
+    ).depth
     inner = np.s_[8:-8, 8:-8]
     assert (depth > 0)[inner][~hole[inner]].mean() > 0.97
     assert not depth[14:27, 14:27].any()
@@ -102,7 +112,10 @@ def test_regular_gaps_are_filled_without_making_up_depth(gaps):
     away = np.ones(where.shape, bool)  # from the edge, where either surface will do
     away[36:95, 46:125] = away[45:86, 55:116] = False
     away[45:86, 55:116] = True
-    np.testing.assert_array_equal(on_board[away & (depth > 0)], where[away & (depth > 0)])
+    np.testing.assert_array_equal(
+        on_board[away & (depth > 0)],
+        where[away & (depth > 0)],
+    )
 
 
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.2, 0.5])
@@ -133,16 +146,24 @@ def test_the_axes_of_a_pose_are_known_by_name():
     }.items():
         pose = POSE.copy()
         pose[:3, :3] = np.stack(columns, 1)
-        np.testing.assert_allclose(Frame(DEPTH, INTRINSICS, pose, axes=axes).pose, POSE, atol=1e-9)
+        np.testing.assert_allclose(
+            Frame(DEPTH, INTRINSICS, pose, axes=axes).pose,
+            POSE,
+            atol=1e-9,
+        )
 
 
 def test_the_first_pixel_may_have_its_centre_at_zero():
     k = INTRINSICS.copy()
     k[:2, 2] -= 0.5
     np.testing.assert_array_equal(
-        Frame(DEPTH, k).intrinsics, Frame(DEPTH, INTRINSICS, pixel_centre=0.5).intrinsics
+        Frame(DEPTH, k).intrinsics,
+        Frame(DEPTH, INTRINSICS, pixel_centre=0.5).intrinsics,
     )
-    np.testing.assert_array_equal(Frame(DEPTH, INTRINSICS, pixel_centre=0.5).intrinsics, INTRINSICS)
+    np.testing.assert_array_equal(
+        Frame(DEPTH, INTRINSICS, pixel_centre=0.5).intrinsics,
+        INTRINSICS,
+    )
 
 
 def test_positions_lie_on_what_is_seen():
@@ -151,7 +172,9 @@ def test_positions_lie_on_what_is_seen():
     rows, columns = np.nonzero(frame.depth)
     np.testing.assert_allclose(frame.positions(rows, columns)[:, 2], 0, atol=1e-5)
     np.testing.assert_allclose(
-        frame.along(np.array([0, 0, 2.0]), 0.5)[frame.depth > 0], 0.5, atol=1e-5
+        frame.along(np.array([0, 0, 2.0]), 0.5)[frame.depth > 0],
+        0.5,
+        atol=1e-5,
     )
 
 
@@ -169,8 +192,12 @@ WRONG = {
     "nothing is seen": {"depth": np.full(SHAPE, np.nan)},
     "transposed, or with a skew": {"intrinsics": INTRINSICS.T},
     "in pixels, not in millimetres": {"intrinsics": np.diag([3.6, 3.6, 1])},
-    "another resolution": {"intrinsics": np.array([[520, 0, 1500], [0, 520, 900], [0, 0, 1.0]])},
-    "intrinsics of another resolution": {"intrinsics": np.diag([0.75, 0.75, 1]) @ INTRINSICS},
+    "another resolution": {
+        "intrinsics": np.array([[520, 0, 1500], [0, 520, 900], [0, 0, 1.0]])
+    },
+    "intrinsics of another resolution": {
+        "intrinsics": np.diag([0.75, 0.75, 1]) @ INTRINSICS
+    },
     "of another resolution": {"intrinsics": np.diag([1.5, 1.5, 1]) @ INTRINSICS},
     "transposed?": {"pose": POSE.T},
     "scaled by 2": {"pose": POSE @ np.diag([2, 2, 2, 1.0])},

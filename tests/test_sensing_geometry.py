@@ -43,7 +43,10 @@ def circle_through(points) -> tuple[np.ndarray, float]:
 
 @given(
     st.lists(
-        st.tuples(st.integers(-20, 20), st.integers(-20, 20)), min_size=2, max_size=12, unique=True
+        st.tuples(st.integers(-20, 20), st.integers(-20, 20)),
+        min_size=2,
+        max_size=12,
+        unique=True,
     )
 )
 def test_the_smallest_circle_is_that_of_brute_force(corners):
@@ -78,7 +81,9 @@ def test_poses_go_to_the_object_frame_and_back():
     # the camera sees the same in either frame, but for the scale
     point = np.array([1.1, -1.9, 0.6])
     seen = pose[:3, :3].T @ (point - pose[:3, 3])
-    again = there[:3, :3].T @ (frame.axes @ (point - frame.centre) / frame.radius - there[:3, 3])
+    again = there[:3, :3].T @ (
+        frame.axes @ (point - frame.centre) / frame.radius - there[:3, 3]
+    )
     np.testing.assert_allclose(again, seen / 0.2, atol=1e-12)
 
 
@@ -87,16 +92,28 @@ def test_poses_go_to_the_object_frame_and_back():
 
 def test_the_plane_is_that_of_least_squares_through_what_lies_on_it():
     points = np.column_stack([rng().uniform(-1, 1, (500, 2)), np.zeros(500)])
-    points[:, 2] = 0.05 * points[:, 0] - 0.02 * points[:, 1] + 0.001 * rng(1).normal(size=500)
+    points[:, 2] = (
+        0.05 * points[:, 0] - 0.02 * points[:, 1] + 0.001 * rng(1).normal(size=500)
+    )
     clutter = rng(2).uniform([-1, -1, 0.05], [1, 1, 0.6], (300, 3))
     order, camera = np.arange(800), np.array([0, 0, 1.0])
-    seen = Samples(np.vstack([points, clutter]), np.full(800, 0.005), order, order, camera)
+    seen = Samples(
+        np.vstack([points, clutter]),
+        np.full(800, 0.005),
+        order,
+        order,
+        camera,
+    )
     plane = find_plane(seen, rng(), UP)
     a, b, c = np.linalg.lstsq(
-        np.column_stack([points[:, :2], np.ones(500)]), points[:, 2], rcond=None
+        np.column_stack([points[:, :2], np.ones(500)]),
+        points[:, 2],
+        rcond=None,
     )[0]
     np.testing.assert_allclose(
-        plane.normal, np.array([-a, -b, 1]) / np.sqrt(a * a + b * b + 1), atol=1e-3
+        plane.normal,
+        np.array([-a, -b, 1]) / np.sqrt(a * a + b * b + 1),
+        atol=1e-3,
     )
     assert plane.offset == pytest.approx(-c, abs=1e-3)
 
@@ -115,7 +132,9 @@ def table_depth():
 def test_noise_is_measured_at_every_depth(sigma):
     depth = table_depth()
     # grows with depth
-    noisy = (1 / (1 / depth + sigma * depth * rng().normal(size=depth.shape))).astype(np.float32)
+    noisy = (1 / (1 / depth + sigma * depth * rng().normal(size=depth.shape))).astype(
+        np.float32
+    )
     noise = estimate_noise(noisy, noisy > 0)
     at = np.quantile(depth, [0.15, 0.5, 0.85])
     np.testing.assert_allclose(noise.at(at), sigma * at, rtol=0.1)
@@ -149,7 +168,9 @@ def test_the_facets_of_a_plane_are_that_plane():
         assert len(facets.planes) == depth.size
         np.testing.assert_allclose(np.median(facets.planes, 0), n, atol=1e-3)
         np.testing.assert_allclose(
-            facets.points[:, 2], depth[facets.rows, facets.columns], rtol=1e-5
+            facets.points[:, 2],
+            depth[facets.rows, facets.columns],
+            rtol=1e-5,
         )
 
 
@@ -161,15 +182,25 @@ def test_smoothing_takes_noise_away_and_leaves_the_edge():
     clean = cast([TABLE, box((0.2, 0.15, 0.1), (0, 0, 0.05))], pose)[0]
     part = slice(90, 390), slice(170, 450)
     sigma = 0.003
-    noisy = np.where(clean > 0, clean + sigma * rng().normal(size=SHAPE), 0).astype(np.float32)
-    facets = fit_facets(noisy[part], clean[part] > 0, INTRINSICS, (part[0].start, part[1].start))
+    noisy = np.where(clean > 0, clean + sigma * rng().normal(size=SHAPE), 0).astype(
+        np.float32
+    )
+    facets = fit_facets(
+        noisy[part],
+        clean[part] > 0,
+        INTRINSICS,
+        (part[0].start, part[1].start),
+    )
     off = (facet_depth(facets) - clean)[part]
     assert np.sqrt(np.mean(off**2)) < sigma / 2.5
     assert (np.abs(off) > 5 * sigma).mean() < 0.002
 
 
 def test_holes_are_filled_but_what_lies_behind_is_not():
-    clean, seen = cast([TABLE, box((0.2, 0.15, 0.1), (0, 0, 0.05))], pose_at(60, 30, 0.7))
+    clean, seen = cast(
+        [TABLE, box((0.2, 0.15, 0.1), (0, 0, 0.05))],
+        pose_at(60, 30, 0.7),
+    )
     holed = np.where(rng().random(SHAPE) < 0.2, 0, clean)
     facets = fit_facets(holed, (holed > 0) & (seen == 1), INTRINSICS)
     filled = facet_depth(facets)
@@ -177,7 +208,9 @@ def test_holes_are_filled_but_what_lies_behind_is_not():
     assert (filled[of_box] > 0).mean() > 0.99
     assert (filled[~of_box & (holed > 0)] == 0).all()
     np.testing.assert_allclose(
-        filled[of_box & (filled > 0)], clean[of_box & (filled > 0)], atol=0.01
+        filled[of_box & (filled > 0)],
+        clean[of_box & (filled > 0)],
+        atol=0.01,
     )
 
 

@@ -28,7 +28,11 @@ def rng(*seed: int) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def plane(sensor: Sensor, distance: float, tilt: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def plane(
+    sensor: Sensor,
+    distance: float,
+    tilt: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
     """A plane that crosses the optical axis at a distance, turned about y by degrees; depth,
     angles of incidence.
     """
@@ -45,19 +49,24 @@ def plane(sensor: Sensor, distance: float, tilt: float = 0.0) -> tuple[np.ndarra
 def nguyen(z: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Nguyen, Izadi, Lovell 2012."""
     return (
-        0.0012 + 0.0019 * (z - 0.4) ** 2 + 0.0001 / np.sqrt(z) * angle**2 / (np.pi / 2 - angle) ** 2
+        0.0012
+        + 0.0019 * (z - 0.4) ** 2
+        + 0.0001 / np.sqrt(z) * angle**2 / (np.pi / 2 - angle) ** 2
     )
 
 
 @pytest.mark.parametrize(
-    ("distance", "tilt"), [(0.6, 0), (1.0, 30), (2.0, 0), (3.0, 60), (1.0, 75)]
+    ("distance", "tilt"),
+    [(0.6, 0), (1.0, 30), (2.0, 0), (3.0, 60), (1.0, 75)],
 )
 @pytest.mark.parametrize("step", [0.0, 1 / 8])
 def test_axial_noise_of_a_kinect_is_the_published_one(distance, tilt, step):
     sensor = replace(SENSORS["none"], axial=1.0, step=step)
     depth, angle = plane(sensor, distance, tilt)
     measured, _ = sensor.measure(depth, rng(1))
-    some = (depth > 0.5 * distance) & (depth < 1.5 * distance) & (angle < np.radians(79))
+    some = (
+        (depth > 0.5 * distance) & (depth < 1.5 * distance) & (angle < np.radians(79))
+    )
     some[:2] = some[-2:] = some[:, :2] = some[:, -2:] = False
     scaled = (measured[some] - depth[some]) / nguyen(depth[some], angle[some])
     assert some.sum() > 20_000
@@ -70,7 +79,10 @@ def test_stereo_noise_grows_with_the_square_of_the_distance(distance):
     sensor = replace(SENSORS["none"], disparity=0.1, focal=424.0, baseline=0.05)
     depth, _ = plane(sensor, distance)
     measured, _ = sensor.measure(depth, rng(2))
-    assert (measured - depth).std() == pytest.approx(distance**2 * 0.1 / (424 * 0.05), rel=0.02)
+    assert (measured - depth).std() == pytest.approx(
+        distance**2 * 0.1 / (424 * 0.05),
+        rel=0.02,
+    )
 
 
 def test_neighbours_err_together_as_far_as_the_grain():
@@ -80,7 +92,8 @@ def test_neighbours_err_together_as_far_as_the_grain():
     for k in range(1, 7):
         for a, b in ((error[k:], error[:-k]), (error[:, k:], error[:, :-k])):
             assert (a * b).mean() / error.var() == pytest.approx(
-                np.exp(-(k**2) / (4 * 1.8**2)), abs=0.03
+                np.exp(-(k**2) / (4 * 1.8**2)),
+                abs=0.03,
             )
     assert error.std() == pytest.approx(0.001, rel=0.05)
 
@@ -106,7 +119,9 @@ def test_edges_move_by_the_published_pixels_and_planes_stay():
             assert share == pytest.approx(expected, abs=4 * np.sqrt(expected / rows))
     tilted, _ = plane(sensor, 1.0, 50)
     np.testing.assert_allclose(
-        sensor.measure(tilted, rng(7))[0][4:-4, 4:-4], tilted[4:-4, 4:-4], rtol=1e-3
+        sensor.measure(tilted, rng(7))[0][4:-4, 4:-4],
+        tilted[4:-4, 4:-4],
+        rtol=1e-3,
     )
     assert (source != np.arange(source.size).reshape(source.shape)).mean() > 0.5
 
@@ -120,7 +135,8 @@ def test_grazing_pixels_are_lost(tilt, grain):
     some[:, :1] = some[:, -1:] = False
     lost = (sensor.measure(depth, rng(9))[0] == 0)[some].mean()
     assert lost == pytest.approx(
-        np.maximum(0, 1 - np.cos(angle[some]) / 0.3).mean(), abs=0.01 if grain == 0 else 0.03
+        np.maximum(0, 1 - np.cos(angle[some]) / 0.3).mean(),
+        abs=0.01 if grain == 0 else 0.03,
     )
 
 
@@ -132,21 +148,24 @@ def test_shadows_are_where_rays_from_the_projector_do_not_arrive(baseline):
         box((0.05, 0.05, 0.3), (-0.1, 0.15, 0.1)),
         box((2, 2, 0.02)),
     ]
-    things.append(trimesh.creation.icosphere(4, 0.08).apply_translation((0.15, -0.2, 0.15)))
+    things.append(
+        trimesh.creation.icosphere(4, 0.08).apply_translation((0.15, -0.2, 0.15))
+    )
     pose = pose_at(35, 60, 1.0)
     depth, _ = cast(things, pose, sensor.intrinsics, sensor.shape)
     lost = sensor.measure(depth, rng(12))[0] == 0
     scene = trimesh.util.concatenate(things)
-    points = (rays(sensor.intrinsics, sensor.shape) * depth[..., None]) @ pose[:3, :3].T + pose[
-        :3, 3
-    ]
+    points = (rays(sensor.intrinsics, sensor.shape) * depth[..., None]) @ pose[
+        :3,
+        :3,
+    ].T + pose[:3, 3]
     projector = pose[:3, 3] + baseline * pose[:3, 0]
     towards = projector - points.reshape(-1, 3)
     length = np.linalg.norm(towards, axis=1)
     starts = points.reshape(-1, 3) + 0.004 * towards / length[:, None]
-    hidden = scene.ray.intersects_any(starts, towards / length[:, None]).reshape(depth.shape) & (
-        depth > 0
-    )
+    hidden = scene.ray.intersects_any(starts, towards / length[:, None]).reshape(
+        depth.shape
+    ) & (depth > 0)
     lost &= depth > 0
     assert hidden.sum() > 1000
     differ = hidden != lost
@@ -172,7 +191,8 @@ def test_no_strength_no_error_to_the_bit(name):
     np.testing.assert_array_equal(measured, depth)
     np.testing.assert_array_equal(source.ravel(), np.arange(depth.size))
     ideal = replace(
-        SENSORS["none"], **{n: getattr(sensor, n) for n in ("height", "width", "focal")}
+        SENSORS["none"],
+        **{n: getattr(sensor, n) for n in ("height", "width", "focal")},
     )
     views = [
         SensedCamera(sample_mesh("chair"), s, rng(15)).observe(SPHERE.poses[20])
@@ -187,7 +207,9 @@ OF_FRAMES = ("centre", "size", "tilt", "table", "crop", "boxes", "turned", "move
 
 @pytest.mark.parametrize("error", [error for error in ERRORS if error not in OF_FRAMES])
 def test_stronger_is_noisier(error):
-    strength = getattr(SENSORS["kinect"], error) or getattr(SENSORS["stereo"], error) or 0.002
+    strength = (
+        getattr(SENSORS["kinect"], error) or getattr(SENSORS["stereo"], error) or 0.002
+    )
     sensor = replace(SENSORS["none"], **{error: strength})
     depth, _ = plane(sensor, 1.0, 74)
     depth[200:280, 300:380] = np.minimum(depth[200:280, 300:380], 0.7)
@@ -217,10 +239,14 @@ def test_a_sensor_without_errors_sees_the_ball_and_not_the_table():
 def test_errors_of_the_object_frame_have_their_strength():
     sensor = replace(SENSORS["none"], centre=0.1, size=0.2, tilt=3.0)
     frames = [
-        SensedCamera(sample_mesh("table"), sensor, rng(18, i)).object_frame for i in range(400)
+        SensedCamera(sample_mesh("table"), sensor, rng(18, i)).object_frame
+        for i in range(400)
     ]
     assert np.std([f.centre / 0.12 for f in frames]) == pytest.approx(0.1, rel=0.12)
-    assert np.std([np.log(f.radius / 0.12) for f in frames]) == pytest.approx(0.2, rel=0.15)
+    assert np.std([np.log(f.radius / 0.12) for f in frames]) == pytest.approx(
+        0.2,
+        rel=0.15,
+    )
     lean = [np.arccos(f.axes[2, 2]) ** 2 for f in frames]  # of two axes
     assert np.degrees(np.sqrt(np.mean(lean))) == pytest.approx(3 * np.sqrt(2), rel=0.15)
 
@@ -243,11 +269,15 @@ def test_part_of_the_table_is_left_in_and_part_of_the_object_cut_off():
     around = SensedCamera(mesh, replace(SENSORS["none"], table=1.0), rng(20)).frame(
         SPHERE.poses[20]
     )
-    left = SensedCamera(mesh, replace(SENSORS["none"], table=0.3), rng(20)).frame(SPHERE.poses[20])
+    left = SensedCamera(mesh, replace(SENSORS["none"], table=0.3), rng(20)).frame(
+        SPHERE.poses[20]
+    )
     extra = [(frame.mask & ~exact.mask).sum() for frame in (around, left)]
     assert extra[1] == pytest.approx(0.3 * extra[0], rel=0.4)
     camera = SensedCamera(mesh, replace(SENSORS["none"], crop=0.5), rng(21))
-    kept = [camera.frame(SPHERE.poses[20]).mask.sum() / exact.mask.sum() for _ in range(20)]
+    kept = [
+        camera.frame(SPHERE.poses[20]).mask.sum() / exact.mask.sum() for _ in range(20)
+    ]
     assert 0.3 < min(kept) < 0.75 < max(kept) <= 1
 
 
@@ -262,7 +292,9 @@ def test_boxes_hide_what_is_behind_them_and_are_not_taken_for_the_object():
         assert not (kept & ~whole.mask).any()
         if hidden is not None:
             np.testing.assert_array_equal(hidden.depth[kept], whole.depth[kept])
-            assert (hidden.depth[whole.mask & ~kept] < whole.depth[whole.mask & ~kept]).all()
+            assert (
+                hidden.depth[whole.mask & ~kept] < whole.depth[whole.mask & ~kept]
+            ).all()
         shares.append(kept.sum() / whole.mask.sum())
     assert min(shares) < 0.5 < max(shares)
 
@@ -283,19 +315,30 @@ def test_the_visible_share_of_a_ball_behind_a_wall():
         frame[:3, 3] = -1.2 * towards + 1.0 * centre
         wall = trimesh.creation.box((2.0, 4.0, 0.01), frame)
         around = replace(
-            BALL, vertices=np.asarray(wall.vertices), faces=np.asarray(wall.faces, np.int32)
+            BALL,
+            vertices=np.asarray(wall.vertices),
+            faces=np.asarray(wall.faces, np.int32),
         )
-        assert SensedCamera(BALL, ball, rng(3), around=around).visible_share(pose) == pytest.approx(
-            share, abs=0.02
-        )
+        assert SensedCamera(BALL, ball, rng(3), around=around).visible_share(
+            pose
+        ) == pytest.approx(share, abs=0.02)
 
 
 def test_a_mix_is_another_sensor_for_every_object():
     drawn = [SensedCamera(BALL, "mix", rng(26, i)).sensor for i in range(300)]
-    assert drawn == [SensedCamera(BALL, SensorMix(), rng(26, i)).sensor for i in range(300)]
-    assert {sensor.name.partition(":")[0] for sensor in drawn} == {"render", "kinect", "stereo"}
+    assert drawn == [
+        SensedCamera(BALL, SensorMix(), rng(26, i)).sensor for i in range(300)
+    ]
+    assert {sensor.name.partition(":")[0] for sensor in drawn} == {
+        "render",
+        "kinect",
+        "stereo",
+    }
     for error, chance in (("tilt", 0.5), ("crop", 0.4), ("boxes", 0.5), ("table", 0.2)):
-        assert np.mean([getattr(s, error) > 0 for s in drawn]) == pytest.approx(chance, abs=0.1)
+        assert np.mean([getattr(s, error) > 0 for s in drawn]) == pytest.approx(
+            chance,
+            abs=0.1,
+        )
     weak = [SensorMix(0.5).draw(rng(27, i)) for i in range(50)]
     strong = [SensorMix().draw(rng(27, i)) for i in range(50)]
     for error in ERRORS:
@@ -311,19 +354,28 @@ def test_recognise_through_a_sensor_of_a_name_or_an_object():
         for sensor in ("wrist:2", sensor_named("wrist:2"))
     ]
     assert results[0].confidence == results[1].confidence
-    assert results[0].views[0].belief.max() != system.recognise(mesh, 3, 5).views[0].belief.max()
+    assert (
+        results[0].views[0].belief.max()
+        != system.recognise(mesh, 3, 5).views[0].belief.max()
+    )
     with pytest.raises(UsageError, match="sensor is for meshes"):
         system.recognise(SimulatedCamera(mesh), sensor="kinect")
 
 
 def rendered(furniture, store, sensor=None, workers=0):
     return render(
-        furniture, store, FEW, workers=workers, options=RenderOptions(split="test", sensor=sensor)
+        furniture,
+        store,
+        FEW,
+        workers=workers,
+        options=RenderOptions(split="test", sensor=sensor),
     )
 
 
 def test_a_store_of_a_sensor_resumes_to_the_bit_and_with_no_other(furniture, tmp_path):
-    whole, resumed, clean = (tmp_path / f"{name}.zarr" for name in ("whole", "resumed", "clean"))
+    whole, resumed, clean = (
+        tmp_path / f"{name}.zarr" for name in ("whole", "resumed", "clean")
+    )
     list(rendered(furniture, whole, "wrist:2"))
     begun = rendered(furniture, resumed, "wrist:2")
     next(begun)
@@ -356,7 +408,8 @@ def test_a_mesh_of_known_unit_is_looked_at_in_its_true_size(name, radius):
     assert not any(edge.any() for edge in border)
     nearest = frame.depth[frame.mask].min()
     assert nearest == pytest.approx(
-        camera.sensor.distance - radius, abs=0.03 * camera.sensor.distance
+        camera.sensor.distance - radius,
+        abs=0.03 * camera.sensor.distance,
     )
     assert camera.observe(SPHERE.poses[13]).radius == pytest.approx(radius)
 
@@ -370,15 +423,28 @@ def test_of_a_thing_of_a_millimetre_nothing_is_seen():
 def test_what_has_no_unit_and_what_a_mix_looks_at_is_as_large_as_the_sensor_says():
     ball = replace(BALL, unit="m")
     assert SensedCamera(BALL, "wrist", rng(31)).sensor == SENSORS["wrist"]
-    assert SensedCamera(ball, "wrist", rng(31), true_size=False).sensor == SENSORS["wrist"]
-    assert SensedCamera(ball, "mix", rng(31)).sensor == SensedCamera(BALL, "mix", rng(31)).sensor
+    assert (
+        SensedCamera(ball, "wrist", rng(31), true_size=False).sensor == SENSORS["wrist"]
+    )
+    assert (
+        SensedCamera(ball, "mix", rng(31)).sensor
+        == SensedCamera(BALL, "mix", rng(31)).sensor
+    )
 
 
-def test_a_store_of_a_sensor_shows_true_sizes_and_resumes_with_no_other_unit(furniture, tmp_path):
+def test_a_store_of_a_sensor_shows_true_sizes_and_resumes_with_no_other_unit(
+    furniture,
+    tmp_path,
+):
     store = tmp_path / "sized.zarr"
 
     def sized(unit, sensor="wrist"):
-        options = RenderOptions(split="test", sensor=sensor, unit=unit, deform=Deform(stretch=0.1))
+        options = RenderOptions(
+            split="test",
+            sensor=sensor,
+            unit=unit,
+            deform=Deform(stretch=0.1),
+        )
         return list(render(furniture, store, FEW, workers=0, options=options))
 
     sized("cm")

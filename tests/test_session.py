@@ -42,7 +42,13 @@ def test_it_asks_for_views_until_it_is_done(system, camera):
 
 
 def test_travel_and_belief_are_those_of_the_views(system, camera):
-    result = Session(system.models, system.policy, system.sphere, 9, Stopping(1.0, 4)).run(camera)
+    result = Session(
+        system.models,
+        system.policy,
+        system.sphere,
+        9,
+        Stopping(1.0, 4),
+    ).run(camera)
     path = [view.index for view in result.views]
     assert len(set(path)) == 4
     assert result.travel == pytest.approx(
@@ -55,9 +61,13 @@ def test_travel_and_belief_are_those_of_the_views(system, camera):
     for view in reversed(result.views):
         e = system.models.evidence([view.observation])
         azimuth = system.sphere.azimuth[[view.index]]
-        total = total + log_evidence_of(e.logits, e.azimuth_bins, azimuth).astype(np.float64)
+        total = total + log_evidence_of(e.logits, e.azimuth_bins, azimuth).astype(
+            np.float64
+        )
     np.testing.assert_allclose(
-        calibration.belief(total, 4, len(system.classes))[0], result.views[-1].belief, atol=1e-9
+        calibration.belief(total, 4, len(system.classes))[0],
+        result.views[-1].belief,
+        atol=1e-9,
     )
 
 
@@ -87,11 +97,21 @@ def test_a_picture_that_is_handed_in_again_counts_once(system, camera):
     made it.
     """
     for move in (True, False):
-        session = Session(system.models, system.policy, system.sphere, 20, Stopping(0.99, 5))
+        session = Session(
+            system.models,
+            system.policy,
+            system.sphere,
+            20,
+            Stopping(0.99, 5),
+        )
         first = camera.observe(session.pose)
         while not session.done:
             session.update(
-                replace(first, depth=first.depth.copy(), pose=session.pose if move else first.pose)
+                replace(
+                    first,
+                    depth=first.depth.copy(),
+                    pose=session.pose if move else first.pose,
+                )
             )
         beliefs = np.array([view.belief for view in session.views])
         assert len(beliefs) == 5
@@ -104,15 +124,18 @@ def test_a_picture_that_is_handed_in_again_counts_once(system, camera):
 
 
 @pytest.mark.parametrize(
-    ("first", "confident", "n_views"), [("chair", True, 5), ("table", False, 6)]
+    ("first", "confident", "n_views"),
+    [("chair", True, 5), ("table", False, 6)],
 )
 def test_an_object_that_is_swapped_after_the_first_view_gets_no_confident_answer(
-    first, confident, n_views
+    first,
+    confident,
+    n_views,
 ):
     cameras = [SimulatedCamera(sample_mesh(name)) for name in (first, *["chair"] * 5)]
-    session = nextview.load(stopping=lambda seen, _: seen.n_views >= 5, max_views=6).session(
-        start=9
-    )
+    session = nextview.load(
+        stopping=lambda seen, _: seen.n_views >= 5, max_views=6
+    ).session(start=9)
     while not session.done:
         session.update(cameras[len(session.views)].observe(session.pose))
     assert not session.views[-1].warnings
@@ -130,7 +153,10 @@ def test_the_two_sides_of_a_symmetric_object_are_two_views(system, tmp_path):
     assert (first.belief != second.belief).any()
 
 
-@pytest.mark.parametrize("again", [deepcopy, lambda session: pickle.loads(pickle.dumps(session))])
+@pytest.mark.parametrize(
+    "again",
+    [deepcopy, lambda session: pickle.loads(pickle.dumps(session))],
+)
 @pytest.mark.parametrize("policy", ["gain", "lem", "visible-gain"])
 def test_a_copy_of_a_session_goes_on_alike_and_apart(camera, policy, again):
     session = nextview.load(policy=policy, threshold=1, max_views=3).session(start=20)
@@ -145,7 +171,10 @@ def test_threads_that_share_a_session_wait_for_each_other(system, camera):
     session = Session(system.models, system.policy, system.sphere, 20, Stopping(1.0, 5))
     seen = [camera.observe(pose) for pose in system.sphere.poses[8:24]]
     with ThreadPoolExecutor(4) as pool:
-        ended = [done.exception() for done in [pool.submit(session.update, one) for one in seen]]
+        ended = [
+            done.exception()
+            for done in [pool.submit(session.update, one) for one in seen]
+        ]
     assert sorted(map(str, filter(None, ended))) == [
         "this session has ended; begin another one"
     ] * (len(seen) - 5)
@@ -153,14 +182,21 @@ def test_threads_that_share_a_session_wait_for_each_other(system, camera):
     for view in session.views:
         alone.update(view.observation)
     np.testing.assert_array_equal(
-        [v.belief for v in session.views], [v.belief for v in alone.views]
+        [v.belief for v in session.views],
+        [v.belief for v in alone.views],
     )
 
 
 def test_half_way_the_result_is_what_is_believed_so_far(system, camera):
     session = Session(system.models, system.policy, system.sphere, 20, Stopping(1.0, 3))
     before = session.result
-    assert (before.answer, before.beliefs, before.travel, before.radius, before.views) == (
+    assert (
+        before.answer,
+        before.beliefs,
+        before.travel,
+        before.radius,
+        before.views,
+    ) == (
         None,
         {},
         0,
@@ -172,7 +208,9 @@ def test_half_way_the_result_is_what_is_believed_so_far(system, camera):
     result = session.result
     assert result.views == (view,)
     assert (result.confident, result.stranded) == (False, False)
-    assert result.beliefs == dict(zip(system.classes, view.belief.tolist(), strict=True))
+    assert result.beliefs == dict(
+        zip(system.classes, view.belief.tolist(), strict=True)
+    )
     assert result.answer == max(result.beliefs, key=result.beliefs.get)
     session.run(camera)
     assert len(session.result.views) == 3

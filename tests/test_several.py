@@ -23,7 +23,10 @@ from nextview.things.unknown import KnownResiduals
 def memory_of(folder) -> VerifiedRecogniser:
     memory = VerifiedRecogniser(folder / "memory.json", 1)
     things = len(memory.things.names)
-    memory.things.residuals = KnownResiduals(np.full(things, 0.3), (np.linspace(-0.3, 0.3, 99),))
+    memory.things.residuals = KnownResiduals(
+        np.full(things, 0.3),
+        (np.linspace(-0.3, 0.3, 99),),
+    )
     return memory
 
 
@@ -37,7 +40,8 @@ def several(known):  # noqa: F811
 @pytest.fixture(scope="module")
 def system(several):
     return replace(
-        nextview.load(threads=1, policy="spread", unknown=0.02), models=Models(several, {})
+        nextview.load(threads=1, policy="spread", unknown=0.02),
+        models=Models(several, {}),
     )
 
 
@@ -69,14 +73,21 @@ def test_a_class_is_named_where_no_thing_explains_what_is_seen(system, name, uni
     alone = nextview.load(threads=1, policy="spread").recognise(shown, start=12, seed=2)
     ours = result.views[0].belief[4:]
     np.testing.assert_allclose(
-        ours / ours.sum(), alone.views[0].belief, atol=0.02 if unit else 1e-6
+        ours / ours.sum(),
+        alone.views[0].belief,
+        atol=0.02 if unit else 1e-6,
     )
 
 
 def test_what_is_neither_is_unknown(system):
     ring = trimesh.creation.torus(0.09, 0.008)
-    stranger = trimesh.util.concatenate([ring, box((0.01, 0.01, 0.14), (0.09, 0, 0.07))])
-    result = system.recognise(make_mesh(stranger.vertices, stranger.faces, unit="m"), seed=1)
+    stranger = trimesh.util.concatenate(
+        [ring, box((0.01, 0.01, 0.14), (0.09, 0, 0.07))]
+    )
+    result = system.recognise(
+        make_mesh(stranger.vertices, stranger.faces, unit="m"),
+        seed=1,
+    )
     assert result.unknown
     assert (result.answer, result.pose) == (None, None)
 
@@ -86,7 +97,9 @@ def test_a_session_of_several_can_be_pickled(system, meshes):  # noqa: F811
     camera = nextview.SimulatedCamera(meshes["mug"])
     session.update(camera.observe(session.pose))
     other = pickle.loads(pickle.dumps(session))
-    other.update(camera.observe(other.pose))  # what was said of the first view is asked anew
+    other.update(
+        camera.observe(other.pose)
+    )  # what was said of the first view is asked anew
     assert len(other.views) == 2
     assert len(session.views) == 1
 
@@ -94,14 +107,18 @@ def test_a_session_of_several_can_be_pickled(system, meshes):  # noqa: F811
 def test_what_cannot_be_put_together_is_refused(known):  # noqa: F811
     network, memory = NetworkRecogniser(threads=1), memory_of(known)
     with pytest.raises(
-        ModelError, match="a, b: several collections are memories of things and at most one network"
+        ModelError,
+        match="a, b: several collections are memories of things and at most one network",
     ):
         SeveralRecognisers({"a": network, "b": network})
     with pytest.raises(ModelError, match="mine: knows no geometry of its things"):
-        SeveralRecognisers({"a": network, "mine": TaughtRecogniser(known / "memory.json", 1)})
+        SeveralRecognisers(
+            {"a": network, "mine": TaughtRecogniser(known / "memory.json", 1)}
+        )
     memory.things.residuals = None
     with pytest.raises(
-        ModelError, match="mine: does not say how well its things are usually explained"
+        ModelError,
+        match="mine: does not say how well its things are usually explained",
     ):
         SeveralRecognisers({"a": network, "mine": memory})
 

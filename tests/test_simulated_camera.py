@@ -91,7 +91,9 @@ def test_any_pose_sees_what_casting_every_ray_sees(position, quaternion):
 def test_a_wall_that_runs_past_the_camera_is_seen_to_the_border():
     # It begins a little to the left, ahead, and ends behind: where its ends project says nothing of
     # where it is seen.
-    corners = np.array([[-0.1, -0.05, 1], [-0.1, 0.05, 1], [0.3, 0.05, -1], [0.3, -0.05, -1]])
+    corners = np.array(
+        [[-0.1, -0.05, 1], [-0.1, 0.05, 1], [0.3, 0.05, -1], [0.3, -0.05, -1]]
+    )
     wall = make_mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
     pose = np.eye(4)
     pose[:3, 3] = -wall.centre / wall.radius
@@ -117,8 +119,13 @@ def test_a_wall_that_runs_past_the_camera_is_seen_to_the_border():
     ],
 )
 def test_a_bump_appears_on_the_side_derived_by_hand(view, towards, row, column):
-    stay = trimesh.creation.icosphere(radius=0.1)  # keeps the bounding box around the origin
-    ends = [stay.copy().apply_translation(p) for p in np.vstack([np.eye(3), -np.eye(3)]) * 1.5]
+    stay = trimesh.creation.icosphere(
+        radius=0.1
+    )  # keeps the bounding box around the origin
+    ends = [
+        stay.copy().apply_translation(p)
+        for p in np.vstack([np.eye(3), -np.eye(3)]) * 1.5
+    ]
     body = trimesh.creation.icosphere(subdivisions=3, radius=0.8)
     bump = trimesh.creation.icosphere(subdivisions=3, radius=0.5).apply_translation(
         np.array(towards) * 0.8
@@ -141,20 +148,31 @@ def test_points_lie_on_the_surface_and_are_visible(mesh, view):
     assert observation.points.dtype == np.float32
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     _, distance, _ = trimesh.proximity.closest_point_naive(
-        solid, observation.points[::16].astype(float)
+        solid,
+        observation.points[::16].astype(float),
     )
     np.testing.assert_allclose(distance, 0, atol=2e-5)
-    in_camera = (observation.points - observation.pose[:3, 3]) @ observation.pose[:3, :3]
+    in_camera = (observation.points - observation.pose[:3, 3]) @ observation.pose[
+        :3,
+        :3,
+    ]
     projected = in_camera @ observation.intrinsics.T
     column, row = np.floor(projected[:, :2] / projected[:, 2:]).astype(int).T
-    np.testing.assert_allclose(observation.depth[row, column], in_camera[:, 2], atol=1e-4)
+    np.testing.assert_allclose(
+        observation.depth[row, column],
+        in_camera[:, 2],
+        atol=1e-4,
+    )
 
 
 @pytest.mark.skipif(
-    "NEXTVIEW_DATA" not in os.environ, reason="NEXTVIEW_DATA names no folder of real meshes"
+    "NEXTVIEW_DATA" not in os.environ,
+    reason="NEXTVIEW_DATA names no folder of real meshes",
 )
 def test_real_meshes_seen_as_by_casting_every_ray():
-    paths = sorted(Path(os.environ["NEXTVIEW_DATA"]).glob("ModelNet10/*/test/*_[0-9]*.off"))
+    paths = sorted(
+        Path(os.environ["NEXTVIEW_DATA"]).glob("ModelNet10/*/test/*_[0-9]*.off")
+    )
     assert paths
     for path in paths[:: max(1, len(paths) // 7)]:
         for pose in SPHERE.poses[::13]:

@@ -40,14 +40,22 @@ def site(tmp_path_factory):
         str(folder),
     ]
     done = subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=500
+        command,
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=500,
     )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-6000:]
     return folder
 
 
 def pages(site):
-    return {page.relative_to(site).as_posix(): page.read_text() for page in site.rglob("*.html")}
+    return {
+        page.relative_to(site).as_posix(): page.read_text()
+        for page in site.rglob("*.html")
+    }
 
 
 def test_every_command_has_a_page_with_its_own_help(site, capsys):
@@ -71,7 +79,9 @@ def test_every_bundled_model_has_a_page_with_its_hash(site):
 def test_public_names_are_documented(site):
     import nextview
 
-    inventory = "".join(text for name, text in pages(site).items() if name.startswith("api/"))
+    inventory = "".join(
+        text for name, text in pages(site).items() if name.startswith("api/")
+    )
     for name in nextview.__all__:
         found = getattr(nextview, name)
         where = f"{found.__module__}.{getattr(found, '__qualname__', name)}"
@@ -92,7 +102,10 @@ def test_every_page_is_in_the_navigation(site):
 
 def test_nothing_is_loaded_from_elsewhere(site):
     for name, text in pages(site).items():
-        loaded = re.findall(r'<(?:script|img|link)[^>]+(?:src|href)="(https?:)?//([^"]+)"', text)
+        loaded = re.findall(
+            r'<(?:script|img|link)[^>]+(?:src|href)="(https?:)?//([^"]+)"',
+            text,
+        )
         assert not loaded, name
 
 

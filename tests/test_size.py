@@ -34,25 +34,37 @@ def shop(tmp_path_factory):
     folder, rng = tmp_path_factory.mktemp("shop"), np.random.default_rng(0)
     for label, radius in (("big", 80), ("small", 20)):
         for i in range(8):
-            path = folder / f"meshes/{label}/{'train' if i < 6 else 'test'}/{label}_{i}.off"
+            path = (
+                folder
+                / f"meshes/{label}/{'train' if i < 6 else 'test'}/{label}_{i}.off"
+            )
             path.parent.mkdir(parents=True, exist_ok=True)
             trimesh.creation.icosphere(2, radius * rng.uniform(0.8, 1.25)).export(path)
     list(render(folder / "meshes", folder / "views.zarr", SPHERE, 32, workers=1))
-    change_card(make_recogniser(folder, CLASSES), held_out=["big_0", "big_1", "small_0", "small_1"])
+    change_card(
+        make_recogniser(folder, CLASSES),
+        held_out=["big_0", "big_1", "small_0", "small_1"],
+    )
     return folder
 
 
 def test_a_density_is_that_of_its_class_and_a_share_of_anything():
     rng = np.random.default_rng(0)
     radii = np.exp(
-        np.concatenate([rng.normal(np.log(0.1), 0.1, 500), rng.normal(np.log(2), 0.1, 500)])
+        np.concatenate(
+            [rng.normal(np.log(0.1), 0.1, 500), rng.normal(np.log(2), 0.1, 500)]
+        )
     )
     found = densities(radii, np.repeat([0, 1], 500), 2)
     span = np.log(RADII[-1] / RADII[0])
     share = np.exp(found).mean(1) * span  # under the curve
     assert share == pytest.approx([1, 1], rel=0.03)
     near = np.abs(RADII - 0.1).argmin()
-    wanted = 0.95 * norm.pdf(np.log(RADII[near]), np.log(0.1), np.hypot(0.1, 0.1 * 500**-0.2))
+    wanted = 0.95 * norm.pdf(
+        np.log(RADII[near]),
+        np.log(0.1),
+        np.hypot(0.1, 0.1 * 500**-0.2),
+    )
     assert np.exp(found[0, near]) == pytest.approx(wanted, rel=0.15)
     assert np.exp(found[1, near]) == pytest.approx(ANY_SIZE / span)
     strays = np.concatenate([radii[:500], np.full(20, 15.0)])  # drawn in another unit
@@ -69,18 +81,24 @@ def test_the_weight_is_the_most_likely_one():
     labels = rng.integers(0, 2, n)
     logs = rng.normal(np.log([0.3, 0.6])[labels], 0.5)
     density = norm.logpdf(np.log(RADII)[None], np.log([[0.3], [0.6]]), 0.5)
-    shape = rng.normal(np.where(labels == 0, 1, -1), np.sqrt(2))  # log-odds of the first class
+    shape = rng.normal(
+        np.where(labels == 0, 1, -1),
+        np.sqrt(2),
+    )  # log-odds of the first class
     # three views, all alike
     logits = np.stack([shape, np.zeros(n)], 1)[:, None].repeat(3, 1).astype(np.float32)
     data = train_predictions(logits, labels, ViewSphere((0.0,), 3), ("a", "b"))
     evidence, before, after = fit_weight(data, np.exp(logs), density)
     assert evidence.weight == pytest.approx(1, abs=0.15)
     alone = np.log1p(np.exp(np.where(labels == 0, -shape, shape)))
-    assert before == pytest.approx(np.mean([alone[labels == c].mean() for c in (0, 1)]), rel=1e-4)
-    assert after < before - 0.1
-    assert fit_weight(data, np.exp(rng.permutation(logs)), density)[0].weight == pytest.approx(
-        0, abs=0.1
+    assert before == pytest.approx(
+        np.mean([alone[labels == c].mean() for c in (0, 1)]),
+        rel=1e-4,
     )
+    assert after < before - 0.1
+    assert fit_weight(data, np.exp(rng.permutation(logs)), density)[
+        0
+    ].weight == pytest.approx(0, abs=0.1)
 
 
 def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
@@ -93,7 +111,9 @@ def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
     main(["predict", views, honest, "--held-out", card, "--recogniser", card, "--maps"])
     assert "--unit" in refused(capsys, "fit", "size", views, honest, card)
     main(["render", str(shop / "meshes"), views, "--size", "32", "--unit", "cm"])
-    radii = dict(zip(ViewStore.open(views).names, ViewStore.open(views).radii, strict=True))
+    radii = dict(
+        zip(ViewStore.open(views).names, ViewStore.open(views).radii, strict=True)
+    )
     assert radii["small_3"] == pytest.approx(
         load_mesh(shop / "meshes/small/train/small_3.off", unit="cm").metres
     )
@@ -101,7 +121,12 @@ def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
     with pytest.raises(DatasetError, match="measured in cm, not m"):
         list(
             render(
-                shop / "meshes", Path(views), SPHERE, 32, workers=1, options=RenderOptions(unit="m")
+                shop / "meshes",
+                Path(views),
+                SPHERE,
+                32,
+                workers=1,
+                options=RenderOptions(unit="m"),
             )
         )
 
@@ -110,8 +135,22 @@ def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
     by_shape = Predictions.load(test)
     assert by_shape.of_size is None
     main(["fit", "size", views, honest, card])
-    assert read_card(Path(card)).fitted_to["size"].startswith("8 objects of the training split, ")
-    list(predict(Path(views), test, read_card(Path(card)), {}, "test", workers=1, overwrite=True))
+    assert (
+        read_card(Path(card))
+        .fitted_to["size"]
+        .startswith("8 objects of the training split, ")
+    )
+    list(
+        predict(
+            Path(views),
+            test,
+            read_card(Path(card)),
+            {},
+            "test",
+            workers=1,
+            overwrite=True,
+        )
+    )
     known = Predictions.load(test)
     assert (known.logits.argmax(2) == known.labels[:, None]).all()
     np.testing.assert_allclose(known.by_shape().logits, by_shape.logits, atol=1e-5)
@@ -127,10 +166,25 @@ def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
             overwrite=True,
         )
     )
-    np.testing.assert_allclose(Predictions.load(test).logits, by_shape.logits, atol=1e-5)
-    list(predict(Path(views), tmp_path / "new.npz", read_card(Path(card)), {}, "test", workers=1))
     np.testing.assert_allclose(
-        Predictions.load(tmp_path / "new.npz").logits, known.logits, atol=1e-5
+        Predictions.load(test).logits,
+        by_shape.logits,
+        atol=1e-5,
+    )
+    list(
+        predict(
+            Path(views),
+            tmp_path / "new.npz",
+            read_card(Path(card)),
+            {},
+            "test",
+            workers=1,
+        )
+    )
+    np.testing.assert_allclose(
+        Predictions.load(tmp_path / "new.npz").logits,
+        known.logits,
+        atol=1e-5,
     )
 
     recogniser = NetworkRecogniser(card)
@@ -146,7 +200,11 @@ def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
     row = known.names.index("small_7")
     found = recogniser(n_views).logits
     # depth is rounded
-    np.testing.assert_allclose(found, [known.logits[row, 9], by_shape.logits[row, 9]], atol=2e-3)
+    np.testing.assert_allclose(
+        found,
+        [known.logits[row, 9], by_shape.logits[row, 9]],
+        atol=2e-3,
+    )
     strange = tmp_path / "strange.npz"
     replace(Predictions.load(honest), names=("a", "b", "c", "d")).save(strange)
     assert "holds 'a'" in refused(capsys, "fit", "size", views, strange, card)

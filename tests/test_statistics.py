@@ -14,16 +14,24 @@ def test_ratios_and_class_means_agree_with_plain_loops():
         rng.integers(0, 3, 12),
     )
     draws = rng.integers(12, size=(5, 12))
-    weights = np.stack([np.bincount(draw, minlength=12) for draw in draws]).astype(float)
+    weights = np.stack([np.bincount(draw, minlength=12) for draw in draws]).astype(
+        float
+    )
     ratio, mean = (
         metrics.ratio(top, bottom, weights),
         metrics.class_mean(top, bottom, labels, weights),
     )
     for s, draw in enumerate(draws):
         for m in range(2):
-            assert ratio[s, m] == pytest.approx(top[draw, m].sum() / bottom[draw, m].sum())
+            assert ratio[s, m] == pytest.approx(
+                top[draw, m].sum() / bottom[draw, m].sum()
+            )
             each = [draw[labels[draw] == c] for c in range(3)]
-            parts = [top[d, m].sum() / bottom[d, m].sum() for d in each if bottom[d, m].sum() > 0]
+            parts = [
+                top[d, m].sum() / bottom[d, m].sum()
+                for d in each
+                if bottom[d, m].sum() > 0
+            ]
             assert mean[s, m] == pytest.approx(np.mean(parts))
 
 
@@ -31,7 +39,9 @@ def test_mcnemar_with_one_run_is_the_textbook_test():
     right = np.array([[1, 1, 1, 1, 1, 1, 0, 0, 1, 0, 1, 1, 1]], bool)
     other = np.array([[1, 0, 0, 0, 0, 0, 1, 0, 1, 1, 0, 0, 0]], bool)
     b, c = (right & ~other).sum(), (~right & other).sum()
-    assert st.mcnemar(right, other) == pytest.approx(stats.chi2.sf((b - c) ** 2 / (b + c), 1))
+    assert st.mcnemar(right, other) == pytest.approx(
+        stats.chi2.sf((b - c) ** 2 / (b + c), 1)
+    )
     assert st.mcnemar(right, right) == 1
 
 
@@ -56,7 +66,8 @@ def test_mcnemar_rejects_a_true_null_hypothesis_as_often_as_it_says():
 def test_holm_gives_the_textbook_values():
     # R: p.adjust(c(0.01, 0.04, 0.03, 0.005), "holm")
     np.testing.assert_allclose(
-        st.holm(np.array([0.01, 0.04, 0.03, 0.005])), [0.03, 0.06, 0.06, 0.02]
+        st.holm(np.array([0.01, 0.04, 0.03, 0.005])),
+        [0.03, 0.06, 0.06, 0.02],
     )
     np.testing.assert_allclose(st.holm(np.array([0.6, np.nan, 0.9])), [1, np.nan, 1])
 
@@ -64,18 +75,28 @@ def test_holm_gives_the_textbook_values():
 def test_bootstrap_p_agrees_with_the_paired_t_test():
     difference = np.random.default_rng(0).normal(0.1, 1, 500)
     weights = st.resample(500, 5000, np.random.default_rng(1))
-    p = st.bootstrap_p(difference.mean(keepdims=True), weights @ difference[:, None] / 500)
+    p = st.bootstrap_p(
+        difference.mean(keepdims=True),
+        weights @ difference[:, None] / 500,
+    )
     assert p[0] == pytest.approx(stats.ttest_1samp(difference, 0).pvalue, rel=0.15)
     assert st.bootstrap_p(np.zeros(1), np.zeros((10, 1))) == [1]
 
 
 def test_calibration_error_is_the_gap_between_confidence_and_accuracy():
-    assert metrics.calibration_error(np.full(8, 0.75), np.arange(8) < 4) == pytest.approx(0.25)
+    assert metrics.calibration_error(
+        np.full(8, 0.75),
+        np.arange(8) < 4,
+    ) == pytest.approx(0.25)
     rng = np.random.default_rng(0)
     confidence = rng.uniform(0.1, 1, 200_000)
-    assert metrics.calibration_error(confidence, rng.random(200_000) < confidence) < 0.01
+    assert (
+        metrics.calibration_error(confidence, rng.random(200_000) < confidence) < 0.01
+    )
     sure, accuracy, count = metrics.reliability(
-        np.array([0.0, 1.0]), np.array([False, True]), bins=4
+        np.array([0.0, 1.0]),
+        np.array([False, True]),
+        bins=4,
     )
     np.testing.assert_array_equal(count, [1, 0, 0, 1])
     np.testing.assert_array_equal([sure[3], accuracy[3]], [1, 1])

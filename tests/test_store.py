@@ -22,7 +22,9 @@ def store(views, tmp_path) -> Path:
 
 def chunk(views: Path, name: str, i: int) -> Path:
     place = views / name / "c" / str(i)
-    return place if place.is_file() else next(p for p in place.rglob("*") if p.is_file())
+    return (
+        place if place.is_file() else next(p for p in place.rglob("*") if p.is_file())
+    )
 
 
 def damage(file: Path, how: str) -> None:
@@ -46,7 +48,10 @@ def found(views: Path) -> dict[str, str]:
 def test_damage_is_named_by_every_read_and_by_check(store, name, how):
     ViewStore.open(store).note(unit="cm")
     damage(chunk(store, name, 1), how)
-    wrong, views = "is missing" if how == "lost" else "cannot be read", ViewStore.open(store)
+    wrong, views = (
+        "is missing" if how == "lost" else "cannot be read",
+        ViewStore.open(store),
+    )
     reads = {
         "image": lambda: views.image(1),
         "depth": lambda: views.depth(1),
@@ -56,26 +61,56 @@ def test_damage_is_named_by_every_read_and_by_check(store, name, how):
     }
     for read in (reads[name], lambda: views.rows(name)):
         with pytest.raises(
-            DatasetError, match=rf"{name} of chair_1 {wrong}.*remove the store and render"
+            DatasetError,
+            match=rf"{name} of chair_1 {wrong}.*remove the store and render",
         ):
             read()
     assert list(found(store)) == ["chair_1"]
 
 
-def test_a_damaged_object_ends_the_command_that_reads_it(store, models, tmp_path, capsys):
+def test_a_damaged_object_ends_the_command_that_reads_it(
+    store,
+    models,
+    tmp_path,
+    capsys,
+):
     damage(chunk(store, "depth", 1), "lost")
-    cards = ["--recogniser", models / "tiny.json", "--maps", f"lem={models / 'tiny-lem.json'}"]
-    said = refused(capsys, "predict", store, tmp_path / "out.npz", *cards, "--workers", 0)
+    cards = [
+        "--recogniser",
+        models / "tiny.json",
+        "--maps",
+        f"lem={models / 'tiny-lem.json'}",
+    ]
+    said = refused(
+        capsys,
+        "predict",
+        store,
+        tmp_path / "out.npz",
+        *cards,
+        "--workers",
+        0,
+    )
     assert f"{store}: depth of chair_1 is missing; remove the store" in said
     assert not (tmp_path / "out.npz").exists()
-    assert "1 of 18 objects are damaged" in refused(capsys, "check", store, "--workers", 0)
+    assert "1 of 18 objects are damaged" in refused(
+        capsys,
+        "check",
+        store,
+        "--workers",
+        0,
+    )
 
 
 @pytest.mark.parametrize("name", RENDERED_ARRAYS)
 def test_check_and_render_say_which_array_is_missing(store, furniture, capsys, name):
     shutil.rmtree(store / name)
     for command in (["check", store], ["render", furniture, store, "--size", 32]):
-        assert f"the array {name} is missing" in refused(capsys, *command, "--workers", 0)
+        assert f"the array {name} is missing" in refused(
+            capsys,
+            *command,
+            "--workers",
+            0,
+        )
 
 
 def test_a_store_that_called_rotated_objects_turned_is_read(store):
@@ -87,7 +122,11 @@ def test_a_store_that_called_rotated_objects_turned_is_read(store):
     assert found(store) == {}
 
 
-def test_a_store_without_its_root_or_another_folder_is_left_alone(store, furniture, tmp_path):
+def test_a_store_without_its_root_or_another_folder_is_left_alone(
+    store,
+    furniture,
+    tmp_path,
+):
     (store / "zarr.json").unlink()
     with pytest.raises(DatasetError, match="there is no view store"):
         ViewStore.open(store)
@@ -96,7 +135,11 @@ def test_a_store_without_its_root_or_another_folder_is_left_alone(store, furnitu
             list(render(furniture, store, SPHERE, 32, workers=0, overwrite=overwrite))
 
 
-def test_other_settings_and_meshes_are_refused_or_replace_the_store(store, furniture, tmp_path):
+def test_other_settings_and_meshes_are_refused_or_replace_the_store(
+    store,
+    furniture,
+    tmp_path,
+):
     (store / "notes.txt").write_text("mine")
     changed = shutil.copytree(furniture, tmp_path / "changed")
     with (changed / "chair/test/chair_4.off").open("a") as file:
@@ -109,10 +152,19 @@ def test_other_settings_and_meshes_are_refused_or_replace_the_store(store, furni
         {"options": RenderOptions(split="train")},
     ):
         with pytest.raises(DatasetError, match=r"was begun with other .*--overwrite"):
-            list(render(furniture, store, SPHERE, **{"size": 32, "workers": 0} | options))
+            list(
+                render(furniture, store, SPHERE, **{"size": 32, "workers": 0} | options)
+            )
     list(measure(store, ["depth_entropy"], workers=0))
     options = RenderOptions(split="test")
-    assert len(list(render(furniture, store, SPHERE, 16, options, workers=0, overwrite=True))) == 6
+    assert (
+        len(
+            list(
+                render(furniture, store, SPHERE, 16, options, workers=0, overwrite=True)
+            )
+        )
+        == 6
+    )
     assert ViewStore.open(store).image(0).shape == (40, 16, 16)
     assert (store / "notes.txt").read_text() == "mine"
     assert found(store) == {}

@@ -30,10 +30,21 @@ def test_python_and_command_line_stop_alike(options, capsys):
         [word for name in options for word in (f"--{name}", str(options[name]))],
     )
     for start in range(0, 40, 7):
-        main(["recognise", str(SAMPLE.with_stem("table")), "--start", str(start), "--json", *given])
+        main(
+            [
+                "recognise",
+                str(SAMPLE.with_stem("table")),
+                "--start",
+                str(start),
+                "--json",
+                *given,
+            ]
+        )
         printed = json.loads(capsys.readouterr().out)
         result = system.recognise(SAMPLE.with_stem("table"), start=start)
-        assert [view["view"] for view in printed["views"]] == [view.index for view in result.views]
+        assert [view["view"] for view in printed["views"]] == [
+            view.index for view in result.views
+        ]
         assert (printed["answer"], printed["threshold_reached"]) == (
             result.answer,
             result.confident,
@@ -44,11 +55,14 @@ def test_a_folder_of_ones_own_models(tmp_path, capsys):
     make_recogniser(tmp_path, ["box", "chair"])
     system = nextview.load(tmp_path)
     assert system.classes == ("box", "chair")
-    assert system.policy_name == "spread"  # no gain policy was learned for these classes
+    assert (
+        system.policy_name == "spread"
+    )  # no gain policy was learned for these classes
     assert system.recognise(SAMPLE).answer in system.classes
     make_map_network(tmp_path)
     assert (
-        nextview.load(tmp_path, policy="lem-peak").models.maps["lem"].card.path.parent == tmp_path
+        nextview.load(tmp_path, policy="lem-peak").models.maps["lem"].card.path.parent
+        == tmp_path
     )
     main(["recognise", str(SAMPLE), "--models", str(tmp_path), "--json"])
     assert json.loads(capsys.readouterr().out)["answer"] in system.classes
@@ -57,15 +71,29 @@ def test_a_folder_of_ones_own_models(tmp_path, capsys):
 def test_what_gain_valued_is_what_it_followed():
     views = nextview.load(threshold=1.0).recognise(SAMPLE, start=3).views
     for view, following in itertools.pairwise(views):
-        unvisited = np.setdiff1d(np.arange(40), [v.index for v in views[: views.index(view) + 1]])
-        assert view.next_view == following.index == unvisited[view.values[unvisited].argmax()]
+        unvisited = np.setdiff1d(
+            np.arange(40),
+            [v.index for v in views[: views.index(view) + 1]],
+        )
+        assert (
+            view.next_view
+            == following.index
+            == unvisited[view.values[unvisited].argmax()]
+        )
     assert views[-1].values is None
 
 
 def test_a_map_policy_values_its_window_alone():
-    view = nextview.load(policy="lem-peak", threshold=1.0).recognise(SAMPLE, start=3).views[0]
+    view = (
+        nextview.load(policy="lem-peak", threshold=1.0)
+        .recognise(SAMPLE, start=3)
+        .views[0]
+    )
     window = nextview.ViewSphere.named("40").windows[3]
-    np.testing.assert_array_equal(np.flatnonzero(np.isfinite(view.values)), np.sort(window.ravel()))
+    np.testing.assert_array_equal(
+        np.flatnonzero(np.isfinite(view.values)),
+        np.sort(window.ravel()),
+    )
     np.testing.assert_allclose(view.values[window], view.maps["lem"])
 
 
@@ -78,17 +106,23 @@ def test_importing_and_a_robot_need_no_ray_caster():
 
 
 @pytest.mark.skipif(
-    not os.environ.get("NEXTVIEW_DATA"), reason="NEXTVIEW_DATA names no folder with ModelNet10"
+    not os.environ.get("NEXTVIEW_DATA"),
+    reason="NEXTVIEW_DATA names no folder with ModelNet10",
 )
-@pytest.mark.filterwarnings("ignore:.*is it a table")  # asked of a monitor on a wide plate
+@pytest.mark.filterwarnings(
+    "ignore:.*is it a table"
+)  # asked of a monitor on a wide plate
 def test_the_bundled_models_keep_their_accuracy():
     """The card says that 0.907 of single views are right; of 30 objects fewer than 0.8 are so by
     chance in 1 of 40.
     """
-    meshes = sorted(Path(os.environ["NEXTVIEW_DATA"], "ModelNet10").glob("*/test/*.off"))[:30]
+    meshes = sorted(
+        Path(os.environ["NEXTVIEW_DATA"], "ModelNet10").glob("*/test/*.off")
+    )[:30]
     system = nextview.load(unknown=0)
     right = [
-        system.recognise(path, seed=k).answer == path.parts[-3] for k, path in enumerate(meshes)
+        system.recognise(path, seed=k).answer == path.parts[-3]
+        for k, path in enumerate(meshes)
     ]
     assert len(right) >= 10
     assert np.mean(right) >= 0.8
@@ -99,5 +133,11 @@ def test_the_sample_meshes_are_told_apart_from_any_view():
     system = nextview.load()
     both = itertools.product(SAMPLE_MESHES, range(0, 40, 3))
     assert (
-        np.mean([system.recognise(SAMPLE.with_stem(n), start=k).answer == n for n, k in both]) > 0.9
+        np.mean(
+            [
+                system.recognise(SAMPLE.with_stem(n), start=k).answer == n
+                for n, k in both
+            ]
+        )
+        > 0.9
     )

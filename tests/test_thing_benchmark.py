@@ -31,8 +31,15 @@ from nextview.policies.base import EpisodeState
 from nextview.recognition.evidence import Evidence
 from nextview.simulation.sensed_camera import SensedCamera
 
-JOINED = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "joined_things.py"))
-SETTINGS = ThingSettings(views=(1, 2), policies=("random", "geometry"), repeats=1, samples=200)
+JOINED = runpy.run_path(
+    str(Path(__file__).parents[1] / "benchmarks" / "joined_things.py")
+)
+SETTINGS = ThingSettings(
+    views=(1, 2),
+    policies=("random", "geometry"),
+    repeats=1,
+    samples=200,
+)
 
 
 class FarAzimuth:
@@ -59,7 +66,10 @@ def settings(knobs_memory):
 def made(shared, knobs, settings):
     """A folder of results."""
     return (
-        shared("knobs_results", lambda f: benchmark_things(knobs, f / "out", settings, workers=0))
+        shared(
+            "knobs_results",
+            lambda f: benchmark_things(knobs, f / "out", settings, workers=0),
+        )
         / "out"
     )
 
@@ -73,17 +83,34 @@ def results(made, tmp_path):
 def episode_of(knobs_memory, knobs, thing, folder=None, occlusion="none"):
     things = stage.opened(str(knobs_memory))
     mesh = load_mesh(knobs / f"{things.names[thing]}.ply", unit="m")
-    return ThingEpisode(things, lambda: mesh, thing, 0, Setting("wrist", occlusion), folder)
+    return ThingEpisode(
+        things, lambda: mesh, thing, 0, Setting("wrist", occlusion), folder
+    )
 
 
 # From scans to tables
 
 
 def test_the_command_prints_and_writes_tables_of_all_policies(
-    knobs, knobs_memory, results, capsys, monkeypatch
+    knobs,
+    knobs_memory,
+    results,
+    capsys,
+    monkeypatch,
 ):
-    monkeypatch.setattr(stage, "work", lambda job: pytest.fail("nothing was left to do"))
-    line = ["benchmark-things", knobs, results, "--models", knobs_memory, "--views", 1, 2]
+    monkeypatch.setattr(
+        stage, "work", lambda job: pytest.fail("nothing was left to do")
+    )
+    line = [
+        "benchmark-things",
+        knobs,
+        results,
+        "--models",
+        knobs_memory,
+        "--views",
+        1,
+        2,
+    ]
     line += ["--policies", "random", "geometry", "--repeats", 1, "--workers", 0]
     main([str(word) for word in line])
     shown = capsys.readouterr().out
@@ -91,17 +118,28 @@ def test_the_command_prints_and_writes_tables_of_all_policies(
     assert "until sure" in shown
     text = (results / "tables.md").read_text()
     assert text.count("| geometry | ") == 2 + 2 * 3  # two tables; three tests for each
-    for name in ("measures.csv", "tests.csv", "things.csv", "table.tex", "accuracy.png"):
+    for name in (
+        "measures.csv",
+        "tests.csv",
+        "things.csv",
+        "table.tex",
+        "accuracy.png",
+    ):
         assert (results / name).stat().st_size > 100
 
 
 def test_a_view_is_sensed_once_and_another_policy_uses_what_is_there(
-    knobs, results, settings, monkeypatch
+    knobs,
+    results,
+    settings,
+    monkeypatch,
 ):
     sensed = []
     observe = SensedCamera.observe
     monkeypatch.setattr(
-        SensedCamera, "observe", lambda self, pose: sensed.append(1) or observe(self, pose)
+        SensedCamera,
+        "observe",
+        lambda self, pose: sensed.append(1) or observe(self, pose),
     )
     before = {file: file.read_bytes() for file in (results / "runs").iterdir()}
     benchmark_things(knobs, results, settings, workers=0)
@@ -110,7 +148,12 @@ def test_a_view_is_sensed_once_and_another_policy_uses_what_is_there(
 
     FarAzimuth.seen.clear()
     own = f"{__name__}:FarAzimuth"
-    tables = benchmark_things(knobs, results, replace(settings, policies=(own,)), workers=0)
+    tables = benchmark_things(
+        knobs,
+        results,
+        replace(settings, policies=(own,)),
+        workers=0,
+    )
     assert len(sensed) <= 3  # the second view of each episode
     assert list(tables.measures["policy"].unique()) == ["random", "geometry", own]
     joint, hypotheses = FarAzimuth.seen[0]
@@ -119,11 +162,17 @@ def test_a_view_is_sensed_once_and_another_policy_uses_what_is_there(
     assert hypotheses.belief.sum() == pytest.approx(1)
     assert hypotheses.poses.shape == (len(hypotheses.things), 4, 4)
     away = EPISODE_SPHERE.arc.max(1)
-    travel = tables.measures.query("policy == @own and measure == 'travel, rad' and views == 2")
+    travel = tables.measures.query(
+        "policy == @own and measure == 'travel, rad' and views == 2"
+    )
     assert travel["value"].iloc[0] == pytest.approx(away.mean(), abs=away.std() + 1e-9)
 
 
-def test_what_is_kept_is_what_the_recogniser_says_of_the_same_views(knobs_memory, knobs, tmp_path):
+def test_what_is_kept_is_what_the_recogniser_says_of_the_same_views(
+    knobs_memory,
+    knobs,
+    tmp_path,
+):
     file = tmp_path / "episode"
     fresh = episode_of(knobs_memory, knobs, 0, file)
     views = [fresh.start, (fresh.start + 3) % len(EPISODE_SPHERE)]
@@ -145,13 +194,23 @@ def test_what_is_kept_is_what_the_recogniser_says_of_the_same_views(knobs_memory
     assert again.pose_error(views) < 8
 
 
-def test_what_does_not_fit_is_refused_in_one_sentence(knobs, results, settings, tmp_path):
+def test_what_does_not_fit_is_refused_in_one_sentence(
+    knobs,
+    results,
+    settings,
+    tmp_path,
+):
     with pytest.raises(ResultsError, match=r"of another seed \(0, not 1\)"):
         benchmark_things(knobs, results, replace(settings, seed=1), workers=0)
     with pytest.raises(ResultsError, match="of another occlusion"):
         benchmark_things(knobs, results, replace(settings, occlusion="half"), workers=0)
     with pytest.raises(UsageError, match="no policy is called spreed"):
-        benchmark_things(knobs, results, replace(settings, policies=("spreed",)), workers=0)
+        benchmark_things(
+            knobs,
+            results,
+            replace(settings, policies=("spreed",)),
+            workers=0,
+        )
     with pytest.raises(UsageError, match="ascend"):
         benchmark_things(knobs, results, replace(settings, views=(2, 1)), workers=0)
     (tmp_path / "letters").mkdir()
@@ -167,7 +226,10 @@ def test_what_does_not_fit_is_refused_in_one_sentence(knobs, results, settings, 
     whole = (folder / "000000.npz").read_bytes()
     for damaged in (b"", b"PK\x03\x04 no archive", whole[:-100]):
         (folder / "000000.npz").write_bytes(damaged)
-        with pytest.raises(ResultsError, match=r"000000\.npz: is damaged .* remove its folder"):
+        with pytest.raises(
+            ResultsError,
+            match=r"000000\.npz: is damaged .* remove its folder",
+        ):
             KeptArrays(folder)
     (folder / "000000.npz").write_bytes(whole[:400] + bytes(400) + whole[800:])
     kept = KeptArrays(folder)
@@ -176,7 +238,10 @@ def test_what_does_not_fit_is_refused_in_one_sentence(knobs, results, settings, 
 
 
 def test_some_of_the_things_are_shown_and_all_may_be_believed(
-    knobs, knobs_memory, settings, tmp_path
+    knobs,
+    knobs_memory,
+    settings,
+    tmp_path,
 ):
     (tmp_path / "scans").mkdir()
     shutil.copy(knobs / "plain.ply", tmp_path / "scans")
@@ -194,7 +259,10 @@ def test_boxes_leave_the_share_visible_that_was_asked_for(knobs_memory, knobs):
     for low, high in VISIBLE_SHARES.values():
         boxes = hiding_boxes(standing, (low, high), (0, 1))
         camera = SensedCamera(
-            standing, episode.stage.sensor, np.random.default_rng(0), around=boxes
+            standing,
+            episode.stage.sensor,
+            np.random.default_rng(0),
+            around=boxes,
         )
         shares = [camera.visible_share(pose) for pose in EPISODE_SPHERE.poses]
         assert low - 0.08 < np.mean(shares) < high + 0.08
@@ -216,18 +284,29 @@ def state_at(view, visited=()):
     mask = np.zeros((1, len(EPISODE_SPHERE)), bool)
     mask[0, [view, *visited]] = True
     nothing = Evidence(np.zeros((1, 1)))
-    return EpisodeState(np.array([view]), mask, np.ones((1, 1)), nothing, len(visited) + 1)
+    return EpisodeState(
+        np.array([view]),
+        mask,
+        np.ones((1, 1)),
+        nothing,
+        len(visited) + 1,
+    )
 
 
 def test_the_fixed_sequence_comes_to_all_views_of_its_ring():
     taken = [8]
     for _ in range(7):
         state = state_at(taken[-1], taken)
-        taken.append(int(RingSteps(EPISODE_SPHERE).next_views(state, np.random.default_rng(0))[0]))
+        taken.append(
+            int(
+                RingSteps(EPISODE_SPHERE).next_views(state, np.random.default_rng(0))[0]
+            )
+        )
     assert sorted(taken) == list(range(8, 16))
     assert taken[1] == 11  # three steps of 45 degrees ahead
     after = RingSteps(EPISODE_SPHERE).next_views(
-        state_at(taken[-1], taken), np.random.default_rng(0)
+        state_at(taken[-1], taken),
+        np.random.default_rng(0),
     )
     assert int(after[0]) not in taken
 
@@ -261,8 +340,16 @@ def both(thing, random, other):
 def test_measures_are_those_of_a_hand_count():
     wrong = ([False, False, True], [0.5, 0.98, 0.6], [0, 4, 1])
     good = ([False, True, True], [0.5, 0.9, 0.99], [0, 4, 2])
-    episodes = [both("a_x", wrong, good), both("a_y", good, good), both("b_x", wrong, good)]
-    alike = Alikeness(("a_x", "a_y", "b_x"), ("a_y", "a_x", "a_x"), np.array([0.1, 0.2, 0.3]))
+    episodes = [
+        both("a_x", wrong, good),
+        both("a_y", good, good),
+        both("b_x", wrong, good),
+    ]
+    alike = Alikeness(
+        ("a_x", "a_y", "b_x"),
+        ("a_y", "a_x", "a_x"),
+        np.array([0.1, 0.2, 0.3]),
+    )
     how = Compared(("random", "spread"), (1, 2, 3), 0.97, True, 2000)
     tables = summarise_things(episodes, alike, how)
     rows = tables.measures.set_index(["things", "policy", "measure", "views"])["value"]
@@ -275,10 +362,13 @@ def test_measures_are_those_of_a_hand_count():
     assert random["pose error, 95 %", 3] == 1
     steps = np.pi / 4 * np.cos(EPISODE_SPHERE.elevation[0])
     assert random["travel, rad", 2] == pytest.approx(
-        np.pi * np.cos(EPISODE_SPHERE.elevation[0]), abs=0.2
+        np.pi * np.cos(EPISODE_SPHERE.elevation[0]),
+        abs=0.2,
     )
     assert steps > 0
-    difference = tables.tests.query("things == 'all' and measure == 'accuracy' and views == 2")
+    difference = tables.tests.query(
+        "things == 'all' and measure == 'accuracy' and views == 2"
+    )
     assert difference["difference"].iloc[0] == pytest.approx(2 / 3)
     # Two families: in a quarter of the samples both draws are the family b, and so on.
     assert difference["low"].iloc[0] == pytest.approx(0.5)
@@ -312,15 +402,27 @@ def test_no_difference_is_no_discovery_and_a_sure_one_is():
 
 def test_the_latex_table_is_whole_and_names_are_escaped(results, knobs, settings):
     own = f"{__name__}:FarAzimuth"
-    tables = benchmark_things(knobs, results, replace(settings, policies=(own,)), workers=0)
-    tables.measures["policy"] = tables.measures["policy"].replace(own, "my_module:Best_50%")
+    tables = benchmark_things(
+        knobs,
+        results,
+        replace(settings, policies=(own,)),
+        workers=0,
+    )
+    tables.measures["policy"] = tables.measures["policy"].replace(
+        own,
+        "my_module:Best_50%",
+    )
     text = latex(tables)
     assert r"Best\_50\%" in text
     assert text.count("{") == text.count("}")
     columns = re.search(r"tabular\}\{@\{\}(\w+)@", text).group(1)
-    bodies = [line for line in text.splitlines() if line.endswith(r"\\") and "&" in line]
+    bodies = [
+        line for line in text.splitlines() if line.endswith(r"\\") and "&" in line
+    ]
     assert len(bodies) == 1 + 2 * 3
-    assert all(len(re.findall(r"(?<!\\)&", line)) == len(columns) - 1 for line in bodies)
+    assert all(
+        len(re.findall(r"(?<!\\)&", line)) == len(columns) - 1 for line in bodies
+    )
     assert "| my_module:Best_50% |" in markdown(tables)
 
 

@@ -33,7 +33,10 @@ def test_gymnasium_finds_nothing_wrong_with_it(env):
 
 def test_the_observation_is_the_joint_belief_of_thing_and_pose(env):
     names = env.unwrapped.things.names
-    observation, info = env.reset(seed=0, options={"object": names.index("knob"), "draw": 1})
+    observation, info = env.reset(
+        seed=0,
+        options={"object": names.index("knob"), "draw": 1},
+    )
     assert observation["belief"].sum() == pytest.approx(1, abs=1e-5)
     assert observation["hypotheses"].sum() == pytest.approx(1, abs=1e-5)
     assert (np.diff(observation["hypotheses"]) <= 0).all()
@@ -48,10 +51,15 @@ def test_the_observation_is_the_joint_belief_of_thing_and_pose(env):
     assert ((ahead[:, 2] > 0.2) & (ahead[:, 2] < 0.6)).all()
     turned = poses[:, :, :3]
     np.testing.assert_allclose(
-        turned @ turned.swapaxes(1, 2), np.tile(np.eye(3), (len(poses), 1, 1)), atol=1e-5
+        turned @ turned.swapaxes(1, 2),
+        np.tile(np.eye(3), (len(poses), 1, 1)),
+        atol=1e-5,
     )
     down = -np.sin(EPISODE_SPHERE.elevation[info["view"]])
-    assert poses[0, 2, 2] == pytest.approx(down, abs=0.1)  # the thing's up, along the view
+    assert poses[0, 2, 2] == pytest.approx(
+        down,
+        abs=0.1,
+    )  # the thing's up, along the view
 
 
 def test_rewards_add_up_and_an_action_is_counted_from_the_camera(env):
@@ -74,7 +82,10 @@ def test_rewards_add_up_and_an_action_is_counted_from_the_camera(env):
     assert info["view"] not in (start, before)
     assert over
     total += reward
-    assert total == pytest.approx(observation["belief"][0] - first - 0.1 * info["travel"], abs=1e-5)
+    assert total == pytest.approx(
+        observation["belief"][0] - first - 0.1 * info["travel"],
+        abs=1e-5,
+    )
     with pytest.raises(SessionError, match="call reset"):
         env.unwrapped.step(0)
 

@@ -25,9 +25,20 @@ def ceiling(draws, specs):
     p, n = specs.predictions, len(draws[0])
     evidence = p.log_evidence.reshape(len(draws), n, 40, -1)
     policy = THINGS["FairCeiling"](
-        p.sphere, evidence, p.labels[:n], specs.objects, 3, p.calibration
+        p.sphere,
+        evidence,
+        p.labels[:n],
+        specs.objects,
+        3,
+        p.calibration,
     )
-    return replay_policy("ceiling", policy, specs, Stopping(1.0, 3), np.random.default_rng(0)).views
+    return replay_policy(
+        "ceiling",
+        policy,
+        specs,
+        Stopping(1.0, 3),
+        np.random.default_rng(0),
+    ).views
 
 
 def noisy(*seeds: int) -> list[Predictions]:
@@ -40,41 +51,77 @@ def test_where_the_noise_is_the_same_again_the_fair_ceiling_is_foresight():
     draws = noisy(3, 3)
     specs = make_specs(THINGS["together"](draws), 4, 0)
     np.testing.assert_array_equal(
-        ceiling(draws, specs), replay("oracle-gain-all", specs, 3, 0).views
+        ceiling(draws, specs),
+        replay("oracle-gain-all", specs, 3, 0).views,
     )
 
 
 def test_the_fair_ceiling_goes_by_the_mean_of_the_other_draws():
     draws = noisy(3, 4, 5)
     specs = make_specs(THINGS["together"](draws), 2, 0)
-    for (first, second, _), episode in zip(ceiling(draws, specs), specs.objects, strict=True):
+    for (first, second, _), episode in zip(
+        ceiling(draws, specs),
+        specs.objects,
+        strict=True,
+    ):
         draw, thing = divmod(episode, 6)
         others = [k for k in range(3) if k != draw]
         seen = draws[draw].logits[thing, first].astype(float)
         worth = sum(
-            log_softmax(seen + draws[k].logits[thing], axis=1)[:, thing % 3] for k in others
+            log_softmax(seen + draws[k].logits[thing], axis=1)[:, thing % 3]
+            for k in others
         )
         worth[first] = -np.inf
         assert second == worth.argmax()
 
 
 def test_things_are_compared_from_meshes_on_under_the_same_azimuth_and_other_noise(
-    tmp_path, scans, taught, capsys
+    tmp_path,
+    scans,
+    taught,
+    capsys,
 ):
     tables = [tmp_path / f"{k}.npz" for k in range(2)]
     for k, more in enumerate(([], ["--noise-seed", "1"])):
         store = str(tmp_path / f"{k}.zarr")
         main(
-            ["render", str(scans), store, "--sensor", "wrist", "--rotated", "--workers", "0", *more]
+            [
+                "render",
+                str(scans),
+                store,
+                "--sensor",
+                "wrist",
+                "--rotated",
+                "--workers",
+                "0",
+                *more,
+            ]
         )
         main(
-            ["predict", store, str(tables[k]), "--models", str(taught), "--maps", "--workers", "0"]
+            [
+                "predict",
+                store,
+                str(tables[k]),
+                "--models",
+                str(taught),
+                "--maps",
+                "--workers",
+                "0",
+            ]
         )
     first, again = (ViewStore.open(tmp_path / f"{k}.zarr") for k in range(2))
     np.testing.assert_array_equal(rotations(first), rotations(again))
     assert not np.array_equal(first.depth(0), again.depth(0))
-    THINGS["main"](taught / "memory.json", tmp_path / "out", tuple(tables), runs=3, views=(1, 2))
-    found = pd.read_csv(tmp_path / "out" / "things.csv").set_index(["things", "policy", "n_views"])
+    THINGS["main"](
+        taught / "memory.json",
+        tmp_path / "out",
+        tuple(tables),
+        runs=3,
+        views=(1, 2),
+    )
+    found = pd.read_csv(tmp_path / "out" / "things.csv").set_index(
+        ["things", "policy", "n_views"]
+    )
     draws = [Predictions.load(path) for path in tables]
     specs = make_specs(THINGS["together"](draws), 3, 0)
     one = replay("random-all", specs, 1, 0).answers[:, 0] == specs.labels

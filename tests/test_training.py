@@ -48,10 +48,21 @@ RECIPE = RecogniserRecipe(size=32, epochs=3, views_per_object=4, batch=8)
 # Of 16 pixels the last step of a ResNet is a strided convolution of one pixel, whose bfloat16
 # gradient on a CPU is not always finite (torch 2.13).
 SMALL = RecogniserRecipe(
-    size=32, epochs=1, views_per_object=2, batch=4, validation_share=0.25, azimuth_bins_weight=0.3
+    size=32,
+    epochs=1,
+    views_per_object=2,
+    batch=4,
+    validation_share=0.25,
+    azimuth_bins_weight=0.3,
 )
 EXACT = Hardware(precision="32-true")
-SMALL_MAP = MapRecipe(size=32, epochs=1, views_per_object=2, batch=4, validation_share=0.25)
+SMALL_MAP = MapRecipe(
+    size=32,
+    epochs=1,
+    views_per_object=2,
+    batch=4,
+    validation_share=0.25,
+)
 
 
 # Batches
@@ -60,7 +71,10 @@ SMALL_MAP = MapRecipe(size=32, epochs=1, views_per_object=2, batch=4, validation
 def views_of(recipe, objects=6, views=V):
     """Inputs whose pixels say which object and view they are."""
     which = np.arange(objects * views, dtype=np.uint8).reshape(objects, views, 1, 1, 1)
-    source = StoredInputs(np.broadcast_to(which, (objects, views, 4, 2, 2)), np.arange(objects))
+    source = StoredInputs(
+        np.broadcast_to(which, (objects, views, 4, 2, 2)),
+        np.arange(objects),
+    )
     return Views([source], np.arange(objects), np.arange(objects) % 2, recipe)
 
 
@@ -71,24 +85,39 @@ def test_the_published_recipe_sees_every_view_once_an_epoch_in_a_new_order():
     first, second = orders
     assert sorted(first) == sorted(second) == list(range(6 * V))
     assert first != second
-    assert (np.concatenate([label for _, label in views]) == np.array(second) // V % 2).all()
+    assert (
+        np.concatenate([label for _, label in views]) == np.array(second) // V % 2
+    ).all()
 
 
 def test_balanced_draws_even_out_the_classes():
     labels = np.repeat([0, 1], [90, 10])
     inputs = np.zeros((100, V, 1, 1, 1), np.uint8)
     recipe = RecogniserRecipe(views_per_object=100, batch=100)
-    views = Views([StoredInputs(inputs, np.arange(100))], np.arange(100), labels, recipe)
+    views = Views(
+        [StoredInputs(inputs, np.arange(100))],
+        np.arange(100),
+        labels,
+        recipe,
+    )
     seen = np.concatenate([label for _, label in views])
-    share = 10**0.5 / (10**0.5 + 90**0.5)  # a class of n objects is drawn with weight n / sqrt(n)
+    share = 10**0.5 / (
+        10**0.5 + 90**0.5
+    )  # a class of n objects is drawn with weight n / sqrt(n)
     assert (seen == 1).mean() == pytest.approx(
-        share, abs=4 * (share * (1 - share) / len(seen)) ** 0.5
+        share,
+        abs=4 * (share * (1 - share) / len(seen)) ** 0.5,
     )
 
 
 def test_objects_without_a_deformed_twin_are_seen_as_they_are():
     own, twins = (np.full((2, 40, 1, 1, 1), k, np.uint8) for k in (0, 1))
-    recipe = RecogniserRecipe(views_per_object=2000, batch=50, deformed_share=0.5, balanced=False)
+    recipe = RecogniserRecipe(
+        views_per_object=2000,
+        batch=50,
+        deformed_share=0.5,
+        balanced=False,
+    )
     sources = [StoredInputs(own, np.arange(2)), StoredInputs(twins, np.array([-1, 0]))]
     views = Views(sources, np.arange(2), np.arange(2), recipe)
     drawn = [[x.numpy() for x in batch] for batch in views]
@@ -121,8 +150,14 @@ def test_augment_says_which_views_it_mirrored():
 def test_map_batches_hold_each_view_with_its_own_map():
     sphere, rng = ViewSphere.named("40"), np.random.default_rng(0)
     values = rng.random((7, 40)).astype(np.float32)
-    seen = np.zeros((7, 40, 4, 2, 2), np.uint8)  # object and view, in the left half of the image
-    seen[..., 0, 0, 0], seen[..., 1, 0, 0] = np.arange(7)[:, None] + 1, np.arange(40) + 1
+    seen = np.zeros(
+        (7, 40, 4, 2, 2),
+        np.uint8,
+    )  # object and view, in the left half of the image
+    seen[..., 0, 0, 0], seen[..., 1, 0, 0] = (
+        np.arange(7)[:, None] + 1,
+        np.arange(40) + 1,
+    )
     windows = Windows(
         seen,
         values,
@@ -139,7 +174,9 @@ def test_map_batches_hold_each_view_with_its_own_map():
             drawn.append((o, v))
             flips.append(image[0, 0, 1] > 0)
             steps = np.arange(8) * (-1 if flips[-1] else 1)
-            assert (target == values[o, np.arange(5)[:, None] * 8 + (v + steps) % 8]).all()
+            assert (
+                target == values[o, np.arange(5)[:, None] * 8 + (v + steps) % 8]
+            ).all()
     assert len(drawn) == 16
     assert len(set(drawn)) == 16  # no view comes twice before all have come
     assert {o for o, _ in drawn} == {1, 2, 5}
@@ -147,7 +184,10 @@ def test_map_batches_hold_each_view_with_its_own_map():
 
 
 def test_folds_divide_every_class_evenly_and_keep_twins_together():
-    labels, measured = np.repeat([0, 1], [12, 8]), np.random.default_rng(0).random((20, 5))
+    labels, measured = (
+        np.repeat([0, 1], [12, 8]),
+        np.random.default_rng(0).random((20, 5)),
+    )
     measured[15] = measured[3]  # one mesh, two labels
     folds = hold_out(labels, measured, 3, seed=1)
     assert sorted(np.concatenate(folds)) == list(range(20))
@@ -167,7 +207,13 @@ def test_the_mirror_plane_is_the_one_that_maps_the_views_into_each_other(tmp_pat
         distance = np.minimum((azimuth - plane) % 8, (plane - azimuth) % 8)
         values.append(profile[:, distance].ravel())
     names = [f"object_{i}" for i in range(15)]
-    store = store_of(tmp_path / "views.zarr", names, labels, SPHERE, depth_entropy=np.array(values))
+    store = store_of(
+        tmp_path / "views.zarr",
+        names,
+        labels,
+        SPHERE,
+        depth_entropy=np.array(values),
+    )
     assert training.mirror_planes(store, np.arange(15)).tolist() == [0, 1, 2]
     bins = training.azimuth_bins(store, 8, np.array([0.0, 1.0, 2.0])).reshape(15, 2, 8)
     assert bins[:, :, 0].tolist() == [[(-label) % 8] * 2 for label in labels]
@@ -180,9 +226,14 @@ def test_a_turned_object_is_seen_from_the_side_that_its_turn_says():
     turned = Deform(rotated=True)(mesh, 5, "chair_1")
     _, angle = Deform(rotated=True).draw(5, "chair_1")
     c, s = np.cos(-angle), np.sin(-angle)
-    back = make_mesh(turned.vertices @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T, mesh.faces)
+    back = make_mesh(
+        turned.vertices @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T,
+        mesh.faces,
+    )
     cameras = (SimulatedCamera(m, 32, SPHERE.distance) for m in (mesh, back))
-    a, b = (render_object(camera, SPHERE, 32)["depth"].astype(int) for camera in cameras)
+    a, b = (
+        render_object(camera, SPHERE, 32)["depth"].astype(int) for camera in cameras
+    )
     assert (np.abs(a - b) > 3).mean() < 0.01
 
 
@@ -197,7 +248,8 @@ def test_the_side_between_two_steps_counts_by_nearness():
         + 0.5 * likely[2, 1, 0]
     )
     assert training.side_loss(likely, label, side) == pytest.approx(
-        -float(likely[0, 0, 2] + between) / 3, rel=1e-5
+        -float(likely[0, 0, 2] + between) / 3,
+        rel=1e-5,
     )
 
 
@@ -250,7 +302,13 @@ def train(out, recipe=RECIPE, hardware=Hardware(), stop=None):
         patch.setattr(training, "recogniser_network", SmallNet)
         patch.setattr(training.RecogniserModule, "training_step", fatal)
         return training.fit_recogniser(
-            sources, labels, (objects[:9], objects[9:]), recipe, out, None, hardware
+            sources,
+            labels,
+            (objects[:9], objects[9:]),
+            recipe,
+            out,
+            None,
+            hardware,
         )
 
 
@@ -268,7 +326,9 @@ def uninterrupted(tmp_path_factory):
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 @pytest.mark.parametrize("stop", [(1, 2), (0, 1)], ids=["middle", "first"])
 def test_a_run_that_was_killed_in_mid_epoch_and_moved_resumes_the_same_to_the_bit(
-    tmp_path, uninterrupted, stop
+    tmp_path,
+    uninterrupted,
+    stop,
 ):
     whole, folder = uninterrupted
     (tmp_path / "a").mkdir()
@@ -335,7 +395,10 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
     fit(Scripted([1.0]), One(), One(), tmp_path, "score", "min", EXACT)
     last = tmp_path / "last.ckpt"
     last.write_bytes(last.read_bytes()[: last.stat().st_size // 2])
-    with pytest.raises(ModelError, match=r"last\.ckpt: a damaged checkpoint .* delete it"):
+    with pytest.raises(
+        ModelError,
+        match=r"last\.ckpt: a damaged checkpoint .* delete it",
+    ):
         fit(Scripted([1.0, 1.0]), One(), One(), tmp_path, "score", "min", EXACT)
 
 
@@ -350,7 +413,12 @@ def trained(shared, views):
 
     def make(folder: Path) -> None:
         train_recogniser(views, folder / "runs/recogniser", recipe=SMALL)
-        export_recogniser(folder / "runs/recogniser", views, folder / "models", name="tiny")
+        export_recogniser(
+            folder / "runs/recogniser",
+            views,
+            folder / "models",
+            name="tiny",
+        )
         train_map(views, folder / "runs/lem", recipe=SMALL_MAP)
         export_map(folder / "runs/lem", views, folder / "models", name="tiny-lem")
 
@@ -358,20 +426,28 @@ def trained(shared, views):
 
 
 def test_trained_models_have_cards_and_run(trained, views):
-    card, run = read_card(trained / "models/tiny.json"), read_run(trained / "runs/recogniser")
+    card, run = (
+        read_card(trained / "models/tiny.json"),
+        read_run(trained / "runs/recogniser"),
+    )
     assert card.classes == ("chair", "monitor", "table")
     # training leaves the test split alone
     assert [part.split()[0] for part in card.scores] == ["validation"]
     assert card.held_out == tuple(sorted(run.held_out))
     store = ViewStore.open(views)
     assert set(card.held_out) < {
-        n for n, split in zip(store.names, store.splits, strict=True) if split == "train"
+        n
+        for n, split in zip(store.names, store.splits, strict=True)
+        if split == "train"
     }
     evidence = NetworkRecogniser(trained / "models/tiny.json").from_inputs(
         np.zeros((3, 4, 32, 32), np.uint8)
     )
     assert evidence.logits.shape == (3, 3)
-    assert np.exp(evidence.azimuth_bins).sum(2) == pytest.approx(np.ones((3, 3)), abs=1e-4)
+    assert np.exp(evidence.azimuth_bins).sum(2) == pytest.approx(
+        np.ones((3, 3)),
+        abs=1e-4,
+    )
     lem = MapNetwork(trained / "models/tiny-lem.json").from_inputs(
         np.zeros((2, 4, 32, 32), np.uint8)
     )
@@ -387,17 +463,24 @@ def test_trained_models_have_cards_and_run(trained, views):
 
 def test_several_runs_are_averaged(trained, views, tmp_path):
     run = trained / "runs/recogniser"
-    train_recogniser(views, tmp_path / "on", weights=run, recipe=replace(SMALL, ensemble_seed=1))
+    train_recogniser(
+        views,
+        tmp_path / "on",
+        weights=run,
+        recipe=replace(SMALL, ensemble_seed=1),
+    )
     export_recogniser(run, views, tmp_path, ensemble=(tmp_path / "on",), name="both")
     x = load_inputs(views, 32)[0, :3]
     networks = [
-        run_network(folder, SMALL, ViewStore.open(views)) for folder in (run, tmp_path / "on")
+        run_network(folder, SMALL, ViewStore.open(views))
+        for folder in (run, tmp_path / "on")
     ]
     with torch.no_grad():
         outputs = [network(torch.from_numpy(x).float() / 255) for network in networks]
     both = NetworkRecogniser(tmp_path / "both.json")
     assert both.from_inputs(x).logits == pytest.approx(
-        sum(o[0] for o in outputs).numpy() / 2, abs=2e-2
+        sum(o[0] for o in outputs).numpy() / 2,
+        abs=2e-2,
     )
     assert both.card.network == "ResNet-18 + ResNet-18"
     assert [recipe["ensemble_seed"] for recipe in both.card.training.recipes] == [0, 1]
@@ -408,23 +491,40 @@ def test_a_network_goes_on_from_a_run(trained, views, tmp_path):
     network = ResNet(18, 3, 4, 8)
     start_from(network, run)
     expected = load_run(ResNet(18, 3, 4, 8), run).state_dict()
-    assert all(torch.equal(value, expected[name]) for name, value in network.state_dict().items())
+    assert all(
+        torch.equal(value, expected[name])
+        for name, value in network.state_dict().items()
+    )
     maps = ViewMap(5, 8, 18, 4)
     head = maps.resnet.fc.weight.clone()
     start_from(maps.resnet, run, head=False)
-    assert torch.equal(maps.resnet.layer2[0].conv1.weight, expected["layer2.0.conv1.weight"])
+    assert torch.equal(
+        maps.resnet.layer2[0].conv1.weight,
+        expected["layer2.0.conv1.weight"],
+    )
     assert torch.equal(maps.resnet.fc.weight, head)
     start_from(maps.resnet, trained / "runs/lem")
     assert not torch.equal(maps.resnet.fc.weight, head)
     train_map(
-        views, tmp_path / "lem", weights=trained / "runs/lem", recipe=replace(SMALL_MAP, lr=0.0)
+        views,
+        tmp_path / "lem",
+        weights=trained / "runs/lem",
+        recipe=replace(SMALL_MAP, lr=0.0),
     )
-    last = torch.load(tmp_path / "lem/network.pt", weights_only=True)["resnet.fc.weight"]
+    last = torch.load(tmp_path / "lem/network.pt", weights_only=True)[
+        "resnet.fc.weight"
+    ]
     # a rate of 0 leaves the weights that it was given
     assert torch.equal(last, maps.resnet.fc.weight)
-    with pytest.raises(ModelError, match=r"was trained on .* objects that this network must not"):
+    with pytest.raises(
+        ModelError,
+        match=r"was trained on .* objects that this network must not",
+    ):
         train_recogniser(
-            views, tmp_path / "seen", weights=run, recipe=replace(SMALL, validation_share=0.5)
+            views,
+            tmp_path / "seen",
+            weights=run,
+            recipe=replace(SMALL, validation_share=0.5),
         )
     with pytest.raises(ModelError, match="other first weights"):
         train_map(views, tmp_path / "lem", recipe=replace(SMALL_MAP, lr=0.0))
@@ -446,17 +546,27 @@ def test_the_published_networks_train_on_images_and_clouds(views, tmp_path):
         batch=4,
         validation_share=0.25,
     )
-    assert train_recogniser(views, tmp_path / "image", recipe=image) == [tmp_path / "image"]
+    assert train_recogniser(views, tmp_path / "image", recipe=image) == [
+        tmp_path / "image"
+    ]
     run = read_run(tmp_path / "image")
     assert run.recipe == asdict(image)
     assert set(run.validation) == set(run.held_out)
-    assert torch.load(tmp_path / "image/network.pt", weights_only=True)["conv1.weight"].shape == (
+    assert torch.load(tmp_path / "image/network.pt", weights_only=True)[
+        "conv1.weight"
+    ].shape == (
         64,
         1,
         7,
         7,
     )
-    cloud = replace(THESIS_MAP, epochs=1, views_per_object=1, points=64, validation_share=0.25)
+    cloud = replace(
+        THESIS_MAP,
+        epochs=1,
+        views_per_object=1,
+        points=64,
+        validation_share=0.25,
+    )
     train_map(views, tmp_path / "cloud", recipe=cloud)
     made = export_map(tmp_path / "cloud", views, tmp_path, name="published")
     seen = from_store(InputSpec("cloud"), ViewStore.open(views), 0)[:2]
@@ -473,7 +583,9 @@ def test_what_is_no_finished_run_is_not_exported(trained, views, tmp_path):
     (tmp_path / "run.json").write_bytes((trained / "runs/lem/run.json").read_bytes())
     with pytest.raises(ModelError, match="the training is not done"):
         export_map(tmp_path, views, tmp_path / "models")
-    (tmp_path / "network.pt").write_bytes((trained / "runs/lem/network.pt").read_bytes()[:10_000])
+    (tmp_path / "network.pt").write_bytes(
+        (trained / "runs/lem/network.pt").read_bytes()[:10_000]
+    )
     with pytest.raises(ModelError, match="damaged"):
         export_map(tmp_path, views, tmp_path / "models")
     assert not (tmp_path / "models").exists()

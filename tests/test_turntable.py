@@ -19,7 +19,9 @@ from nextview.simulation.scene import square
 from nextview.teaching.learn import learn
 
 RADIUS, N, SHAPE = 0.3, 24, (240, 320)
-K = np.array([[262.5, 0, 159.5], [0, 262.5, 119.5], [0, 0, 1]])  # first pixel's centre at 0
+K = np.array(
+    [[262.5, 0, 159.5], [0, 262.5, 119.5], [0, 0, 1]]
+)  # first pixel's centre at 0
 POSE = look_at_origin(np.radians(35), np.radians(20), 4.2 * RADIUS)
 POSE[2, 3] += 0.4 * RADIUS
 
@@ -31,20 +33,28 @@ def write_frames(folder, angles):
     folder.mkdir(parents=True)
     np.savetxt(folder / "camera-intrinsics.txt", K)
     mesh = sample_mesh("chair")
-    vertices = RADIUS * (mesh.vertices + np.array([0.2, -0.1, -mesh.vertices[:, 2].min()]))
+    vertices = RADIUS * (
+        mesh.vertices + np.array([0.2, -0.1, -mesh.vertices[:, 2].min()])
+    )
     rays = (
-        PinholeCamera.of(K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), SHAPE).rays.reshape(
-            -1, 3
-        )
+        PinholeCamera.of(
+            K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]),
+            SHAPE,
+        ).rays.reshape(-1, 3)
         @ POSE[:3, :3].T
     )
     for i, angle in enumerate(angles):
         c, s = np.cos(angle), np.sin(angle)
         turned = vertices @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
         depth, which = RayCaster([(turned, mesh.faces), square(3 * RADIUS, 0.0)]).cast(
-            POSE[:3, 3], rays
+            POSE[:3, 3],
+            rays,
         )
-        millimetres = np.rint(1000 * np.where(which < 0, 0, depth)).astype(np.uint16).reshape(SHAPE)
+        millimetres = (
+            np.rint(1000 * np.where(which < 0, 0, depth))
+            .astype(np.uint16)
+            .reshape(SHAPE)
+        )
         Image.fromarray(millimetres).save(folder / f"{i:02d}.png")
     return folder
 
@@ -52,7 +62,8 @@ def write_frames(folder, angles):
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory):
     return write_frames(
-        tmp_path_factory.mktemp("turntable") / "chair", 2 * np.pi * np.arange(N) / N
+        tmp_path_factory.mktemp("turntable") / "chair",
+        2 * np.pi * np.arange(N) / N,
     )
 
 
@@ -67,12 +78,17 @@ def test_the_poses_are_those_of_the_camera_around_the_axis(frames):
         np.testing.assert_allclose(frame.pose[2, :3], POSE[2, :3], atol=0.01)
         c, s = np.cos(2 * np.pi * i / N), np.sin(2 * np.pi * i / N)
         np.testing.assert_allclose(
-            first[:3, :3], [[c, -s, 0], [s, c, 0], [0, 0, 1]] @ frame.pose[:3, :3], atol=1e-9
+            first[:3, :3],
+            [[c, -s, 0], [s, c, 0], [0, 0, 1]] @ frame.pose[:3, :3],
+            atol=1e-9,
         )
 
 
 def test_what_does_not_fit_is_noticed(frames, tmp_path):
-    with pytest.raises(DatasetError, match="agree if the thing turned the other way, not cw"):
+    with pytest.raises(
+        DatasetError,
+        match="agree if the thing turned the other way, not cw",
+    ):
         read_turntable(frames, "cw")
     half = write_frames(tmp_path / "half", np.pi * np.arange(N) / N)
     with pytest.raises(DatasetError, match="equal steps through a full circle"):
@@ -80,22 +96,39 @@ def test_what_does_not_fit_is_noticed(frames, tmp_path):
     steps = np.random.default_rng(0).uniform(0.3, 1.7, N)
     with pytest.raises(DatasetError, match="equal steps through a full circle"):
         read_turntable(
-            write_frames(tmp_path / "uneven", 2 * np.pi * np.cumsum(steps) / steps.sum()), "ccw"
+            write_frames(
+                tmp_path / "uneven",
+                2 * np.pi * np.cumsum(steps) / steps.sum(),
+            ),
+            "ccw",
         )
 
 
 def test_a_thing_from_a_turntable_is_recognised_by_its_mesh(frames, scans, tmp_path):
     shutil.copytree(frames, tmp_path / "things/chair")
     with pytest.raises(
-        DatasetError, match=r"chair: its frames have no poses; --turntable ccw or cw says"
+        DatasetError,
+        match=r"chair: its frames have no poses; --turntable ccw or cw says",
     ):
         learn(tmp_path / "things", tmp_path / "mine", workers=0)
     for name in ("monitor", "table"):
         shutil.copy(scans / f"{name}.off", tmp_path / "things")
-    found = learn(tmp_path / "things", tmp_path / "mine", upright=True, turntable="ccw", workers=0)
+    found = learn(
+        tmp_path / "things",
+        tmp_path / "mine",
+        upright=True,
+        turntable="ccw",
+        workers=0,
+    )
     assert (found.things, found.left_out) == (3, ())
     system = nextview.load(models=tmp_path / "mine", unknown=0)
     for name in ("chair", "monitor", "table"):
         assert (
-            system.recognise(scans / f"{name}.off", start=17, sensor="wrist", seed=1).answer == name
+            system.recognise(
+                scans / f"{name}.off",
+                start=17,
+                sensor="wrist",
+                seed=1,
+            ).answer
+            == name
         )

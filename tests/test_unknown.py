@@ -37,7 +37,9 @@ from nextview.training.unknown import quantiles
 
 def some_score(rng, f=7, neighbours=40, objects=50, levels=31, n_views=4) -> Novelty:
     return Novelty(
-        quantiles=np.sort(rng.normal(size=(n_views, levels)), axis=1).astype(np.float32),
+        quantiles=np.sort(rng.normal(size=(n_views, levels)), axis=1).astype(
+            np.float32
+        ),
         objects=np.array([objects]),
         neighbours=as_stored(units(rng, neighbours, f)),
         standard=np.array([[-0.8, 0.2], [-0.9, 0.1]], np.float32),
@@ -57,11 +59,15 @@ def test_the_score_is_what_brute_force_gives():
     score, views = some_score(rng), units(rng, 20, 7)
     # Between unit vectors the squared distance is 2 less twice their product; the rows are units up
     # to rounding.
-    products = (1 + (score.neighbours**2).sum(1) - cdist(views, score.neighbours) ** 2) / 2
+    products = (
+        1 + (score.neighbours**2).sum(1) - cdist(views, score.neighbours) ** 2
+    ) / 2
     tenth = np.sort(products, 1)[:, -NEIGHBOUR]
     np.testing.assert_allclose(score.scores(views), (-tenth + 0.8) / 0.2, atol=1e-4)
     np.testing.assert_allclose(
-        score.scores(views, np.arange(20) > 9)[10:], (-tenth[10:] + 0.9) / 0.1, atol=1e-4
+        score.scores(views, np.arange(20) > 9)[10:],
+        (-tenth[10:] + 0.9) / 0.1,
+        atol=1e-4,
     )
 
 
@@ -91,7 +97,12 @@ def test_a_score_beyond_all_of_few_known_views_is_as_rare_as_a_normal_distributi
     rng = np.random.default_rng(0)
     few, many = rng.normal(3, 2, 48), rng.normal(3, 2, 100_000)
     table = np.quantile(few, np.linspace(0, 1, 101))[None]
-    score = Quantiles(table, np.array([48]), joint=True, usual=np.array([[0.0, 1.0], [0.5, 0.0]]))
+    score = Quantiles(
+        table,
+        np.array([48]),
+        joint=True,
+        usual=np.array([[0.0, 1.0], [0.5, 0.0]]),
+    )
     assert score.of_belief(np.array([-9.0, -8.0]), 1) == 7.0
     assert score.of_belief(np.array([-7.0, -8.0]), 5) == 6.5
     assert score.p_value(few.max(), 1) == 1 / 49  # no more can be said by counting
@@ -104,14 +115,19 @@ def test_a_score_beyond_all_of_few_known_views_is_as_rare_as_a_normal_distributi
 def test_a_score_is_read_as_it_was_written_and_what_is_missing_damaged_or_another_is_refused(
     tmp_path,
 ):
-    score, path = some_score(np.random.default_rng(6)), tmp_path / "a.novelty.safetensors"
+    score, path = (
+        some_score(np.random.default_rng(6)),
+        tmp_path / "a.novelty.safetensors",
+    )
     sha256 = score.save(path)
     again = read_novelty(path, sha256)
     for name, values in vars(score).items():
         np.testing.assert_array_equal(getattr(again, name), values)
     in_halves(path)
     np.testing.assert_allclose(
-        read_novelty(path, sha256_of(path)).neighbours, score.neighbours, atol=1e-3
+        read_novelty(path, sha256_of(path)).neighbours,
+        score.neighbours,
+        atol=1e-3,
     )
     with pytest.raises(ModelError, match="other features; run nextview fit unknown"):
         again.scores(np.zeros((1, 8)))
@@ -148,7 +164,8 @@ MUTATIONS = {
 OF_ONE = {
     ("quantiles", "descending"): lambda values: values[:, ::-1],
     ("quantiles", "a pair out of order"): lambda values: values[
-        :, [1, 0, *range(2, values.shape[1])]
+        :,
+        [1, 0, *range(2, values.shape[1])],
     ],
     ("quantiles", "a single one"): lambda values: values[:, :1],
     ("objects", "none"): lambda values: values * 0,
@@ -156,7 +173,9 @@ OF_ONE = {
     ("objects", "two"): lambda values: np.repeat(values, 2),
     ("neighbours", "too few"): lambda values: values[: NEIGHBOUR - 1],
     ("neighbours", "half as long"): lambda values: values / 2,
-    ("neighbours", "a zero vector"): lambda values: np.vstack([values[1:], 0 * values[:1]]),
+    ("neighbours", "a zero vector"): lambda values: np.vstack(
+        [values[1:], 0 * values[:1]]
+    ),
     ("standard", "no deviation"): lambda values: values * (1, 0),
     ("standard", "a negative deviation"): lambda values: values * (1, -1),
     ("standard", "three"): lambda values: np.vstack([values, values[:1]]),
@@ -189,16 +208,23 @@ def in_halves(path):
     """The file as earlier versions wrote it, with the known views in half precision."""
     arrays = load_file(path)
     rows = arrays["neighbours"].astype(np.float32)
-    arrays["neighbours"] = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float16)
+    arrays["neighbours"] = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(
+        np.float16
+    )
     save_file(arrays, path)
 
 
 @pytest.mark.parametrize("halves", [False, True], ids=["eight bits", "half precision"])
 @pytest.mark.parametrize(
-    ("name", "how", "change"), [pytest.param(*m, id="-".join(m[:2])) for m in mutations()]
+    ("name", "how", "change"),
+    [pytest.param(*m, id="-".join(m[:2])) for m in mutations()],
 )
 def test_every_value_of_a_novelty_file_is_checked_though_its_hash_is_right(
-    tmp_path, name, how, change, halves
+    tmp_path,
+    name,
+    how,
+    change,
+    halves,
 ):
     if name == "neighbours" and not halves and how not in OF_BYTES:
         pytest.skip("bytes have no such values")
@@ -212,22 +238,34 @@ def test_every_value_of_a_novelty_file_is_checked_though_its_hash_is_right(
     changed = change(arrays.pop(name))
     if changed is not None:
         arrays[name] = changed
-    save_file({key: np.array(values, order="C") for key, values in arrays.items()}, path)
+    save_file(
+        {key: np.array(values, order="C") for key, values in arrays.items()},
+        path,
+    )
     with pytest.raises(
-        ModelError, match=r"^\S+/a\.novelty\.safetensors: not a novelty score \(it\S* .*\)$"
+        ModelError,
+        match=r"^\S+/a\.novelty\.safetensors: not a novelty score \(it\S* .*\)$",
     ):
         read_novelty(path, sha256_of(path))
 
 
-@pytest.mark.parametrize(("beside", "share"), [(5.0, 0), (2.7, 0), (1.0, 24 / 76), (0.0, 0)])
-def test_the_share_of_an_outline_that_is_hidden_is_that_beside_something_nearer(beside, share):
+@pytest.mark.parametrize(
+    ("beside", "share"),
+    [(5.0, 0), (2.7, 0), (1.0, 24 / 76), (0.0, 0)],
+)
+def test_the_share_of_an_outline_that_is_hidden_is_that_beside_something_nearer(
+    beside,
+    share,
+):
     depth, target = np.full((60, 60), 3.0, np.float32), np.zeros((60, 60), bool)
-    target[20:40, 20:40] = True  # with 76 pixels of outline: 20 to each side, and 4 near a corner
+    target[20:40, 20:40] = (
+        True  # with 76 pixels of outline: 20 to each side, and 4 near a corner
+    )
     depth[20:40, 40:] = beside
     depth[20:40, 42:] = 5.0
-    assert hidden_share(SceneView(depth, target, np.eye(4), np.eye(3))) == pytest.approx(
-        share, abs=1e-9
-    )
+    assert hidden_share(
+        SceneView(depth, target, np.eye(4), np.eye(3))
+    ) == pytest.approx(share, abs=1e-9)
 
 
 # Sessions
@@ -251,7 +289,12 @@ def recognised(p, unknown, camera=None):
     before, recogniser.novelty = recogniser.novelty, FixedNovelty(p)
     try:
         session = nextview.Session(
-            system.models, system.policy, system.sphere, 3, Stopping(0.9, 2), unknown=unknown
+            system.models,
+            system.policy,
+            system.sphere,
+            3,
+            Stopping(0.9, 2),
+            unknown=unknown,
         )
         return session.run(camera or SimulatedCamera(sample_mesh("chair")))
     finally:
@@ -289,7 +332,9 @@ def scrambled(seed):
     mesh, rng = sample_mesh("chair"), np.random.default_rng(seed)
     corners = mesh.vertices[mesh.faces]
     corners = (
-        corners - corners.mean(1, keepdims=True) + rng.uniform(-0.6, 0.6, (len(corners), 1, 3))
+        corners
+        - corners.mean(1, keepdims=True)
+        + rng.uniform(-0.6, 0.6, (len(corners), 1, 3))
     )
     return make_mesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 
@@ -305,7 +350,9 @@ def test_a_ball_and_a_scrambled_chair_are_unknown_and_the_samples_are_not(wary):
 
 def test_the_command_says_that_it_does_not_know(tmp_path, capsys):
     mesh = scrambled(0)
-    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(tmp_path / "heap.off")
+    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(
+        tmp_path / "heap.off"
+    )
     main(["recognise", str(tmp_path / "heap.off"), "--start", "3", "--unknown", "0.05"])
     said = " ".join(capsys.readouterr().out.split())
     assert "It is none of the 10 known classes (most like a " in said
@@ -328,20 +375,32 @@ def test_an_object_of_a_size_that_its_class_never_has_is_none_of_it():
 def test_a_suspicious_object_gets_no_confident_answer_and_is_looked_at_longer():
     usual, suspicious = recognised(0.5, 0.05), recognised(0.2, 0.05)
     assert (usual.confident, len(usual.views)) == (True, 1)
-    assert (suspicious.answer, suspicious.confident, len(suspicious.views)) == ("chair", False, 2)
+    assert (suspicious.answer, suspicious.confident, len(suspicious.views)) == (
+        "chair",
+        False,
+        2,
+    )
 
 
-def test_what_a_later_frame_shows_in_another_light_is_not_held_against_the_object(monkeypatch):
+def test_what_a_later_frame_shows_in_another_light_is_not_held_against_the_object(
+    monkeypatch,
+):
     """From the front a long box is half as long: novel.
 
     The frame from the side corrects that, also of the first.
     """
     scores = []
     monkeypatch.setattr(
-        Novelty, "scores", lambda self, embeddings, exact: np.full(len(embeddings), scores[-1])
+        Novelty,
+        "scores",
+        lambda self, embeddings, exact: np.full(len(embeddings), scores[-1]),
     )
-    monkeypatch.setattr(Novelty, "of_views", lambda self, scores: float(np.mean(scores) < 1))
-    session = nextview.load(threshold=0.1).session(object=ObservedObject(life_size=False))
+    monkeypatch.setattr(
+        Novelty, "of_views", lambda self, scores: float(np.mean(scores) < 1)
+    )
+    session = nextview.load(threshold=0.1).session(
+        object=ObservedObject(life_size=False)
+    )
     for k, pose in enumerate(
         (pose_at(4, 0, 0.8, (0, 0, 0.06)), pose_at(45, 90, 0.8, (0, 0, 0.06)))
     ):
@@ -356,16 +415,26 @@ def test_what_a_later_frame_shows_in_another_light_is_not_held_against_the_objec
 
 
 @pytest.mark.parametrize(
-    ("score", "joins", "asked"), [(9.0, ["never"], 1), (9.0, [], 0), (0.0, ["never"], 0)]
+    ("score", "joins", "asked"),
+    [(9.0, ["never"], 1), (9.0, [], 0), (0.0, ["never"], 0)],
 )
-def test_only_a_novel_object_that_touches_another_is_reconsidered(monkeypatch, score, joins, asked):
+def test_only_a_novel_object_that_touches_another_is_reconsidered(
+    monkeypatch,
+    score,
+    joins,
+    asked,
+):
     calls, pose = [], pose_at(40, 20, 0.8, (0, 0, 0.06))
     monkeypatch.setattr(
-        Novelty, "scores", lambda self, embeddings, exact: np.full(len(embeddings), score)
+        Novelty,
+        "scores",
+        lambda self, embeddings, exact: np.full(len(embeddings), score),
     )
     monkeypatch.setattr(ObservedObject, "other_joins", lambda self: joins)
     monkeypatch.setattr(
-        ObservedObject, "reconsider", lambda self, novelty: calls.append(novelty(self.observations))
+        ObservedObject,
+        "reconsider",
+        lambda self, novelty: calls.append(novelty(self.observations)),
     )
     depth = cast([TABLE, box((0.4, 0.12, 0.12), (0, 0, 0.06))], pose)[0]
     nextview.load().session(object=ObservedObject()).update(

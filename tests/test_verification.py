@@ -18,7 +18,13 @@ from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin, rotation_z
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, MetricImage, depth_view
+from nextview.things.depth_view import (
+    ELSEWHERE,
+    NOT_MEASURED,
+    THING,
+    MetricImage,
+    depth_view,
+)
 from nextview.things.fusion import fuse
 from nextview.things.ground import levelling
 from nextview.things.memory import TaughtRecogniser
@@ -40,7 +46,12 @@ from nextview.things.taught import TaughtThings
 from nextview.things.unknown import KnownResiduals
 from nextview.things.verification import likelihood
 from nextview.things.verifier import Verified, Verifier
-from nextview.things.weighing import VIEW_CORRELATIONS, EvidenceWeights, JudgedEpisode, fit_weights
+from nextview.things.weighing import (
+    VIEW_CORRELATIONS,
+    EvidenceWeights,
+    JudgedEpisode,
+    fit_weights,
+)
 
 SIDE = 40
 VIEWS = ((25.0, 20.0), (50.0, 140.0), (35.0, 260.0))  # elevation and azimuth, degrees
@@ -96,7 +107,12 @@ def displaced(observation: Observation, by) -> Observation:
 
 def with_scene(observation: Observation, depth, target) -> Observation:
     """The same view with all that the camera saw, depth in object radii."""
-    scene = SceneView(depth.astype(np.float32), target, observation.pose, observation.intrinsics)
+    scene = SceneView(
+        depth.astype(np.float32),
+        target,
+        observation.pose,
+        observation.intrinsics,
+    )
     return replace(observation, scene=scene)
 
 
@@ -113,15 +129,27 @@ def off_by(found: np.ndarray, true: np.ndarray, at: np.ndarray) -> tuple[float, 
     return float(np.degrees(turn)), float(1000 * np.linalg.norm(moved[:3]))
 
 
-def aligned(mesh: Mesh, observations, yaws) -> tuple[SurfaceCaster, np.ndarray, np.ndarray]:
+def aligned(
+    mesh: Mesh,
+    observations,
+    yaws,
+) -> tuple[SurfaceCaster, np.ndarray, np.ndarray]:
     """Poses found from some azimuths, and how likely the views are with each."""
     caster = SurfaceCaster([Surface.from_mesh(mesh, "thing")])
     coarse = [depth_view(each, 24) for each in observations]
     fine = [depth_view(each, SIDE) for each in observations]
     found = start(np.zeros(len(yaws), int), rotation_z(yaws), len(observations))
-    found = align(caster, centred(caster, found, coarse), coarse, (*FIRST, *COARSE_LEVELS))
+    found = align(
+        caster,
+        centred(caster, found, coarse),
+        coarse,
+        (*FIRST, *COARSE_LEVELS),
+    )
     found = align(caster, found, fine, FINE)
-    judged = [likelihood(view, render(caster, found, view, k)).mean for k, view in enumerate(fine)]
+    judged = [
+        likelihood(view, render(caster, found, view, k)).mean
+        for k, view in enumerate(fine)
+    ]
     return found, found.poses(caster), np.sum(judged, 0)
 
 
@@ -143,7 +171,8 @@ def test_a_tilt_of_the_vertical_is_found_too():
     shown = rotated(mesh, lean)
     camera = SimulatedCamera(shown)
     observations = [
-        camera.observe(look_at_origin(np.radians(up), np.radians(around))) for up, around in VIEWS
+        camera.observe(look_at_origin(np.radians(up), np.radians(around)))
+        for up, around in VIEWS
     ]
     _, poses, _ = aligned(mesh, observations, np.array([0.35]))
     true = np.eye(4)
@@ -187,7 +216,10 @@ def test_a_missing_handle_lowers_the_likelihood():
         view = depth_view(observation, SIDE)
         found = start(np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), 1)
         found = align(
-            caster, centred(caster, found, [view]), [view], (*FIRST, *COARSE_LEVELS, *FINE)
+            caster,
+            centred(caster, found, [view]),
+            [view],
+            (*FIRST, *COARSE_LEVELS, *FINE),
         )
         with_it, without = likelihood(view, render(caster, found, view, 0)).mean
         assert (with_it > without + 0.1) == handle
@@ -196,8 +228,16 @@ def test_a_missing_handle_lowers_the_likelihood():
 @pytest.mark.parametrize("times", [0.2, 8.0])  # a die, and a cupboard
 def test_small_and_large_things_are_aligned_as_well(times):
     mesh = l_block()
-    scaled = make_mesh(times * (mesh.vertices * mesh.radius + mesh.centre), mesh.faces, unit="m")
-    _, poses, likely = aligned(scaled, views_of(scaled, 2.0)[:2], np.arange(8) * np.pi / 4)
+    scaled = make_mesh(
+        times * (mesh.vertices * mesh.radius + mesh.centre),
+        mesh.faces,
+        unit="m",
+    )
+    _, poses, likely = aligned(
+        scaled,
+        views_of(scaled, 2.0)[:2],
+        np.arange(8) * np.pi / 4,
+    )
     turn, moved = off_by(poses[likely.argmax()], true_pose(scaled, 2.0), scaled.centre)
     assert turn < 1
     assert moved < max(1, times)
@@ -216,7 +256,9 @@ def standing_view(mesh: Mesh, lean: np.ndarray, noise: float = 0.0) -> Observati
     table = (bottom - observation.pose[:3, 3] @ up) / (rays @ up)
     target = observation.depth > 0
     depth = np.where(target, observation.depth, table)
-    q = 1 / depth + noise * observation.radius * np.random.default_rng(0).normal(size=depth.shape)
+    q = 1 / depth + noise * observation.radius * np.random.default_rng(0).normal(
+        size=depth.shape
+    )
     return with_scene(observation, 1 / q, target)
 
 
@@ -264,7 +306,9 @@ def test_nothing_reaches_below_the_ground():
 
 
 def test_hypotheses_that_come_to_one_pose_are_one():
-    caster = SurfaceCaster([Surface.from_mesh(mesh, "thing") for mesh in (l_block(), cup(True))])
+    caster = SurfaceCaster(
+        [Surface.from_mesh(mesh, "thing") for mesh in (l_block(), cup(True))]
+    )
     turns = rotation_z(np.array([0.5, 0.51, 0.5, 0.9, 0.5]))
     placed = start(np.array([0, 0, 1, 0, 0]), turns, 1)
     placed.centres[4, 0] += 0.01
@@ -276,10 +320,17 @@ def test_a_pose_that_is_hardly_determined_has_no_negative_variance():
     rng = np.random.default_rng(0)
     factors = rng.normal(size=(20, 6, 6))
     full = factors @ factors.swapaxes(1, 2) + np.eye(6)
-    np.testing.assert_allclose(inverses(full), np.linalg.inv(full), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        inverses(full),
+        np.linalg.inv(full),
+        rtol=1e-9,
+        atol=1e-12,
+    )
 
     turns, _ = np.linalg.qr(factors)
-    strengths = np.array([1e12, 1e11, 1e9, 1e4, 1e-7, -1e-5])  # the last ones by rounding
+    strengths = np.array(
+        [1e12, 1e11, 1e9, 1e4, 1e-7, -1e-5]
+    )  # the last ones by rounding
     singular = (turns * strengths) @ turns.swapaxes(1, 2)
     assert (np.linalg.eigvalsh(inverses(singular)) > 0).all()
     assert (np.trace(inverses(singular), axis1=1, axis2=2) > 1e-6).all()
@@ -310,7 +361,11 @@ def mean_likelihood(observation, caster, placed) -> float:
 @pytest.mark.parametrize(
     ("distance", "lowers"),
     [(1.0, False), (5.0, True), (0.0, False)],
-    ids=["something stands before it", "the wall shows through it", "nothing is measured there"],
+    ids=[
+        "something stands before it",
+        "the wall shows through it",
+        "nothing is measured there",
+    ],
 )
 def test_what_shows_in_the_place_of_a_part(block_view, distance, lowers):
     observation, caster, placed = block_view
@@ -340,41 +395,65 @@ def test_a_few_pixels_at_the_outline_cost_little(block_view):
     depth, target = on_a_wall(observation)
     whole = mean_likelihood(with_scene(observation, depth, target), caster, placed)
     shifted = np.roll(depth, 1, axis=1), np.roll(target, 1, axis=1)
-    assert mean_likelihood(with_scene(observation, *shifted), caster, placed) > whole - 0.3
+    assert (
+        mean_likelihood(with_scene(observation, *shifted), caster, placed) > whole - 0.3
+    )
 
 
 def test_kinds_of_pixels():
     observation = views_of(l_block(), directions=VIEWS[:1])[0]
     depth, target = on_a_wall(observation)
-    depth[:, : depth.shape[1] // 2] = np.where(target, depth, 0)[:, : depth.shape[1] // 2]
+    depth[:, : depth.shape[1] // 2] = np.where(target, depth, 0)[
+        :,
+        : depth.shape[1] // 2,
+    ]
     view = depth_view(with_scene(observation, depth, target), SIDE)
     assert set(view.kind.tolist()) == {NOT_MEASURED, ELSEWHERE, THING}
     assert len(view.kind) == np.prod(view.shape)
     assert (view.edge[view.kind == THING] < 0).all()
     assert (view.edge[view.kind != THING] > 0).all()
     reach = np.linalg.norm(view.thing_points, axis=1).max()
-    assert reach == pytest.approx(observation.radius, rel=0.1)  # metres, about the centre
+    assert reach == pytest.approx(
+        observation.radius,
+        rel=0.1,
+    )  # metres, about the centre
     nothing = replace(observation, depth=np.zeros_like(observation.depth))
     assert depth_view(nothing, SIDE) is None
-    with pytest.raises(ObservationError, match="the object radius in metres is not known"):
+    with pytest.raises(
+        ObservationError,
+        match="the object radius in metres is not known",
+    ):
         depth_view(replace(observation, radius=None), SIDE)
 
 
 def test_rays_cast_at_many_surfaces_are_those_cast_at_each_alone():
     rng = np.random.default_rng(0)
-    meshes = [l_block(), cup(True), mesh_of(((0.5, 0.3, 0.2), (1.0, 2.0, 3.0))), cup(False)]
+    meshes = [
+        l_block(),
+        cup(True),
+        mesh_of(((0.5, 0.3, 0.2), (1.0, 2.0, 3.0))),
+        cup(False),
+    ]
     surfaces = [Surface.from_mesh(mesh, str(k)) for k, mesh in enumerate(meshes)]
     things = rng.integers(len(surfaces), size=12)
     directions = rng.normal(size=(12, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     centres = np.stack([surfaces[k].centre for k in things])
     origins = (centres + 0.8 * directions).astype(np.float32)
-    rays = (centres + rng.normal(0, 0.04, (200, 12, 3)) - origins).swapaxes(0, 1).astype(np.float32)
+    rays = (
+        (centres + rng.normal(0, 0.04, (200, 12, 3)) - origins)
+        .swapaxes(0, 1)
+        .astype(np.float32)
+    )
 
     depth, normals = SurfaceCaster(surfaces).cast(things, origins, rays)
     for row, thing in enumerate(things):
         alone = embree_scene([(surfaces[thing].vertices, surfaces[thing].faces)])
-        hits = alone.run(np.tile(origins[row], (200, 1)), np.ascontiguousarray(rays[row]), output=1)
+        hits = alone.run(
+            np.tile(origins[row], (200, 1)),
+            np.ascontiguousarray(rays[row]),
+            output=1,
+        )
         met = hits["primID"] >= 0
         # rays along an edge may go either way
         assert np.mean(met != np.isfinite(depth[row])) < 0.02
@@ -382,7 +461,11 @@ def test_rays_cast_at_many_surfaces_are_those_cast_at_each_alone():
         assert both.sum() > 20
         np.testing.assert_allclose(depth[row, both], hits["tfar"][both], atol=1e-4)
         assert (np.einsum("pi,pi->p", normals[row, both], rays[row, both]) < 0).all()
-        np.testing.assert_allclose(np.linalg.norm(normals[row, both], axis=1), 1, atol=1e-4)
+        np.testing.assert_allclose(
+            np.linalg.norm(normals[row, both], axis=1),
+            1,
+            atol=1e-4,
+        )
 
 
 def test_a_surface_keeps_the_frame_of_its_scan_and_loses_what_no_camera_sees():
@@ -395,7 +478,11 @@ def test_a_surface_keeps_the_frame_of_its_scan_and_loses_what_no_camera_sees():
     few = surface.simplified()
     assert len(few.faces) < len(surface.faces) / 4
     off = (
-        np.linalg.norm(few.sample(500, np.random.default_rng(0)) - (2.0, -1.0, 0.5), axis=1) - 0.05
+        np.linalg.norm(
+            few.sample(500, np.random.default_rng(0)) - (2.0, -1.0, 0.5),
+            axis=1,
+        )
+        - 0.05
     )
     assert np.abs(off).max() < 0.001
     block = Surface.from_mesh(l_block(), "block")
@@ -458,7 +545,11 @@ def even_belief(hypotheses: int) -> np.ndarray:
 
 def verifier_of(*meshes: Mesh) -> Verifier:
     surfaces = [Surface.from_mesh(mesh, str(k)) for k, mesh in enumerate(meshes)]
-    return Verifier(surfaces, np.arange(len(meshes)), np.tile(np.eye(3), (len(meshes), 1, 1)))
+    return Verifier(
+        surfaces,
+        np.arange(len(meshes)),
+        np.tile(np.eye(3), (len(meshes), 1, 1)),
+    )
 
 
 @pytest.mark.parametrize("shown", [0, 1, 2])
@@ -472,7 +563,11 @@ def test_a_thing_is_named_by_its_geometry_alone(shown):
     assert found.things[0] == shown
     assert found.residual < 0.2
     assert found.explained[0].min() > 0.9
-    turn, moved = off_by(found.poses[0], true_pose(meshes[shown], 0.8), meshes[shown].centre)
+    turn, moved = off_by(
+        found.poses[0],
+        true_pose(meshes[shown], 0.8),
+        meshes[shown].centre,
+    )
     assert moved < 1.5
     assert turn < 1 or shown == 2  # the cup without a handle has four azimuths
 
@@ -490,7 +585,9 @@ def test_what_does_not_fit_together_is_refused():
     surfaces = [Surface.from_mesh(cup(True), "cup")]
     with pytest.raises(ModelError, match="1 surfaces do not fit 2 resting poses"):
         Verifier(surfaces, np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)))
-    nothing = [replace(each, depth=np.zeros_like(each.depth)) for each in views_of(cup(True))]
+    nothing = [
+        replace(each, depth=np.zeros_like(each.depth)) for each in views_of(cup(True))
+    ]
     with pytest.raises(ObservationError, match="no view shows the thing"):
         verifier(nothing, even_belief(2))
 
@@ -501,13 +598,21 @@ def residual_of(verifier: Verifier, mesh: Mesh) -> Verified:
 
 def test_what_no_hypothesis_explains_has_a_small_p_value():
     known = KnownResiduals.fit(
-        np.array([0, 0, 1, 1]), np.array([0.1, 0.2, 0.15, 0.25]), np.array([2, 2, 2, 2]), 2
+        np.array([0, 0, 1, 1]),
+        np.array([0.1, 0.2, 0.15, 0.25]),
+        np.array([2, 2, 2, 2]),
+        2,
     )
     verifier = verifier_of(cup(True), l_block())
-    stranger = mesh_of(((0.12, 0.12, 0.02), (0, 0, 0)), ((0.02, 0.02, 0.12), (0, 0, 0.05)))
+    stranger = mesh_of(
+        ((0.12, 0.12, 0.02), (0, 0, 0)),
+        ((0.02, 0.02, 0.12), (0, 0, 0.05)),
+    )
     taught, strange = residual_of(verifier, l_block()), residual_of(verifier, stranger)
     # the least of 1 in 5
-    assert known.p_value(strange.residual, int(strange.things[0]), 2) == pytest.approx(0.2)
+    assert known.p_value(strange.residual, int(strange.things[0]), 2) == pytest.approx(
+        0.2
+    )
     assert known.p_value(taught.residual, int(taught.things[0]), 2) > 0.5
 
 
@@ -536,24 +641,47 @@ def test_what_the_noise_of_a_real_camera_explains_is_no_stranger():
     # a banana does not explain a ring, though it lies on a part of it
     assert known.of_real_camera(explained, 0, 1, explained=0.5) == pytest.approx(0.01)
     # a camera that is more exact than the scan does not err by its noise
-    assert known.of_real_camera(0.4 * explained, 0, 1, noise_share=0.4) == pytest.approx(0.01)
+    assert known.of_real_camera(
+        0.4 * explained,
+        0,
+        1,
+        noise_share=0.4,
+    ) == pytest.approx(0.01)
     assert known.of_real_camera(explained, 0, 1, noise_share=0.9) == pytest.approx(0.01)
     assert known.of_real_camera(0.9 * explained, 0, 1, noise_share=0.9) >= 0.5
     # better explained things have larger p-values still
     assert known.of_real_camera(0.04, 0, 1) > known.of_real_camera(0.06, 0, 1)
 
 
-def episode(geometry: float, features: float, truth: int = 0, views: int = 1) -> JudgedEpisode:
+def episode(
+    geometry: float,
+    features: float,
+    truth: int = 0,
+    views: int = 1,
+) -> JudgedEpisode:
     """Two things; by how much geometry, in each view, and features speak for the first one."""
     mean = np.tile([[geometry], [0.0]], (1, views))
     by_features = np.exp([features, 0.0])
     by_features /= by_features.sum()
     costs = np.zeros((2, views))
-    return JudgedEpisode(truth, np.array([0, 1]), mean, costs, np.log(by_features), by_features)
+    return JudgedEpisode(
+        truth,
+        np.array([0, 1]),
+        mean,
+        costs,
+        np.log(by_features),
+        by_features,
+    )
 
 
 def test_the_belief_follows_from_the_sum_of_what_is_weighed():
-    weights = EvidenceWeights(geometry=10, features=0.5, cameras=0.2, correlation=0.5, doubt=0.0)
+    weights = EvidenceWeights(
+        geometry=10,
+        features=0.5,
+        cameras=0.2,
+        correlation=0.5,
+        doubt=0.0,
+    )
     log_odds = 10 * 0.3 * 2 / 1.5 + 0.5 * -1.0
     belief = episode(0.3, -1.0, views=2).belief(weights)
     np.testing.assert_allclose(belief[0] / belief[1], np.exp(log_odds))
@@ -564,10 +692,13 @@ def test_the_belief_follows_from_the_sum_of_what_is_weighed():
 
 
 @pytest.mark.parametrize(
-    ("trusted", "geometry", "features"), [("geometry", 0.1, -1.0), ("features", -0.1, 1.0)]
+    ("trusted", "geometry", "features"),
+    [("geometry", 0.1, -1.0), ("features", -0.1, 1.0)],
 )
 def test_what_misleads_is_given_the_least_weight(trusted, geometry, features):
-    fitted = fit_weights([episode(geometry, features), episode(-geometry, -features, truth=1)])
+    fitted = fit_weights(
+        [episode(geometry, features), episode(-geometry, -features, truth=1)]
+    )
     assert fitted.geometry == (60 if trusted == "geometry" else 5)
     assert fitted.features == (0.2 if trusted == "geometry" else 1)
 
@@ -588,9 +719,12 @@ def test_views_that_err_together_are_not_trusted_as_many():
 
 def test_a_memory_and_scans_name_a_thing_and_tell_its_pose(taught, scans):
     recogniser = TaughtRecogniser(taught / "memory.json", threads=1)
-    meshes = {name: load_mesh(scans / f"{name}.off", unit="m") for name in ("chair", "table")}
+    meshes = {
+        name: load_mesh(scans / f"{name}.off", unit="m") for name in ("chair", "table")
+    }
     things = TaughtThings(
-        recogniser, [Surface.from_mesh(mesh, name) for name, mesh in meshes.items()]
+        recogniser,
+        [Surface.from_mesh(mesh, name) for name, mesh in meshes.items()],
     )
     for number, (name, mesh) in enumerate(meshes.items()):
         found = things(views_of(mesh, 1.1)[:2])
@@ -632,7 +766,9 @@ SYMMETRIC = {
     "prism of three": (prism(3), [3, 2]),
     "prism of five": (prism(5, 0.08), [5, 2]),
     "two arms": (
-        trimesh.util.concatenate([trimesh.creation.box((0.16, 0.03, 0.03)), prism(48, 0.03, 0.06)]),
+        trimesh.util.concatenate(
+            [trimesh.creation.box((0.16, 0.03, 0.03)), prism(48, 0.03, 0.06)]
+        ),
         [2, 2, 2],
     ),
 }
@@ -645,11 +781,15 @@ def test_symmetries_are_found_about_any_axis(name, seed):
     rotation, surface = turned_about(mesh.vertices, mesh.faces, seed)
     found = find_symmetries(surface)
     orders = [one.order for one in found]
-    if expected[0] % 2:  # several axes across an odd one are alike: one of them is enough
+    if (
+        expected[0] % 2
+    ):  # several axes across an odd one are alike: one of them is enough
         orders = orders[:1] + sorted(set(orders[1:]))
     assert orders == expected
     if len(set(expected)) > 1 or expected == [0]:
-        assert abs(rotation[:, 2] @ found[0].axis) > 0.998  # the axis of what is made here is z
+        assert (
+            abs(rotation[:, 2] @ found[0].axis) > 0.998
+        )  # the axis of what is made here is z
 
 
 def with_handle(size):
@@ -673,9 +813,13 @@ def test_a_sheet_has_the_symmetries_of_its_outline(thickness):
     found = find_symmetries(turned_about(sheet.vertices, sheet.faces, 4)[1])
     assert {one.order for one in found} == {2}
     irregular = trimesh.Trimesh(
-        [[0, 0, 0], [0.1, 0, 0], [-0.1, 0.2, 0]], [[0, 1, 2]], process=False
+        [[0, 0, 0], [0.1, 0, 0], [-0.1, 0.2, 0]],
+        [[0, 1, 2]],
+        process=False,
     )
-    assert find_symmetries(turned_about(irregular.vertices, irregular.faces, 5)[1]) == ()
+    assert (
+        find_symmetries(turned_about(irregular.vertices, irregular.faces, 5)[1]) == ()
+    )
 
 
 # Surfaces from frames
@@ -684,14 +828,28 @@ def test_a_sheet_has_the_symmetries_of_its_outline(thickness):
 @pytest.fixture(scope="module")
 def captured(tmp_path_factory):
     """A block with a thin wall, 12 cm long, captured from 12 viewpoints on a table; metres."""
-    mesh = mesh_of(((0.12, 0.06, 0.03), (0.0, 0.0, 0.0)), ((0.004, 0.06, 0.05), (0.03, 0.0, 0.04)))
+    mesh = mesh_of(
+        ((0.12, 0.06, 0.03), (0.0, 0.0, 0.0)),
+        ((0.004, 0.06, 0.05), (0.03, 0.0, 0.04)),
+    )
     folder = tmp_path_factory.mktemp("captured") / "block"
-    list(write_capture(mesh, folder, ViewSphere((15.0, 50.0), 6), mesh.metres, table=True))
+    list(
+        write_capture(
+            mesh,
+            folder,
+            ViewSphere((15.0, 50.0), 6),
+            mesh.metres,
+            table=True,
+        )
+    )
     return mesh, folder
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.0015])
-def test_a_surface_from_frames_lies_on_the_thing_and_covers_what_was_seen(captured, noise):
+def test_a_surface_from_frames_lies_on_the_thing_and_covers_what_was_seen(
+    captured,
+    noise,
+):
     mesh, folder = captured
     camera = CapturedCamera(read_capture(folder))
     rng = np.random.default_rng(4)
@@ -701,7 +859,9 @@ def test_a_surface_from_frames_lies_on_the_thing_and_covers_what_was_seen(captur
         frame = clean(pose)
         depth = frame.depth + (noise * rng.normal(size=frame.shape)).astype(np.float32)
         return replace(
-            frame, depth=np.where(frame.depth > 0, depth, 0).astype(np.float32), pixel_centre=0.5
+            frame,
+            depth=np.where(frame.depth > 0, depth, 0).astype(np.float32),
+            pixel_centre=0.5,
         )
 
     camera.observe = observe
@@ -713,7 +873,9 @@ def test_a_surface_from_frames_lies_on_the_thing_and_covers_what_was_seen(captur
     true = Surface.from_mesh(mesh, "block")
     truth = true.sample(100_000, rng) - true.centre + (0, 0, height)
     off = cKDTree(truth).query(surface.sample(2000, rng))[0]
-    assert off.mean() < 0.0006 + noise / 4  # samples of the truth lie half a millimetre apart
+    assert (
+        off.mean() < 0.0006 + noise / 4
+    )  # samples of the truth lie half a millimetre apart
     assert np.quantile(off, 0.95) < 0.0015 + noise
 
     seen = truth[truth[:, 2] > 0.004]  # not the side that it stands on
@@ -727,7 +889,9 @@ def test_of_frames_that_show_almost_nothing_there_is_no_surface(captured):
     one = camera.object.sightings[0]
     few = replace(one, facets=one.facets.some(slice(0, 20)))
     assert fuse([few], 0.07, "block") is None
-    assert fuse([replace(one, facets=one.facets.some(slice(0, 0)))], 0.07, "block") is None
+    assert (
+        fuse([replace(one, facets=one.facets.some(slice(0, 0)))], 0.07, "block") is None
+    )
 
 
 def can(knob: bool) -> Mesh:

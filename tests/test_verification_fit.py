@@ -31,12 +31,23 @@ def shown(thing, views, rng, things, gap=0.3, lie=0.0):
     """An episode in which the truth is explained better by a gap, but for a share of lies, and
     features say nothing.
     """
-    mean = -0.1 - gap * (np.arange(things) != thing)[:, None] + rng.normal(0, 0.02, (things, views))
+    mean = (
+        -0.1
+        - gap * (np.arange(things) != thing)[:, None]
+        + rng.normal(0, 0.02, (things, views))
+    )
     if rng.random() < lie:
         mean = np.roll(mean, 1, 0)
     numbers = np.arange(things)
     even = np.full(things, 1 / things)
-    judged = JudgedEpisode(thing, numbers, mean, np.zeros((things, views)), np.log(even), even)
+    judged = JudgedEpisode(
+        thing,
+        numbers,
+        mean,
+        np.zeros((things, views)),
+        np.log(even),
+        even,
+    )
     residual = 0.2 + 0.01 * thing + 0.005 * rng.normal()
     return Shown(thing, views, int(mean.sum(1).argmax()), residual, judged)
 
@@ -65,7 +76,9 @@ def test_few_things_that_are_told_apart_leave_the_weights_as_they_were(things):
 
 def test_many_confused_things_lower_the_weight_of_geometry_and_few_do_so_less():
     lies = {
-        things: weights_of(fit_verification(episodes(things, lie=0.4), np.arange(things)))
+        things: weights_of(
+            fit_verification(episodes(things, lie=0.4), np.arange(things))
+        )
         for things in (3, 12)
     }
     assert lies[12].geometry < lies[3].geometry < DEFAULTS.geometry
@@ -78,7 +91,11 @@ def test_the_accuracy_is_that_of_weights_that_were_fitted_to_other_things():
     things = 10
     fit = fit_verification(episodes(things, gap=0.0), np.arange(things))
     assert fit.accuracy[0] < 0.5
-    assert fit.by_features == (0.1, 0.1, 0.1)  # features say nothing: the first thing is named
+    assert fit.by_features == (
+        0.1,
+        0.1,
+        0.1,
+    )  # features say nothing: the first thing is named
     a, b, share = fit.confused[0]
     assert 0 <= a < b < things
     assert 0 < share <= 1
@@ -124,7 +141,10 @@ def test_of_very_many_residuals_quantiles_are_kept():
     assert len(kept.excess[0]) == 400
     full = KnownResiduals(np.zeros(2), (values,))
     for residual in (-1.0, 0.5, 1.9):
-        assert kept.p_value(residual, 0, 1) == pytest.approx(full.p_value(residual, 0, 1), abs=0.01)
+        assert kept.p_value(residual, 0, 1) == pytest.approx(
+            full.p_value(residual, 0, 1),
+            abs=0.01,
+        )
 
 
 def test_added_things_leave_weights_and_what_was_known_and_get_residuals_of_their_own():
@@ -135,15 +155,23 @@ def test_added_things_leave_weights_and_what_was_known_and_get_residuals_of_thei
     )
     rng = np.random.default_rng(2)
     new = [shown(1, views, rng, 3) for views in (1, 2, 3)]
-    after = with_new_things(before, new, np.arange(3), np.array([0, -1, 1])).verification
+    after = with_new_things(
+        before,
+        new,
+        np.arange(3),
+        np.array([0, -1, 1]),
+    ).verification
     assert (after.weights, after.things) == (before.weights, 2)
     assert (after.usual[0], after.usual[2]) == (0.3, 0.1)
-    assert 0.176 < after.usual[1] < 0.21  # between what is usual of the others and what was seen
+    assert (
+        0.176 < after.usual[1] < 0.21
+    )  # between what is usual of the others and what was seen
     assert [len(row) for row in after.excess] == [3, 3, 3]
 
 
 @pytest.mark.parametrize(
-    ("things", "of", "each"), [(1, 1, 16), (3, 3, 5), (1, 78, 2), (78, 78, 2), (1000, 1000, 2)]
+    ("things", "of", "each"),
+    [(1, 1, 16), (3, 3, 5), (1, 78, 2), (78, 78, 2), (1000, 1000, 2)],
 )
 def test_a_bounded_number_of_episodes_is_shown(things, of, each):
     items = to_be_shown(range(things), of, np.random.default_rng(0))
@@ -177,10 +205,14 @@ def test_learn_says_how_often_things_are_named_right_by_their_geometry(blocks):
     assert learned.accuracy[2] >= 0.8
     assert "by features and size alone" in str(learned)
     card = read_card(folder / "mine/memory.json")
-    assert card.scores["verified by geometry"]["3"] == pytest.approx(learned.accuracy[2], abs=1e-4)
+    assert card.scores["verified by geometry"]["3"] == pytest.approx(
+        learned.accuracy[2],
+        abs=1e-4,
+    )
     assert len(card.memory.verification.usual) == 4
     symmetries = {
-        thing.name: [one.order for one in thing.symmetries] for thing in card.memory.things
+        thing.name: [one.order for one in thing.symmetries]
+        for thing in card.memory.things
     }
     assert symmetries == {
         "small": [0, 0, 0],
@@ -201,14 +233,24 @@ def test_geometry_is_carried_over_and_only_new_things_are_shown(blocks, tmp_path
     for file in (folder / "mine").iterdir():
         (models / file.name).write_bytes(file.read_bytes())
 
-    learned = nextview.learn(scans, models, unit="mm", upright=True, workers=0, add=True)
+    learned = nextview.learn(
+        scans,
+        models,
+        unit="mm",
+        upright=True,
+        workers=0,
+        add=True,
+    )
     assert learned.judged == 1
     assert "of 1 of them" in str(learned)
     after = TaughtThings.of(TaughtRecogniser(models / "memory.json"))
     assert sorted(after.names) == sorted([*before.names, "can"])
     for number, name in enumerate(before.names):
         same = after.names.index(name)
-        old, new = before.verifier.caster.surfaces[number], after.verifier.caster.surfaces[same]
+        old, new = (
+            before.verifier.caster.surfaces[number],
+            after.verifier.caster.surfaces[same],
+        )
         np.testing.assert_array_equal(old.vertices, new.vertices)
         np.testing.assert_array_equal(old.faces, new.faces)
         assert before.symmetries[number] == after.symmetries[same]

@@ -44,7 +44,8 @@ def turned_views(mesh: Mesh, turn: np.ndarray):
     shown = rotated(mesh, turn)
     camera = SimulatedCamera(shown)
     observations = [
-        camera.observe(look_at_origin(np.radians(up), np.radians(around))) for up, around in VIEWS
+        camera.observe(look_at_origin(np.radians(up), np.radians(around)))
+        for up, around in VIEWS
     ]
     pose = np.eye(4)
     pose[:3, :3] = turn
@@ -55,7 +56,10 @@ def turned_views(mesh: Mesh, turn: np.ndarray):
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("thing", range(len(THINGS)))
 def test_a_thing_that_is_turned_about_all_axes_is_named_and_placed(
-    verifier, templates, thing, seed
+    verifier,
+    templates,
+    thing,
+    seed,
 ):
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
     observations, true = turned_views(THINGS[thing], turn)
@@ -113,7 +117,11 @@ def test_the_mismatch_is_what_is_defined():
     either = (one.outline[1] > 0) | (other.outline[2] > 0)
     apart = (one.depth[1] - other.depth[2])[both].std()
     ratio = np.log(one.size[1] / other.size[2])
-    expected = 8 * (1 - both.sum() / either.sum()) + 4 * apart + 3 * min((ratio / 0.1) ** 2 / 2, 3)
+    expected = (
+        8 * (1 - both.sum() / either.sum())
+        + 4 * apart
+        + 3 * min((ratio / 0.1) ** 2 / 2, 3)
+    )
     assert costs[1, 2] == pytest.approx(expected, rel=1e-4)
 
 
@@ -126,7 +134,9 @@ def test_directions_are_spread_evenly_and_cameras_look_along_them():
     assert nearest.max() < 20
     looks = looking_from(directions)
     np.testing.assert_allclose(
-        looks @ looks.swapaxes(1, 2), np.tile(np.eye(3), (162, 1, 1)), atol=1e-12
+        looks @ looks.swapaxes(1, 2),
+        np.tile(np.eye(3), (162, 1, 1)),
+        atol=1e-12,
     )
     np.testing.assert_allclose(np.linalg.det(looks), 1)
     np.testing.assert_allclose(looks[:, 2], -directions)

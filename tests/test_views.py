@@ -42,11 +42,14 @@ def test_the_numbers_are_those_of_a_benchmark_with_so_many_views(made, n_views):
         .sort_index()
     )
     for ours, theirs in (("accuracy", "accuracy"), ("travel", "travel_all")):
-        summary = tables.summary[tables.summary["measure"] == theirs].set_index("policy")
+        summary = tables.summary[tables.summary["measure"] == theirs].set_index(
+            "policy"
+        )
         for name in names:
             for column in ("value", "low", "high"):
                 assert found.loc[name, n_views, ours][column] == pytest.approx(
-                    summary.loc[name, column], abs=1e-9
+                    summary.loc[name, column],
+                    abs=1e-9,
                 )
     tests = tables.tests.query("measure == 'accuracy'").set_index("policy")
     for name in names[1:]:
@@ -57,7 +60,8 @@ def test_the_numbers_are_those_of_a_benchmark_with_so_many_views(made, n_views):
             ("p", "mcnemar"),
         ):
             assert found.loc[name, n_views, "to_random"][ours] == pytest.approx(
-                tests.loc[name, theirs], abs=1e-9
+                tests.loc[name, theirs],
+                abs=1e-9,
             )
 
 
@@ -71,7 +75,9 @@ def test_the_gap_is_that_between_random_and_one_step_of_foresight(made):
         accuracy, share = found["accuracy", n_views], found["share_of_gap", n_views]
         assert (share["random"], share["oracle-gain"]) == (0, pytest.approx(1))
         floor, top = accuracy["random"], accuracy["oracle-gain"]
-        assert share["spread"] == pytest.approx((accuracy["spread"] - floor) / (top - floor))
+        assert share["spread"] == pytest.approx(
+            (accuracy["spread"] - floor) / (top - floor)
+        )
 
 
 def test_the_command_writes_the_same_table_beside_its_own(made, capsys):
@@ -102,11 +108,16 @@ def test_the_command_writes_the_same_table_beside_its_own(made, capsys):
     assert "| policy | 2 views | 4 views |" in capsys.readouterr().out
     keys = ["policy", "n_views", "measure"]
     ours, script = (
-        pd.read_csv(f / "views.csv").set_index(keys).sort_index() for f in (out, made / "out")
+        pd.read_csv(f / "views.csv").set_index(keys).sort_index()
+        for f in (out, made / "out")
     )
     shared = ours.index[ours.index.get_level_values("policy") != "random-all"]
     for column in ("value", "low", "high", "p"):
-        np.testing.assert_allclose(ours.loc[shared, column], script.loc[shared, column], atol=1e-9)
+        np.testing.assert_allclose(
+            ours.loc[shared, column],
+            script.loc[shared, column],
+            atol=1e-9,
+        )
     assert (out / "views.md").read_text().startswith("| policy | 2 views")
     main(["report", str(out), "--figures", str(made / "figures")])
     written = {path.name for path in (made / "figures").iterdir()}
@@ -119,5 +130,13 @@ def test_the_command_writes_the_same_table_beside_its_own(made, capsys):
 
 
 def test_more_views_than_are_taken_are_refused(made, capsys):
-    words = refused(capsys, "benchmark", made / "p.npz", made / "no", "--views", "3", "7")
+    words = refused(
+        capsys,
+        "benchmark",
+        made / "p.npz",
+        made / "no",
+        "--views",
+        "3",
+        "7",
+    )
     assert "policies take 1 to 5 views (--max-views), and --views asks for 3 7" in words

@@ -21,7 +21,9 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parent.parent
-EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+    "optional-dependencies"
+]
 EXAMPLES = {
     "": (
         "import nextview; assert nextview.recognise('samples/chair.off', start=3).answer == 'chair'"
@@ -75,7 +77,9 @@ def wheel(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
     for name in ("src", "samples"):
         shutil.copytree(
-            ROOT / name, folder / name, ignore=shutil.ignore_patterns("*.egg-info", "__pycache__")
+            ROOT / name,
+            folder / name,
+            ignore=shutil.ignore_patterns("*.egg-info", "__pycache__"),
         )
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, folder)
@@ -97,7 +101,9 @@ def wheel(tmp_path_factory):
 
 HOLES = {
     "distributed": ["2025.12.0"],  # CVE-2026-23528
-    "filelock": ["3.20.2"],  # CVE-2025-68146, CVE-2026-22701: links put in the place of locks
+    "filelock": [
+        "3.20.2"
+    ],  # CVE-2025-68146, CVE-2026-22701: links put in the place of locks
     "jinja2": ["3.1.5"],  # CVE-2025-27516
     "lightning": ["2.6.2", "2.6.3"],  # uploaded by someone else than its makers
     "onnx": ["1.20.1"],
@@ -138,7 +144,8 @@ def test_the_constraints_are_within_what_is_asked_for():
     }
     table = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     for needed in map(
-        Requirement, table["dependencies"] + [each for extra in EXTRAS.values() for each in extra]
+        Requirement,
+        table["dependencies"] + [each for extra in EXTRAS.values() for each in extra],
     ):
         assert needed.specifier.contains(pinned[canonicalize_name(needed.name)]), needed
 
@@ -147,7 +154,10 @@ def test_every_extra_has_an_example():
     assert set(EXAMPLES) == {"", *EXTRAS}
 
 
-@pytest.mark.parametrize("extra", EXAMPLES if os.environ.get("NEXTVIEW_WHEELS") == "all" else QUICK)
+@pytest.mark.parametrize(
+    "extra",
+    EXAMPLES if os.environ.get("NEXTVIEW_WHEELS") == "all" else QUICK,
+)
 def test_it_runs_with_what_it_asks_for(wheel, extra, tmp_path):
     python, packages = empty_environment(tmp_path / "venv")
     zipfile.ZipFile(wheel).extractall(packages)
@@ -155,12 +165,17 @@ def test_it_runs_with_what_it_asks_for(wheel, extra, tmp_path):
     try:
         found = asked_for([(text, extra) for text in Distribution.at(own).requires])
     except PackageNotFoundError as missing:
-        pytest.skip(f"the extra {extra} is not installed here: {missing.name} is missing")
+        pytest.skip(
+            f"the extra {extra} is not installed here: {missing.name} is missing"
+        )
     for installed in found.values():
         link(installed, packages)
     run(python, "-c", EXAMPLES[extra], cwd=wheel.parents[1])
     assert f"{packages}" in run(
-        python, "-c", "import nextview; print(nextview.__file__)", cwd=tmp_path
+        python,
+        "-c",
+        "import nextview; print(nextview.__file__)",
+        cwd=tmp_path,
     )
 
 
@@ -177,11 +192,14 @@ def test_it_holds_the_package_and_nothing_else(wheel):
         for path in source.rglob("*")
         if path.is_file() and path.suffix not in (".py", ".pyc", ".toml")
     ]
-    assert {f"nextview/{path.relative_to(source).as_posix()}" for path in data} <= set(names)
+    assert {f"nextview/{path.relative_to(source).as_posix()}" for path in data} <= set(
+        names
+    )
 
 
 @pytest.mark.skipif(
-    os.environ.get("NEXTVIEW_WHEELS") != "all", reason="NEXTVIEW_WHEELS=all installs from an index"
+    os.environ.get("NEXTVIEW_WHEELS") != "all",
+    reason="NEXTVIEW_WHEELS=all installs from an index",
 )
 @pytest.mark.parametrize("extra", EXAMPLES)
 def test_pip_installs_it(wheel, extra, tmp_path):

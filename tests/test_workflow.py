@@ -16,7 +16,13 @@ BUNDLED = WORKFLOW.parent / "src" / "nextview"
 
 def stage(folder, *arguments):
     command = [sys.executable, WORKFLOW / "stage.py", *arguments]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60)
+    return subprocess.run(
+        command,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
 
 
 def needed(folder, name, content):
@@ -44,7 +50,13 @@ def test_a_stage_that_was_cut_off_goes_on_with_what_it_left(tmp_path):
 def test_a_stage_begins_anew_when_what_it_is_made_from_has_changed(tmp_path, change):
     needs, state, command = needed(tmp_path, "meshes", "a"), "1", GROW
     assert stage(
-        tmp_path, "out", "--needs", needs, f"--state={state}", "--commands", command
+        tmp_path,
+        "out",
+        "--needs",
+        needs,
+        f"--state={state}",
+        "--commands",
+        command,
     ).returncode
     (tmp_path / "enough").touch()
     if change == "input":
@@ -55,7 +67,13 @@ def test_a_stage_begins_anew_when_what_it_is_made_from_has_changed(tmp_path, cha
         state = "2"
     assert (
         stage(
-            tmp_path, "out", "--needs", needs, f"--state={state}", "--commands", command
+            tmp_path,
+            "out",
+            "--needs",
+            needs,
+            f"--state={state}",
+            "--commands",
+            command,
         ).returncode
         == 0
     )
@@ -66,7 +84,10 @@ def test_a_stage_that_makes_the_same_leaves_the_same_mark(tmp_path):
     marks = []
     for text, seed in (("a", 1), ("a", 2), ("b", 3)):
         command = f"mkdir -p out && echo {text} > out/made"
-        assert stage(tmp_path, "out", f"--state={seed}", "--commands", command).returncode == 0
+        assert (
+            stage(tmp_path, "out", f"--state={seed}", "--commands", command).returncode
+            == 0
+        )
         marks.append(json.loads((tmp_path / "out.done").read_text())["sha256"])
     assert marks[0] == marks[1] != marks[2]
 
@@ -97,11 +118,19 @@ def snakemake(folder, *arguments, config=()):
 
 def test_the_whole_graph_makes_every_bundled_model_and_table(tmp_path):
     (tmp_path / "ModelNet10/chair/train").mkdir(parents=True)
-    result = snakemake(tmp_path, "-n", "-p", config=(f"data={tmp_path / 'ModelNet10'}",))
+    result = snakemake(
+        tmp_path,
+        "-n",
+        "-p",
+        config=(f"data={tmp_path / 'ModelNet10'}",),
+    )
     assert result.returncode == 0, result.stdout + result.stderr
     planned = result.stdout + result.stderr
     for card in (BUNDLED / "recognition/bundled").glob("*-modelnet10.json"):
-        assert f"--name {card.stem}" in planned or f"{card.stem.partition('-')[0]} runs/" in planned
+        assert (
+            f"--name {card.stem}" in planned
+            or f"{card.stem.partition('-')[0]} runs/" in planned
+        )
     for command in (
         "render ModelNet10 sensed-held-out.zarr --sensor mix",
         "fit calibration",
@@ -135,10 +164,17 @@ def test_a_small_run_of_the_whole_graph(tmp_path):
     assert result.returncode == 0, result.stdout + result.stderr
     page = (tmp_path / "docs/results.md").read_text()
     assert "| mvselect |" in page
-    for heading in ("Recogniser", "Map networks", "Policies at threshold 0.97", "Calibration"):
+    for heading in (
+        "Recogniser",
+        "Map networks",
+        "Policies at threshold 0.97",
+        "Calibration",
+    ):
         assert f"## {heading}\n" in page
     accuracy = (tmp_path / "evaluation/test/accuracy.csv").read_text().splitlines()
-    alone = next(line.split(",") for line in accuracy if line.startswith("1,,accuracy,"))
+    alone = next(
+        line.split(",") for line in accuracy if line.startswith("1,,accuracy,")
+    )
     assert "| one view, all objects | " in page
     assert f"{float(alone[4]):.3f} (" in page
     assert (tmp_path / "docs/images/front.png").stat().st_size > 10_000

@@ -245,7 +245,8 @@ class Step:
     def why_not(self) -> str | None:
         """Why it is not run; None if it is."""
         return next(
-            (why for pattern, why in NOT_RUN.items() if re.search(pattern, self.text)), None
+            (why for pattern, why in NOT_RUN.items() if re.search(pattern, self.text)),
+            None,
         )
 
     @property
@@ -266,7 +267,9 @@ class Step:
 
 def needs_of(text: str) -> frozenset[str]:
     """What the commands or the Python code of a text need besides the base installation."""
-    return frozenset(wanted for pattern, wanted in NEEDS.items() if re.search(pattern, text))
+    return frozenset(
+        wanted for pattern, wanted in NEEDS.items() if re.search(pattern, text)
+    )
 
 
 def steps_of(page: str) -> Iterator[Step]:
@@ -278,7 +281,9 @@ def steps_of(page: str) -> Iterator[Step]:
     if page.endswith(".py"):
         # What may be given or not stands in brackets there.
         about = re.sub(
-            r"\[(--[^\]]+)\]", r"\1", ast.get_docstring(ast.parse(text), clean=False) or ""
+            r"\[(--[^\]]+)\]",
+            r"\1",
+            ast.get_docstring(ast.parse(text), clean=False) or "",
         )
         lines = about.splitlines()
         for number in range(1, 1 + len(lines)):
@@ -293,7 +298,9 @@ def steps_of(page: str) -> Iterator[Step]:
         if line.startswith("```"):
             if kind == "python" and not block[0].startswith(">>>"):
                 yield Step(page, begun + 1, "\n".join(block), python=True)
-            kind = None if kind is not None else line.removeprefix("```").strip() or "sh"
+            kind = (
+                None if kind is not None else line.removeprefix("```").strip() or "sh"
+            )
             begun = number
             block = []
         elif kind == "python":
@@ -319,7 +326,11 @@ def _commands(page: str, number: int, lines: list[str]) -> Iterator[Step]:
 
 def _in_table(page: str, number: int, line: str) -> Iterator[Step]:
     """The last cell of a row of research/README.md: how a file is run."""
-    cells = re.findall(r"`((?:nextview|python) [^`]+)`", line) if line.startswith("|") else []
+    cells = (
+        re.findall(r"`((?:nextview|python) [^`]+)`", line)
+        if line.startswith("|")
+        else []
+    )
     for text in cells[-1:] if page == "research/README.md" else ():
         yield Step(page, number, text)
 
@@ -331,15 +342,25 @@ def make_inputs(folder: Path) -> None:
 
     for name in ("samples", "benchmarks", "research", "examples", "docs", "workflow"):
         shutil.copytree(
-            ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "tests")
+            ROOT / name,
+            folder / name,
+            ignore=shutil.ignore_patterns("__pycache__", "tests"),
         )
     held_out = find_card("recogniser-modelnet10").held_out
     rng = np.random.default_rng(0)
-    test = {"chair": ("chair_0890", "chair_0917"), "table": ("table_0399", "table_0400")}
+    test = {
+        "chair": ("chair_0890", "chair_0917"),
+        "table": ("table_0399", "table_0400"),
+    }
     for label in SAMPLE_MESHES:
         learned = [name for name in held_out if name.rpartition("_")[0] == label][:3]
-        names = [(name, "train") for name in (*learned, f"{label}_0001", f"{label}_0002")]
-        names += [(name, "test") for name in test.get(label, (f"{label}_0470", f"{label}_0471"))]
+        names = [
+            (name, "train") for name in (*learned, f"{label}_0001", f"{label}_0002")
+        ]
+        names += [
+            (name, "test")
+            for name in test.get(label, (f"{label}_0470", f"{label}_0471"))
+        ]
         for name, split in names:
             scale = rng.uniform(0.8, 1.25, 3)
             boxes = [
@@ -347,7 +368,11 @@ def make_inputs(folder: Path) -> None:
                 for box in SAMPLE_MESHES[label]()
             ]
             mesh = boxes_mesh(boxes, label)
-            inches = trimesh.Trimesh(rng.uniform(15, 30) * mesh.vertices, mesh.faces, process=False)
+            inches = trimesh.Trimesh(
+                rng.uniform(15, 30) * mesh.vertices,
+                mesh.faces,
+                process=False,
+            )
             path = folder / "data/ModelNet10" / label / split / f"{name}.off"
             path.parent.mkdir(parents=True, exist_ok=True)
             inches.export(path)
@@ -355,7 +380,8 @@ def make_inputs(folder: Path) -> None:
         shutil.copytree(folder / "data/ModelNet10", folder / copy)
     for label in SAMPLE_MESHES:  # of classes that no recogniser knows
         shutil.copytree(
-            folder / "data/ModelNet10" / label / "test", folder / "PSB" / f"strange_{label}"
+            folder / "data/ModelNet10" / label / "test",
+            folder / "PSB" / f"strange_{label}",
         )
     shutil.copytree(folder / "data/ModelNet10/chair/test", folder / "chairs")
     shutil.copy(folder / "samples/chair.off", folder)
@@ -483,14 +509,22 @@ class Environments:
 
         if needs not in self._made:
             extras = {
-                text.partition("[")[2].rstrip("]") for text in needs if text.startswith("nextview[")
+                text.partition("[")[2].rstrip("]")
+                for text in needs
+                if text.startswith("nextview[")
             }
             research = [
-                text.partition("[")[2].rstrip("]") for text in needs if text.startswith("research")
+                text.partition("[")[2].rstrip("]")
+                for text in needs
+                if text.startswith("research")
             ]
             wanted = set(filter(None, research)) if research else None
             try:
-                python = installation(self.folder / str(len(self._made)), extras, wanted)
+                python = installation(
+                    self.folder / str(len(self._made)),
+                    extras,
+                    wanted,
+                )
             except PackageNotFoundError as missing:
                 raise SystemExit(
                     f"{', '.join(sorted(needs))}: not installed here, {missing.name} is missing"
@@ -499,16 +533,28 @@ class Environments:
         return self._made[needs]
 
     def run(
-        self, command: str, folder: Path, needs: frozenset[str] = frozenset()
+        self,
+        command: str,
+        folder: Path,
+        needs: frozenset[str] = frozenset(),
     ) -> tuple[int, str, float]:
         """Exit status, output and seconds of a command of a shell in a folder."""
         begun = time.monotonic()
-        setting = f"export PATH={shlex.quote(str(self.programs(needs)))}:$PATH; set -e; "
-        surroundings = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        setting = (
+            f"export PATH={shlex.quote(str(self.programs(needs)))}:$PATH; set -e; "
+        )
+        surroundings = {
+            name: value for name, value in os.environ.items() if name != "PYTHONPATH"
+        }
         shell = ["bash", "-c", setting + command]
         try:
             done = subprocess.run(
-                shell, cwd=folder, env=surroundings, capture_output=True, text=True, timeout=LIMIT
+                shell,
+                cwd=folder,
+                env=surroundings,
+                capture_output=True,
+                text=True,
+                timeout=LIMIT,
             )
         except subprocess.TimeoutExpired:
             return 124, f"took longer than {LIMIT} s", time.monotonic() - begun
@@ -516,7 +562,10 @@ class Environments:
 
 
 def run_page(
-    page: str, environments: Environments, folder: Path, beside: Path | None = None
+    page: str,
+    environments: Environments,
+    folder: Path,
+    beside: Path | None = None,
 ) -> list[str]:
     """Run what a page shows; returns what failed, a line each.
 
@@ -528,7 +577,11 @@ def run_page(
     """
     failed = []
     if page in PREPARED:
-        status, said, _ = environments.run(PREPARED[page], folder, needs_of(PREPARED[page]))
+        status, said, _ = environments.run(
+            PREPARED[page],
+            folder,
+            needs_of(PREPARED[page]),
+        )
         if status != 0:
             raise SystemExit(f"{page}: {PREPARED[page]}\n{said}")
     python: list[str] = [BEFORE[page]] if page in BEFORE else []
@@ -550,13 +603,19 @@ def run_page(
             python = [*(python[:1] if page in ALONE else python), step.text]
             needs_of_python |= needs
             needs = needs_of_python
-            (place / "page_block.py").write_text("\n\n".join(python) + "\n", encoding="utf-8")
+            (place / "page_block.py").write_text(
+                "\n\n".join(python) + "\n",
+                encoding="utf-8",
+            )
             command = "python page_block.py"
 
         status, said, seconds = environments.run(command, place, needs)
         ended = "ok" if status == 0 else "FAILED"
         installed = ", ".join(sorted(needs)) or "base"
-        print(f"{ended:>9}  {where}  {seconds:.0f} s  ({installed})  {command}", flush=True)
+        print(
+            f"{ended:>9}  {where}  {seconds:.0f} s  ({installed})  {command}",
+            flush=True,
+        )
         if status != 0:
             print("\n".join(said.splitlines()[-12:]), flush=True)
             failed.append(f"{where}  {step.text.splitlines()[0]}")

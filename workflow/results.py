@@ -56,9 +56,13 @@ def markdown(head: Iterable[str], rows: Iterable[Iterable[str]]) -> Iterator[str
 
 def cells(table: pd.DataFrame, *keys: str) -> dict[tuple, Cell]:
     """The numbers of a long table by its key columns."""
-    published = table["published"] if "published" in table else [float("nan")] * len(table)
+    published = (
+        table["published"] if "published" in table else [float("nan")] * len(table)
+    )
     numbers = zip(table["value"], table["low"], table["high"], published, strict=True)
-    return dict(zip(table[list(keys)].itertuples(index=False, name=None), numbers, strict=True))
+    return dict(
+        zip(table[list(keys)].itertuples(index=False, name=None), numbers, strict=True)
+    )
 
 
 def shown(cell: Cell | None, digits: int = 3, interval: bool = True) -> str:
@@ -100,7 +104,10 @@ def recogniser(stage: Path) -> Iterator[str]:
     for table in tables.values():
         for column in ("value", "low", "high", "published"):
             table[column] = pd.to_numeric(table[column])
-    found = {split: cells(table, "n_views", "label", "measure") for split, table in tables.items()}
+    found = {
+        split: cells(table, "n_views", "label", "measure")
+        for split, table in tables.items()
+    }
     all_views = int(tables["test"]["n_views"].max())
     objects = {
         split: int(table.loc[table["label"] == "", "objects"].max())
@@ -120,7 +127,11 @@ def recogniser(stage: Path) -> Iterator[str]:
             row = [found[split].get((views, "", measure)) for split in SPLITS]
             name = f"{'one view' if views == 1 else f'all {views} views'}, {what}"
             rows.append(
-                [name, *map(shown, row), published(found["test"].get((views, "", measure)))]
+                [
+                    name,
+                    *map(shown, row),
+                    published(found["test"].get((views, "", measure))),
+                ]
             )
     head = [f"{what} ({objects[split]} objects)" for split, what in SPLITS.items()]
     yield from markdown(["", *head, "published, test"], rows)
@@ -131,12 +142,17 @@ def recogniser(stage: Path) -> Iterator[str]:
     rows = [
         [
             label.replace("_", " "),
-            *(shown(of.get((v, label, "accuracy"))) for of in test for v in (1, all_views)),
+            *(
+                shown(of.get((v, label, "accuracy")))
+                for of in test
+                for v in (1, all_views)
+            ),
         ]
         for label in labels
     ]
     yield from markdown(
-        ["class", "one view", "all", "one view, size known", "all, size known"], rows
+        ["class", "one view", "all", "one view, size known", "all, size known"],
+        rows,
     )
 
 
@@ -160,7 +176,14 @@ def calibration(stage: Path) -> Iterator[str]:
         for r in table.itertuples()
     ]
     yield from markdown(
-        ["views", "accuracy", "mean of classes", "mean confidence", "calibration error"], rows
+        [
+            "views",
+            "accuracy",
+            "mean of classes",
+            "mean confidence",
+            "calibration error",
+        ],
+        rows,
     )
 
 
@@ -193,11 +216,14 @@ def maps(stage: Path) -> Iterator[str]:
                         # the page keeps what differs in one respect from the network on test
                         # objects
                         continue
-                    row = [found.get((name, by, over + measure)) for measure in measures]
+                    row = [
+                        found.get((name, by, over + measure)) for measure in measures
+                    ]
                     if any(cell is not None for cell in row):
                         digits = [4 if measure == "mse" else 3 for measure in measures]
                         values = [
-                            shown(c, d, by == "network") for c, d in zip(row, digits, strict=True)
+                            shown(c, d, by == "network")
+                            for c, d in zip(row, digits, strict=True)
                         ]
                         rows.append([f"{name.upper()}, {by}", split, what, *values])
             if split == "test":
@@ -233,9 +259,9 @@ def comparison(stage: Path) -> Iterator[str]:
     )
     yield ""
     found = cells(summary[summary["threshold"] == THRESHOLD], "policy", "measure")
-    at = tests[(tests["threshold"] == THRESHOLD) & (tests["measure"] == "accuracy")].set_index(
-        "policy"
-    )
+    at = tests[
+        (tests["threshold"] == THRESHOLD) & (tests["measure"] == "accuracy")
+    ].set_index("policy")
     rows = []
     for policy in dict.fromkeys(policy for policy, _ in found):
         numbers = [
@@ -245,11 +271,20 @@ def comparison(stage: Path) -> Iterator[str]:
             ("travel_all", 2),
             ("arc_all", 2),
         ]
-        row = [shown(found.get((policy, m)), d, m != "class_accuracy") for m, d in numbers]
+        row = [
+            shown(found.get((policy, m)), d, m != "class_accuracy") for m, d in numbers
+        ]
         test = at.loc[policy] if policy in at.index else None
-        difference = "" if test is None else f"{round(100 * test['difference'], 1) + 0.0:+.1f}"
+        difference = (
+            "" if test is None else f"{round(100 * test['difference'], 1) + 0.0:+.1f}"
+        )
         rows.append(
-            [called(policy), *row, difference, "" if test is None else p_value(test["p_holm"])]
+            [
+                called(policy),
+                *row,
+                difference,
+                "" if test is None else p_value(test["p_holm"]),
+            ]
         )
     yield from markdown(
         [
@@ -265,7 +300,9 @@ def comparison(stage: Path) -> Iterator[str]:
         rows,
     )
     robot = tests["policy"].map(lambda policy: not is_oracle(called(policy)))
-    if not (tests["p_holm"][robot & (tests["measure"] == "accuracy")] < SIGNIFICANT).any():
+    if not (
+        tests["p_holm"][robot & (tests["measure"] == "accuracy")] < SIGNIFICANT
+    ).any():
         yield from wrap(
             "**No policy that a robot could follow differs significantly from"
             f" {settings['reference']} in accuracy** at any threshold: every p after the correction"
@@ -312,11 +349,14 @@ def risk(stage: Path) -> Iterator[str]:
     )
     yield ""
     rows = []
-    for policy in [name for name in settings["policies"] if called(name) in ("random", "gain")]:
+    for policy in [
+        name for name in settings["policies"] if called(name) in ("random", "gain")
+    ]:
         for promised, threshold in settings["risks"].items():
             near = next(t for _, t, _ in found if abs(t - threshold) < 1e-9)
             right, early, views = (
-                found[policy, near, m] for m in ("confident_accuracy", "confident", "n_views")
+                found[policy, near, m]
+                for m in ("confident_accuracy", "confident", "n_views")
             )
             wrong = f"{1 - right[0]:.3f} ({1 - right[2]:.3f}-{1 - right[1]:.3f})"
             cell = shown(found[policy, near, "accuracy"])
@@ -423,11 +463,15 @@ def page(stages: Iterable[str]) -> str:
 def main() -> None:
     """Read the command line and write the page."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("out", type=Path)
     parser.add_argument(
-        "--stages", nargs="+", required=True, choices=sorted({name for name, *_ in SECTIONS})
+        "--stages",
+        nargs="+",
+        required=True,
+        choices=sorted({name for name, *_ in SECTIONS}),
     )
     given = parser.parse_args()
     given.out.parent.mkdir(parents=True, exist_ok=True)

@@ -26,7 +26,9 @@ LARGEST = 2_000_000
 def write_off(path: Path, mesh: Mesh, radius: float) -> None:
     """Write a mesh as an OFF file, so large."""
     lines = ["OFF", f"{len(mesh.vertices)} {len(mesh.faces)} 0"]
-    lines += [" ".join(map(str, vertex)) for vertex in (radius * mesh.vertices).tolist()]
+    lines += [
+        " ".join(map(str, vertex)) for vertex in (radius * mesh.vertices).tolist()
+    ]
     lines += [" ".join(map(str, (3, *face))) for face in mesh.faces.tolist()]
     path.write_text("\n".join(lines) + "\n")
 
@@ -34,7 +36,8 @@ def write_off(path: Path, mesh: Mesh, radius: float) -> None:
 def main() -> None:
     """Read the command line and write the folder."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("out", type=Path)
     parser.add_argument("--objects", type=int, required=True)
@@ -61,7 +64,11 @@ def main() -> None:
                     (tuple(np.multiply(a, stretch)), tuple(np.multiply(b, stretch)))
                     for a, b in build()
                 ]
-                write_off(folder / f"{number}.off", boxes_mesh(boxes, number), rng.uniform(15, 45))
+                write_off(
+                    folder / f"{number}.off",
+                    boxes_mesh(boxes, number),
+                    rng.uniform(15, 45),
+                )
 
 
 if __name__ == "__main__":

@@ -72,7 +72,9 @@ def runnable(command: str) -> str:
     python = shlex.quote(sys.executable)
     if command.startswith("nextview "):
         return f"{python} -m nextview.cli.main {command.removeprefix('nextview ')}"
-    if command.startswith(("python benchmarks/", "python research/", "python workflow/")):
+    if command.startswith(
+        ("python benchmarks/", "python research/", "python workflow/")
+    ):
         script, _, rest = command.removeprefix("python ").partition(" ")
         return f"{python} {shlex.quote(str(ROOT / script))} {rest}"
     if command.startswith("python "):
@@ -97,12 +99,15 @@ def run(out: Path, commands: list[str], needs: list[Path], state: str) -> None:
             remove(path)
         note.write_text(json.dumps(begun, indent=1) + "\n")
     here = os.environ | {
-        "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+        "PYTHONPATH": os.pathsep.join(
+            [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+        )
     }
     for command in commands:
         print(f"$ {command}", flush=True)
         status = subprocess.run(
-            ["bash", "-o", "pipefail", "-c", runnable(command)], env=here
+            ["bash", "-o", "pipefail", "-c", runnable(command)],
+            env=here,
         ).returncode
         if status:
             sys.exit(status if status > 0 else 128 - status)
@@ -117,7 +122,8 @@ def run(out: Path, commands: list[str], needs: list[Path], state: str) -> None:
 def main() -> None:
     """Read the command line and run the stage."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("out", type=Path)
     parser.add_argument("--needs", type=Path, nargs="*", default=[])
@@ -131,7 +137,9 @@ def main() -> None:
         with FileLock(beside(out, "begun.lock"), blocking=False):
             run(out, given.commands, given.needs, given.state)
     except Timeout:
-        sys.exit(f"{out}: another process is at work on this stage; wait for it or stop it")
+        sys.exit(
+            f"{out}: another process is at work on this stage; wait for it or stop it"
+        )
 
 
 if __name__ == "__main__":

@@ -46,7 +46,9 @@ def api_pages() -> dict[str, str]:
     pages = {"api/index.md": top}
     for title, rooms in ROOMS.items():
         modules = [name for room in rooms for name in _modules(room)]
-        blocks = "\n".join(f"::: {name}\n    options: {{heading_level: 2}}\n" for name in modules)
+        blocks = "\n".join(
+            f"::: {name}\n    options: {{heading_level: 2}}\n" for name in modules
+        )
         pages[f"api/{title.lower().replace(' ', '_')}.md"] = f"# {title}\n\n{blocks}"
     return pages
 
@@ -54,9 +56,12 @@ def api_pages() -> dict[str, str]:
 def _modules(room: str) -> list[str]:
     """A module, or those of a package, that have something public to show."""
     path = PACKAGE / room
-    files = [path.with_suffix(".py")] if not path.is_dir() else sorted(path.rglob("*.py"))
+    files = (
+        [path.with_suffix(".py")] if not path.is_dir() else sorted(path.rglob("*.py"))
+    )
     names = [
-        ".".join(("nextview", *file.relative_to(PACKAGE).with_suffix("").parts)) for file in files
+        ".".join(("nextview", *file.relative_to(PACKAGE).with_suffix("").parts))
+        for file in files
     ]
     return [name for name in names if not name.endswith("__init__")]
 

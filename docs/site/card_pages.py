@@ -49,11 +49,15 @@ def card_pages() -> dict[str, str]:
     models, policies, rows = bundled_cards(), bundled_policies(), []
     pages = {f"models/{name}.md": _model_page(card) for name, card in models.items()}
     for card in models.values():
-        rows.append(f"| [{card.name}]({card.name}.md) | {card.network} | {USE[card.kind]} |")
+        rows.append(
+            f"| [{card.name}]({card.name}.md) | {card.network} | {USE[card.kind]} |"
+        )
     cards = {name: read_policy_card(path) for name, path in policies.items()}
     for name, policy in cards.items():
         pages[f"models/{name}.md"] = _policy_page(name, policy)
-        rows.append(f"| [{name}]({name}.md) | policy, {policy.scope} | {USE[policy.kind]} |")
+        rows.append(
+            f"| [{name}]({name}.md) | policy, {policy.scope} | {USE[policy.kind]} |"
+        )
     table = "\n".join(["| model | what it is | what it does |", "|---|---|---|", *rows])
     about = "From their cards. `nextview list models NAME` prints one whole."
     top = f"# Models that ship with nextview\n\n{about}\n\n{table}\n"
@@ -79,12 +83,17 @@ def _model_page(card: ModelCard) -> str:
             "correlation of two views": f"{card.calibration.correlation:g}",
         }
     elif card.kind != "features":
-        facts |= {"output": card.output, "valley classes": ", ".join(card.valley_classes) or "none"}
+        facts |= {
+            "output": card.output,
+            "valley classes": ", ".join(card.valley_classes) or "none",
+        }
     parts = [f"# {card.name}", USE[card.kind], card.note, _table(facts)]
     parts += ["## Scores", _table(dict(_scores(card.scores)), ("measured on", ""))]
     if card.memory is not None:
         parts += ["## Attribution", card.memory.attribution]
-    limits = ["## Limits", LIMITS] if card.memory is None and card.kind != "features" else []
+    limits = (
+        ["## Limits", LIMITS] if card.memory is None and card.kind != "features" else []
+    )
     parts += [*limits, "## How it was made", _shell(card.training.commands)]
     for k, recipe in enumerate(card.training.recipes, 1):
         parts += [f"Recipe {k}:", _table(recipe, ("option", "value"))]
@@ -100,7 +109,12 @@ def _policy_page(name: str, card: PolicyCard) -> str:
     }
     if card.sha256:
         facts["weights"] = f"{name}.onnx, SHA-256 `{card.sha256}`"
-    parts = [f"# {name}", USE[card.kind], _table(facts), f"Use it with `--policy {name}`."]
+    parts = [
+        f"# {name}",
+        USE[card.kind],
+        _table(facts),
+        f"Use it with `--policy {name}`.",
+    ]
     parts += ["## How it was made", _shell(card.commands)]
     if card.settings:
         parts.append(_table(card.settings, ("option", "value")))
@@ -112,7 +126,8 @@ def _scores(scores: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield (
             objects,
             "<br>".join(
-                f"{key.replace('_', ' ')}: {_value(value)}" for key, value in measured.items()
+                f"{key.replace('_', ' ')}: {_value(value)}"
+                for key, value in measured.items()
             ),
         )
 
@@ -125,7 +140,9 @@ def _value(value: Any) -> str:
 
 def _table(rows: Mapping[str, Any], heads: tuple[str, str] = ("", "")) -> str:
     lines = [
-        f"| {key} | {_value(value)} |" for key, value in rows.items() if value not in ("", None)
+        f"| {key} | {_value(value)} |"
+        for key, value in rows.items()
+        if value not in ("", None)
     ]
     return "\n".join([f"| {heads[0]} | {heads[1]} |", "|---|---|", *lines])
 

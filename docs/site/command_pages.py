@@ -45,7 +45,10 @@ def help_of(words: str) -> str:
     plain = {"COLUMNS": COLUMNS, "NO_COLOR": "1"}
     with patch.dict(os.environ, plain), redirect_stdout(printed), suppress(SystemExit):
         main([*words.split(), "--help"])
-    return "\n".join(line.rstrip() for line in printed.getvalue().strip().splitlines()) + "\n"
+    return (
+        "\n".join(line.rstrip() for line in printed.getvalue().strip().splitlines())
+        + "\n"
+    )
 
 
 def _examples() -> dict[str, dict[str, str]]:
@@ -54,10 +57,13 @@ def _examples() -> dict[str, dict[str, str]]:
     found: dict[str, dict[str, str]] = {}
     for source in SOURCES:
         for line in re.findall(
-            r"^ {0,4}(nextview [a-z].*?)\s*(?:  #.*)?$", (ROOT / source).read_text(), re.M
+            r"^ {0,4}(nextview [a-z].*?)\s*(?:  #.*)?$",
+            (ROOT / source).read_text(),
+            re.M,
         ):
             words = next(
-                (name for name in names if f"{line} ".startswith(f"nextview {name} ")), None
+                (name for name in names if f"{line} ".startswith(f"nextview {name} ")),
+                None,
             )
             if words:
                 found.setdefault(words, {}).setdefault(line, source)

@@ -59,7 +59,13 @@ def main(models: str = "modelnet10", out: Path = IMAGES) -> None:
         browser = started.chromium.launch(executable_path=program, args=FLAGS)
         alone = Exploration(shown_objects(), start=3, models=models)
         shoot(browser, Page(alone, port=8850), 2, out / "explore.png")
-        compared = Exploration(shown_objects(), ("gain", "lem"), "wrist", start=3, models=models)
+        compared = Exploration(
+            shown_objects(),
+            ("gain", "lem"),
+            "wrist",
+            start=3,
+            models=models,
+        )
         compared.show("monitor")
         page = Page(compared, port=8850)
         page._hide.value = True

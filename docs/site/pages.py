@@ -67,7 +67,9 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
         sections[name].extend(pages())
     named = set(_leaves(nav))
     sections["Guides"].extend(
-        p.name for p in sorted(Path(config.docs_dir).glob("*.md")) if p.name not in named
+        p.name
+        for p in sorted(Path(config.docs_dir).glob("*.md"))
+        if p.name not in named
     )
     return config
 
@@ -86,22 +88,40 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+def on_page_markdown(
+    markdown: str,
+    page: Page,
+    config: MkDocsConfig,
+    files: Files,
+) -> str:
     """Point relative links at pages of the site."""
     uri = page.file.src_uri
     if not uri.endswith(".md"):
         return markdown
-    source = next((name for name, shown in REPOSITORY_PAGES.items() if shown == uri), f"docs/{uri}")
+    source = next(
+        (name for name, shown in REPOSITORY_PAGES.items() if shown == uri),
+        f"docs/{uri}",
+    )
 
     def mended(match: re.Match[str]) -> str:
         label, target, anchor = match[1], match[2], match[3] or ""
         path = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
-        if path not in REPOSITORY_PAGES and not path.startswith("docs/") and (ROOT / path).exists():
-            return label.strip("[]")  # a file of the repository that the site does not show
+        if (
+            path not in REPOSITORY_PAGES
+            and not path.startswith("docs/")
+            and (ROOT / path).exists()
+        ):
+            return label.strip(
+                "[]"
+            )  # a file of the repository that the site does not show
         found = REPOSITORY_PAGES.get(path, path.removeprefix("docs/"))
         return f"{label}({posixpath.relpath(found, posixpath.dirname(uri) or '.')}{anchor})"
 
-    texts = re.split(r"(^```.*?^```)", markdown, flags=re.M | re.S)  # every second one is code
+    texts = re.split(
+        r"(^```.*?^```)",
+        markdown,
+        flags=re.M | re.S,
+    )  # every second one is code
     texts[::2] = [LINK.sub(mended, text) for text in texts[::2]]
     return "".join(texts)
 
@@ -116,4 +136,6 @@ def _leaves(nav: Any) -> Iterator[str]:
 
 
 def _summary(path: Path) -> str:
-    return re.match(r'(?:#.*\n)*"""(.*?)(?:\n\n|""")', path.read_text(), re.S)[1].replace("\n", " ")  # type: ignore[index]
+    return re.match(r'(?:#.*\n)*"""(.*?)(?:\n\n|""")', path.read_text(), re.S)[
+        1
+    ].replace("\n", " ")  # type: ignore[index]

@@ -44,7 +44,11 @@ def main() -> None:
         figure.savefig(IMAGES / f"{name}.png", dpi=110, facecolor="white")
 
 
-def new(columns: int, height: float = 3.0, width: float = 9.6) -> tuple[Figure, list[Axes]]:
+def new(
+    columns: int,
+    height: float = 3.0,
+    width: float = 9.6,
+) -> tuple[Figure, list[Axes]]:
     """A row of axes."""
     figure = PlainFigure((width, height), layout="constrained")
     return figure, list(figure.subplots(1, columns, squeeze=False)[0])
@@ -53,7 +57,10 @@ def new(columns: int, height: float = 3.0, width: float = 9.6) -> tuple[Figure, 
 def grid(axes: Axes, values: np.ndarray, title: str, **options: object) -> None:
     """A map of the sphere: a row for each ring, the horizon below."""
     axes.imshow(
-        np.ma.masked_invalid(values.reshape(5, 8)), origin="lower", aspect="auto", **options
+        np.ma.masked_invalid(values.reshape(5, 8)),
+        origin="lower",
+        aspect="auto",
+        **options,
     )  # type: ignore[arg-type]
     axes.set_facecolor("#eef1f4")
     axes.set_xticks(range(0, 8, 2), [f"{45 * k}°" for k in range(0, 8, 2)])
@@ -68,11 +75,23 @@ def mark(axes: Axes, view: int, label: str, colour: str) -> None:
     ring, column = divmod(view, 8)
     axes.add_patch(
         Rectangle(
-            (column - 0.46, ring - 0.46), 0.92, 0.92, fill=False, edgecolor=colour, linewidth=2.2
+            (column - 0.46, ring - 0.46),
+            0.92,
+            0.92,
+            fill=False,
+            edgecolor=colour,
+            linewidth=2.2,
         )
     )
     axes.text(
-        column, ring, label, ha="center", va="center", fontsize=7, color=colour, weight="bold"
+        column,
+        ring,
+        label,
+        ha="center",
+        va="center",
+        fontsize=7,
+        color=colour,
+        weight="bold",
     )
 
 
@@ -98,7 +117,10 @@ def viewpoints(here: int) -> Figure:
     space.scatter(*SPHERE.directions.T, c=colours, s=34, depthshade=False)
     camera = nextview.SimulatedCamera(sample_mesh("chair"))
     points = np.concatenate(
-        [camera.observe(SPHERE.poses[view]).points[::2] for view in (1, 3, 5, 7, 33, 37)]
+        [
+            camera.observe(SPHERE.poses[view]).points[::2]
+            for view in (1, 3, 5, 7, 33, 37)
+        ]
     )
     space.scatter(*0.6 * points.T, s=0.6, color=INK)
     space.set_box_aspect((1, 1, 0.6), zoom=1.35)
@@ -108,11 +130,24 @@ def viewpoints(here: int) -> Figure:
     axes = figure.add_subplot(1, 2, 2)
     shown = np.full(len(SPHERE), np.nan)
     shown[window] = 0.35
-    grid(axes, shown, f"their numbers; view {here} and its window", cmap="Blues", vmin=0, vmax=1)
+    grid(
+        axes,
+        shown,
+        f"their numbers; view {here} and its window",
+        cmap="Blues",
+        vmin=0,
+        vmax=1,
+    )
     for view in range(len(SPHERE)):
         if view != here:
             axes.text(
-                view % 8, view // 8, str(view), ha="center", va="center", fontsize=8, color=INK
+                view % 8,
+                view // 8,
+                str(view),
+                ha="center",
+                va="center",
+                fontsize=8,
+                color=INK,
             )
     mark(axes, here, str(here), ACCENT)
     return figure
@@ -123,7 +158,10 @@ def belief() -> Figure:
     comes down.
     """
     system = nextview.load(threshold=1.0, max_views=5)
-    result, usual = system.recognise(sample_mesh("table"), start=START), nextview.load().stopping
+    result, usual = (
+        system.recognise(sample_mesh("table"), start=START),
+        nextview.load().stopping,
+    )
     steps = np.arange(1, len(result.views) + 1)
     beliefs = np.array([view.belief for view in result.views])
     alone = np.array([view.alone for view in result.views])
@@ -133,10 +171,21 @@ def belief() -> Figure:
         (right, beliefs, "fused over the views so far"),
     ):
         for c in np.argsort(-beliefs.max(0))[:3]:
-            axes.plot(steps, values[:, c], marker="o", label=result.classes[c].replace("_", " "))
+            axes.plot(
+                steps,
+                values[:, c],
+                marker="o",
+                label=result.classes[c].replace("_", " "),
+            )
         axes.set_title(title, fontsize=10, loc="left")
         axes.set(ylim=(0, 1.03), xlabel="view", ylabel="belief", xticks=steps)
-    right.plot(steps, usual.threshold_at(steps), color=INK, linestyle=":", label="threshold")
+    right.plot(
+        steps,
+        usual.threshold_at(steps),
+        color=INK,
+        linestyle=":",
+        label="threshold",
+    )
     right.legend()
     return figure
 
@@ -147,14 +196,26 @@ def maps(here: int) -> Figure:
     """
     mesh = sample_mesh("table")
     camera = nextview.SimulatedCamera(mesh)
-    true = np.array([depth_entropy(camera.observe(pose).depth) for pose in SPHERE.poses])
+    true = np.array(
+        [depth_entropy(camera.observe(pose).depth) for pose in SPHERE.poses]
+    )
     session = nextview.load(policy="lem").session(here)
     seen = session.update(camera.observe(session.pose))
     values = np.full(len(SPHERE), np.nan)
     values[SPHERE.windows[here].ravel()] = seen.maps["lem"].ravel()
     figure, (low, high, whole, window) = new(4, 2.8, 11.5)
-    picture(low, int(true.argmin()), mesh, f"view {true.argmin()}: {true.min():.1f} bits")
-    picture(high, int(true.argmax()), mesh, f"view {true.argmax()}: {true.max():.1f} bits")
+    picture(
+        low,
+        int(true.argmin()),
+        mesh,
+        f"view {true.argmin()}: {true.min():.1f} bits",
+    )
+    picture(
+        high,
+        int(true.argmax()),
+        mesh,
+        f"view {true.argmax()}: {true.max():.1f} bits",
+    )
     grid(whole, true, "depth entropy, bits", cmap="viridis")
     figure.colorbar(whole.images[0], ax=whole)
     mark(whole, int(true.argmin()), "low", "white")
@@ -174,7 +235,12 @@ def gain(view: View) -> Figure:
     assert view.values is not None
     assert view.next_view is not None
     figure, (seen, cost, value) = new(3, 3.0)
-    picture(seen, view.index, sample_mesh("table"), f"view {view.index}: a table, or a desk?")
+    picture(
+        seen,
+        view.index,
+        sample_mesh("table"),
+        f"view {view.index}: a table, or a desk?",
+    )
     grid(cost, SPHERE.travel[view.index], "travel from here, cells", cmap="Greys")
     figure.colorbar(cost.images[0], ax=cost)
     grid(value, view.values, "value of each view", cmap="viridis")
@@ -191,15 +257,27 @@ def calibration() -> Figure:
     """
     part = RESULTS.read_text().split("\n## Calibration\n")[1].split("\n## ")[0]
     rows = re.findall(
-        r"^\| (\d+) \| ([\d.]+) \(([\d.]+)-([\d.]+)\) \| [\d.]+ \| ([\d.]+) \|", part, re.M
+        r"^\| (\d+) \| ([\d.]+) \(([\d.]+)-([\d.]+)\) \| [\d.]+ \| ([\d.]+) \|",
+        part,
+        re.M,
     )
     n_views, accuracy, low, high, confidence = np.array(rows, float).T
     figure, (axes,) = new(1, 3.4, 5.6)
     axes.fill_between(n_views, low, high, color=BLUE, alpha=0.15, linewidth=0)
     axes.plot(
-        n_views, accuracy, marker="o", color=BLUE, label="how often it is right, 95 % interval"
+        n_views,
+        accuracy,
+        marker="o",
+        color=BLUE,
+        label="how often it is right, 95 % interval",
     )
-    axes.plot(n_views, confidence, marker="o", color=ACCENT, label="mean belief in the answer")
+    axes.plot(
+        n_views,
+        confidence,
+        marker="o",
+        color=ACCENT,
+        label="mean belief in the answer",
+    )
     axes.set_xscale("log", base=2)
     axes.set_xticks(n_views, [f"{n:.0f}" for n in n_views])
     axes.minorticks_off()
@@ -216,7 +294,10 @@ def samples(views: tuple[int, ...]) -> Figure:
         for each, view in zip(row, views, strict=True):
             elevation, azimuth = SPHERE.angles(view)
             picture(
-                each, view, sample_mesh(name), f"{name}, {elevation:.0f}° up, {azimuth:.0f}° around"
+                each,
+                view,
+                sample_mesh(name),
+                f"{name}, {elevation:.0f}° up, {azimuth:.0f}° around",
             )
     return figure
 

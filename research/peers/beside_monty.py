@@ -40,7 +40,10 @@ from benchmarks.verified_things import (
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import UsageError
 
-RIGHT = ("correct", "correct_mlh")  # the second: by the likeliest hypothesis, out of steps
+RIGHT = (
+    "correct",
+    "correct_mlh",
+)  # the second: by the likeliest hypothesis, out of steps
 TESTED = "tested"  # folders below WORK
 EPISODES = "eval_stats.csv"
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # from Monty's axes, y up
@@ -90,7 +93,10 @@ def episodes_of(work: Path, things: str) -> list[Episode]:
 
 def episode_of(row: dict[str, str]) -> Episode:
     """An episode as Monty writes it."""
-    scalar_first = np.array(row["primary_target_rotation_quat"].strip("[]").split(), float)
+    scalar_first = np.array(
+        row["primary_target_rotation_quat"].strip("[]").split(),
+        float,
+    )
     turn = Rotation.from_quat(scalar_first, scalar_first=True).as_matrix()
     angles = np.array(row["most_likely_rotation"].strip("[]").split(), float)
     found = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
@@ -128,7 +134,9 @@ def beside(taught: Taught, episodes: Sequence[Episode], draw: int) -> list[Outco
 
 
 def table(
-    episodes: Sequence[Episode], outcomes: Sequence[Outcome], taught: Taught
+    episodes: Sequence[Episode],
+    outcomes: Sequence[Outcome],
+    taught: Taught,
 ) -> Iterator[str]:
     """Monty's row, and one for each number of frames."""
     yield "| | right | steps or frames | seconds: median, worst | rotation, degrees: median, 95 % |"
@@ -136,7 +144,9 @@ def table(
     steps = np.array([episode.steps for episode in episodes])
     seconds = np.array([episode.seconds for episode in episodes])
     share = np.mean([episode.right for episode in episodes])
-    errors = median_and_most([error_of(episode, taught) for episode in episodes if episode.right])
+    errors = median_and_most(
+        [error_of(episode, taught) for episode in episodes if episode.right]
+    )
     yield (
         f"| Monty | {share:.3f} | {steps.mean():.0f} | "
         f"{np.median(seconds):.1f}, {seconds.max():.1f} | {errors} |"
@@ -146,7 +156,9 @@ def table(
         here = [outcome for outcome in outcomes if outcome.views == k]
         seconds = np.array([outcome.seconds for outcome in here])
         share = np.mean([outcome.right for outcome in here])
-        errors = median_and_most([outcome.rotation for outcome in here if outcome.right])
+        errors = median_and_most(
+            [outcome.rotation for outcome in here if outcome.right]
+        )
         frames = f"{k} frame{'s' if k > 1 else ''}"
         yield (
             f"| nextview, {frames} | {share:.3f} | {k} | "

@@ -109,7 +109,9 @@ def scans(folder: tyro.conf.Positional[Path], work: tyro.conf.Positional[Path]) 
 
 
 def teach(
-    work: tyro.conf.Positional[Path], things: tyro.conf.Positional[Things], rotations: int = 4
+    work: tyro.conf.Positional[Path],
+    things: tyro.conf.Positional[Things],
+    rotations: int = 4,
 ) -> None:
     """Teach Monty ten things, in one rotation after the other; goes on where it was stopped.
 
@@ -135,7 +137,9 @@ def teach(
 
 
 def recognise(
-    work: tyro.conf.Positional[Path], things: tyro.conf.Positional[Things], rotations: int = 3
+    work: tyro.conf.Positional[Path],
+    things: tyro.conf.Positional[Things],
+    rotations: int = 3,
 ) -> None:
     """Show Monty ten things in random rotations; goes on where it was stopped.
 

@@ -22,7 +22,9 @@ def installed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
     info = folder / "nextview_research-0.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: nextview-research\nVersion: 0\n")
+    (info / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: nextview-research\nVersion: 0\n"
+    )
     with (info / "entry_points.txt").open("w") as file:
         for group, names in project["entry-points"].items():
             print(

@@ -45,7 +45,8 @@ PLAIN = ["--inputs", "belief", "place", "--frame", "camera"]
 
 def train(arguments):
     tyro.extras.subcommand_cli_from_dict(
-        {"ppo": module.main, "mvselect": module.mvselect}, args=arguments
+        {"ppo": module.main, "mvselect": module.mvselect},
+        args=arguments,
     )
 
 
@@ -56,14 +57,19 @@ def hinting(n, seed=0):
     rng = np.random.default_rng(seed)
     labels = np.arange(n) % 3
     right = (
-        np.where(SMALL.ring == labels[:, None], 4.0, 1.0)[..., None] * np.eye(3)[labels][:, None]
+        np.where(SMALL.ring == labels[:, None], 4.0, 1.0)[..., None]
+        * np.eye(3)[labels][:, None]
     )
-    return labels, (right + 0.3 * rng.normal(size=(n, len(SMALL), 3))).astype(np.float32)
+    return labels, (right + 0.3 * rng.normal(size=(n, len(SMALL), 3))).astype(
+        np.float32
+    )
 
 
 def learnable(n, seed=0, split="train"):
     return replace(
-        some_predictions(n, seed), splits=np.array([split] * n), calibration=Calibration(1.5, 0.3)
+        some_predictions(n, seed),
+        splits=np.array([split] * n),
+        calibration=Calibration(1.5, 0.3),
     )
 
 
@@ -107,11 +113,18 @@ def test_an_agent_finds_the_ring_of_the_class_believed(tmp_path, preset):
     )
     labels, logits = hinting(90, seed=1)
     fresh = ReplayTable(
-        train_predictions(logits, labels, SMALL, ("a", "b", "c"), calibration=Calibration(1.01))
+        train_predictions(
+            logits,
+            labels,
+            SMALL,
+            ("a", "b", "c"),
+            calibration=Calibration(1.01),
+        )
     )
     agent = make_policy(str(tmp_path / "a.json"), SMALL)
     first, second = (
-        SMALL.ring[m.state.current] for m in rollout(fresh, agent, 2, np.random.default_rng(5))
+        SMALL.ring[m.state.current]
+        for m in rollout(fresh, agent, 2, np.random.default_rng(5))
     )
     assert np.mean((second == labels)[first != labels]) > 0.7  # a third by chance
     blind, ours = (
@@ -126,7 +139,15 @@ def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("agent")
     learnable(30).save(folder / "p.npz")
     for preset in ("ppo", "mvselect"):
-        train([preset, str(folder / "p.npz"), str(folder / f"{preset}.json"), *QUICK, *PLAIN])
+        train(
+            [
+                preset,
+                str(folder / "p.npz"),
+                str(folder / f"{preset}.json"),
+                *QUICK,
+                *PLAIN,
+            ]
+        )
     return folder
 
 
@@ -160,7 +181,9 @@ def test_a_card_says_how_and_its_file_is_the_one_that_was_written(trained, tmp_p
     assert (card["kind"], card["settings"]["algorithm"]) == ("gain", "dqn")
     assert "24 objects" in card["learned_from"]
     for suffix in ("json", "onnx"):
-        (tmp_path / f"bad.{suffix}").write_bytes((trained / f"mvselect.{suffix}").read_bytes())
+        (tmp_path / f"bad.{suffix}").write_bytes(
+            (trained / f"mvselect.{suffix}").read_bytes()
+        )
     with (tmp_path / "bad.onnx").open("r+b") as file:
         file.seek(200)
         file.write(b"x")
@@ -184,7 +207,10 @@ policy = make_policy({str(trained / "ppo.json")!r}, sphere)
 print(*policy.next_views(state, np.random.default_rng(0)))
 """
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert int(done.stdout) in set(range(40)) - {3}
 
@@ -222,7 +248,9 @@ def test_ap_gym_takes_the_replay_for_one_of_its_own():
     for _ in range(4):
         action = env.action_space.sample()
         _, reward, ended, _, info = env.step(action)
-        loss = -log_softmax(action["prediction"])[info["prediction"]["target"]] / np.log(3)
+        loss = -log_softmax(action["prediction"])[
+            info["prediction"]["target"]
+        ] / np.log(3)
         assert np.isclose(reward, info["base_reward"] - loss, atol=1e-5)
         assert info["base_reward"] <= -0.5
     assert ended

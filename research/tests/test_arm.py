@@ -74,7 +74,8 @@ def looking(elevation, azimuth, distance=0.4):
 
 
 @pytest.mark.parametrize(
-    "joints", [HOME, *STARTS[1:], np.array([0.3, -0.2, 0.5, -1.5, -0.4, 0.2, 1.0])]
+    "joints",
+    [HOME, *STARTS[1:], np.array([0.3, -0.2, 0.5, -1.5, -0.4, 0.2, 1.0])],
 )
 def test_the_camera_is_where_the_published_geometry_has_it(arm, joints):
     pose = arm.camera_at(joints)
@@ -98,7 +99,8 @@ def test_joints_that_are_found_bring_the_camera_there(at_home, view):
     assert np.linalg.norm(reached[:3, 3] - pose[:3, 3]) < CLOSE
     assert angle_between(reached[:3, 2], pose[:3, 2]) < STRAIGHT
     assert (
-        (joints + OFFSETS >= RANGES[:, 0] - 1e-6) & (joints + OFFSETS <= RANGES[:, 1] + 1e-6)
+        (joints + OFFSETS >= RANGES[:, 0] - 1e-6)
+        & (joints + OFFSETS <= RANGES[:, 1] + 1e-6)
     ).all()
     assert not at_home.touches(joints)
 
@@ -116,7 +118,9 @@ def test_what_is_out_of_reach_is_not_reached(at_home):
 
 def test_it_touches_what_is_in_its_way(at_home):
     assert not at_home.touches(HOME)
-    assert at_home.touches(np.array([0, 1.5, 0, -0.5, 0, 0, 0]))  # stretched down through the table
+    assert at_home.touches(
+        np.array([0, 1.5, 0, -0.5, 0, 0, 0])
+    )  # stretched down through the table
     assert at_home.touches(np.array([0, 0, 0, -3.0, 0, -1.6, 0]))  # folded into itself
     inside, ((vertices, _), _) = looking(89.9, 0), at_home.things()[1]
     # between the legs of the chair: in its convex hull
@@ -159,16 +163,27 @@ def test_depth_is_what_mujocos_own_rays_say(at_home):
     rng = np.random.default_rng(0)
     pixels = rng.uniform(0, [sensor.width, sensor.height], (300, 2))
     k = sensor.intrinsics
-    rays = np.column_stack([(pixels - k[:2, 2]) / k[[0, 1], [0, 1]], np.ones(300)]) @ pose[:3, :3].T
+    rays = (
+        np.column_stack([(pixels - k[:2, 2]) / k[[0, 1], [0, 1]], np.ones(300)])
+        @ pose[:3, :3].T
+    )
     depth, which = RayCaster([triangles for triangles, _ in at_home.things()]).cast(
-        pose[:3, 3], rays
+        pose[:3, 3],
+        rays,
     )
     seen = np.zeros(300)
     groups = np.array([1, 1, 1, 0, 1, 1], np.uint8)
     geom = np.zeros(1, np.int32)
     for i, ray in enumerate(rays):
         seen[i] = mujoco.mj_ray(
-            at_home.model, at_home.data, pose[:3, 3], ray / np.linalg.norm(ray), groups, 1, -1, geom
+            at_home.model,
+            at_home.data,
+            pose[:3, 3],
+            ray / np.linalg.norm(ray),
+            groups,
+            1,
+            -1,
+            geom,
         )
     theirs = seen / np.linalg.norm(rays, axis=1)
     assert ((seen >= 0) == (which >= 0)).mean() > 0.98
@@ -179,7 +194,8 @@ def test_depth_is_what_mujocos_own_rays_say(at_home):
 
 def test_it_finds_out_what_stands_there(at_home):
     session = nextview.load(threshold=1.0, max_views=3).session(
-        object=ObservedObject(life_size=False), distance=0.4
+        object=ObservedObject(life_size=False),
+        distance=0.4,
     )
     at_home.joints = at_home.solve(looking(35, 215))
     at_home.motions = []
@@ -190,4 +206,8 @@ def test_it_finds_out_what_stands_there(at_home):
     assert len(result.views) == 3
     assert moved[0] == 0
     assert moved[-1] == pytest.approx(sum(map(seconds_of, at_home.motions)))
-    np.testing.assert_allclose(session.object.object_frame.centre[:2], [0.5, 0], atol=0.1)
+    np.testing.assert_allclose(
+        session.object.object_frame.centre[:2],
+        [0.5, 0],
+        atol=0.1,
+    )

@@ -60,7 +60,10 @@ def table(example, scans):
 def test_three_things_are_hidden_and_nothing_overlaps(example, table):
     """By pixels of frames through the sensor, of all things and of each alone."""
     assert len(table.hidden) == 3
-    arm = Arm([(one.placed, one.faces) for one in table.things], np.random.default_rng(0))
+    arm = Arm(
+        [(one.placed, one.faces) for one in table.things],
+        np.random.default_rng(0),
+    )
     arm.joints = arm.solve(example.first_pose())
     arm.look()
     every = np.bincount(arm.owner[arm.owner >= 0], minlength=8)
@@ -69,7 +72,10 @@ def test_three_things_are_hidden_and_nothing_overlaps(example, table):
         alone.look()
         share = every[row] / np.count_nonzero(alone.owner == 0)
         assert share == pytest.approx(table.shown[row], abs=0.1), thing.name
-    assert [thing.placed[:, 2].min() for thing in table.things] == pytest.approx([0] * 8, abs=1e-9)
+    assert [thing.placed[:, 2].min() for thing in table.things] == pytest.approx(
+        [0] * 8,
+        abs=1e-9,
+    )
 
 
 def test_it_takes_itself_out_of_the_picture(example, table):
@@ -80,7 +86,9 @@ def test_it_takes_itself_out_of_the_picture(example, table):
     pose[:3, 3] += [0.3, 0, 0.1]
     arm.joints = arm.solve(pose)
     links = cKDTree(
-        np.concatenate([trimesh.Trimesh(*each).sample(5000) for each, _ in arm.things()[9:]])
+        np.concatenate(
+            [trimesh.Trimesh(*each).sample(5000) for each, _ in arm.things()[9:]]
+        )
     )
 
     def on_links(frame):

@@ -25,7 +25,10 @@ TEN = (
 
 
 def test_the_grid_holds_the_networks_of_table_6():
-    assert published_cells(TEN, 40) == {  # two numbers are printed for ResNet-34 in batches of 4
+    assert published_cells(
+        TEN,
+        40,
+    ) == {  # two numbers are printed for ResNet-34 in batches of 4
         (18, 4): [0.8588],
         (34, 4): [0.8599, 0.8588],
         (34, 8): [0.8642],
@@ -46,7 +49,12 @@ def test_one_network_is_trained_judged_and_drawn(views, tmp_path, monkeypatch):
     monkeypatch.setattr(
         train_grid, "published_cells", lambda *_: {(18, 4): [0.5, 0.75], (34, 4): []}
     )
-    recipe = RecogniserRecipe(epochs=1, size=32, views_per_object=2, validation_share=0.25)
+    recipe = RecogniserRecipe(
+        epochs=1,
+        size=32,
+        views_per_object=2,
+        validation_share=0.25,
+    )
     train_grid.main(views, tmp_path / "grid", (18,), recipe=recipe)
     rows = list(csv.DictReader((tmp_path / "grid/grid.csv").read_text().splitlines()))
     assert [(row["depth"], row["batch_size"], row["published"]) for row in rows] == [

@@ -11,7 +11,13 @@ from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, UsageError
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.session.style import to_svg
-from research.inspect_store import inspect, median_radii, object_figure, store_figure, summary
+from research.inspect_store import (
+    inspect,
+    median_radii,
+    object_figure,
+    store_figure,
+    summary,
+)
 
 SPHERE = ViewSphere.named("40")
 
@@ -21,11 +27,19 @@ def views(tmp_path_factory):
     folder = tmp_path_factory.mktemp("shop")
     for i in range(5):
         label = "box" if i < 3 else "ball"
-        path = folder / "meshes" / label / ("train" if i % 2 else "test") / f"thing_{i}.off"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        (trimesh.creation.box([1, 2, 3 + i]) if i < 3 else trimesh.creation.icosphere(2)).export(
-            path
+        path = (
+            folder
+            / "meshes"
+            / label
+            / ("train" if i % 2 else "test")
+            / f"thing_{i}.off"
         )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        (
+            trimesh.creation.box([1, 2, 3 + i])
+            if i < 3
+            else trimesh.creation.icosphere(2)
+        ).export(path)
     (folder / "meshes/box/train/broken.off").write_text("OFF\n")
     list(render(folder / "meshes", folder / "views.zarr", SPHERE, 32, workers=0))
     return folder / "views.zarr"
@@ -34,9 +48,15 @@ def views(tmp_path_factory):
 def test_summary_counts(views):
     facts = summary(ViewStore.open(views))
     assert facts["objects"] == "6 in 2 classes"
-    assert (facts["rendered"], facts["left out"], facts["not rendered yet"]) == ("5", "1", "0")
+    assert (facts["rendered"], facts["left out"], facts["not rendered yet"]) == (
+        "5",
+        "1",
+        "0",
+    )
     assert facts["views"].startswith("200 ")
-    assert facts["byte-identical copies"] == "1  (0 with several labels)"  # the two balls
+    assert (
+        facts["byte-identical copies"] == "1  (0 with several labels)"
+    )  # the two balls
 
 
 def test_sizes_are_told_where_the_unit_is_known(views, tmp_path, capsys):
@@ -44,7 +64,10 @@ def test_sizes_are_told_where_the_unit_is_known(views, tmp_path, capsys):
     assert median_radii(store) == {}
     store.note(unit="cm")
     boxes = [np.sqrt(1 + 4 + (3 + i) ** 2) / 2 / 100 for i in (0, 1, 2)]
-    assert median_radii(store) == {"ball": pytest.approx(0.01), "box": pytest.approx(boxes[1])}
+    assert median_radii(store) == {
+        "ball": pytest.approx(0.01),
+        "box": pytest.approx(boxes[1]),
+    }
     inspect(views, tmp_path / "views.png")
     assert "median radius, m       ball 0.01, box 0.02" in capsys.readouterr().err
     store.note(unit=None)
@@ -56,10 +79,14 @@ def test_an_object_is_drawn_with_the_horizon_lowest(views):
     row = store.names.index("thing_0")
     top, bottom = object_figure(store, row).subfigs
     mosaic = top.axes[0].images[0].get_array()
-    np.testing.assert_array_equal(mosaic[-32:, 32:64], store.image(row)[1])  # ring 0, azimuth 1
+    np.testing.assert_array_equal(
+        mosaic[-32:, 32:64],
+        store.image(row)[1],
+    )  # ring 0, azimuth 1
     np.testing.assert_array_equal(mosaic[:32, -32:], store.image(row)[39])
     np.testing.assert_array_equal(
-        bottom.axes[0].images[0].get_array().ravel(), store.measure()[row]
+        bottom.axes[0].images[0].get_array().ravel(),
+        store.measure()[row],
     )
     assert len([axes for axes in bottom.axes if axes.get_title()]) == len(
         list(store.group["measures"])
@@ -88,7 +115,11 @@ def test_names_are_shown_as_they_are(tmp_path):
     trimesh.creation.box([1, 2, 3]).export(mesh)
     list(
         render(
-            tmp_path / "meshes", tmp_path / f"{name}.zarr", ViewSphere.named("12"), 16, workers=0
+            tmp_path / "meshes",
+            tmp_path / f"{name}.zarr",
+            ViewSphere.named("12"),
+            16,
+            workers=0,
         )
     )
     store = ViewStore.open(tmp_path / f"{name}.zarr")

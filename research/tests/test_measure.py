@@ -51,8 +51,14 @@ def test_outline_of_a_turned_square(degrees):
     a = np.radians(degrees + np.array([45, 135, 225, 315]))
     depth = np.zeros((400, 400))
     depth[polygon(200 + 150 * np.sin(a), 200 + 150 * np.cos(a))] = 2.0
-    assert silhouette_length(of_depth(depth)) == pytest.approx(4 * 150 * np.sqrt(2) / 400, rel=0.06)
-    assert view_area(of_depth(depth)) == pytest.approx((150 * np.sqrt(2)) ** 2 / 400**2, rel=0.015)
+    assert silhouette_length(of_depth(depth)) == pytest.approx(
+        4 * 150 * np.sqrt(2) / 400,
+        rel=0.06,
+    )
+    assert view_area(of_depth(depth)) == pytest.approx(
+        (150 * np.sqrt(2)) ** 2 / 400**2,
+        rel=0.015,
+    )
 
 
 def test_outline_agrees_with_scikit_image_holes_and_borders_included():
@@ -60,9 +66,14 @@ def test_outline_agrees_with_scikit_image_holes_and_borders_included():
     for _ in range(20):
         seen = np.zeros((100, 100), bool)
         for _ in range(6):
-            seen[disk(rng.integers(0, 100, 2), rng.integers(5, 30), shape=seen.shape)] ^= True
+            seen[
+                disk(rng.integers(0, 100, 2), rng.integers(5, 30), shape=seen.shape)
+            ] ^= True
         expected = perimeter_crofton(np.pad(seen, 2), directions=4) / 100
-        assert silhouette_length(of_depth(seen.astype(float))) == pytest.approx(expected, rel=1e-9)
+        assert silhouette_length(of_depth(seen.astype(float))) == pytest.approx(
+            expected,
+            rel=1e-9,
+        )
 
 
 def test_depth_distribution_of_planes():
@@ -89,7 +100,9 @@ def test_what_a_sensor_gives_for_nothing_is_no_object(name, nothing):
     sensed = np.where(depth > 0, depth, nothing)
     assert MEASURES[name](of_depth(sensed)) == MEASURES[name](of_depth(depth))
     assert MEASURES[name](of_depth(np.full((8, 8), nothing))) == 0
-    assert np.isnan(sensed).any() == np.isnan(nothing)  # what was handed in is left alone
+    assert np.isnan(sensed).any() == np.isnan(
+        nothing
+    )  # what was handed in is left alone
 
 
 @pytest.fixture
@@ -114,7 +127,9 @@ def test_all_measures_of_a_store_and_its_meshes(views):
     row = store.names.index("box")
     box = trimesh.creation.box([1, 2, 3])
     top = SPHERE.poses[0]
-    own = MEASURES["visible_area_ratio"](view_of(make_mesh(box.vertices, box.faces), top, 96))
+    own = MEASURES["visible_area_ratio"](
+        view_of(make_mesh(box.vertices, box.faces), top, 96)
+    )
     assert store.measure("visible_area_ratio")[row, 0] == pytest.approx(own, abs=1e-3)
     assert {problem for _, problem in check(views, workers=0)} == {None}
 
@@ -131,16 +146,27 @@ def test_a_deformed_store_is_measured_on_the_deformed_meshes(views):
             workers=0,
         )
     )
-    measure_with_meshes(views.parent / "new.zarr", meshes, ("visible_area_ratio",), workers=0)
+    measure_with_meshes(
+        views.parent / "new.zarr",
+        meshes,
+        ("visible_area_ratio",),
+        workers=0,
+    )
     store = ViewStore.open(views.parent / "new.zarr")
     row = store.names.index("box")
     new = deformed(store, load_mesh(meshes / "box/box.off"), "box")
     seen = [view_of(new, pose, 64) for pose in SPHERE.poses]
-    np.testing.assert_allclose(store.depth(row), [view.depth for view in seen], atol=1e-4)
+    np.testing.assert_allclose(
+        store.depth(row),
+        [view.depth for view in seen],
+        atol=1e-4,
+    )
     own = [MEASURES["visible_area_ratio"](view) for view in seen]
     np.testing.assert_allclose(store.measure("visible_area_ratio")[row], own, atol=1e-3)
     before = [
-        MEASURES["visible_area_ratio"](view_of(load_mesh(meshes / "box/box.off"), p, 64))
+        MEASURES["visible_area_ratio"](
+            view_of(load_mesh(meshes / "box/box.off"), p, 64)
+        )
         for p in SPHERE.poses
     ]
     assert np.abs(np.subtract(own, before)).max() > 0.02
@@ -175,7 +201,8 @@ def test_measures_take_the_meshes_that_were_rendered_and_no_others(views):
     file = meshes / "box/box.off"
     file.write_text(file.read_text() + "\n")
     with pytest.raises(
-        DatasetError, match=r"box.off: is not the mesh that .*views.zarr was rendered from"
+        DatasetError,
+        match=r"box.off: is not the mesh that .*views.zarr was rendered from",
     ):
         measure_with_meshes(views, meshes, ("visible_area_ratio",), workers=0)
     file.unlink()

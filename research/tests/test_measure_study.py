@@ -62,7 +62,11 @@ def made(views, tmp_path_factory):
 
 
 def found(made, measure, quantity, label=""):
-    table = pd.read_csv(made / "out" / "measures.csv", keep_default_na=False, na_values=["nan"])
+    table = pd.read_csv(
+        made / "out" / "measures.csv",
+        keep_default_na=False,
+        na_values=["nan"],
+    )
     (row,) = table[
         (table["measure"] == measure)
         & (table["quantity"] == quantity)
@@ -72,8 +76,12 @@ def found(made, measure, quantity, label=""):
 
 
 def test_correlations_are_those_of_the_made_up_recogniser(made):
-    assert float(found(made, "view_area", "correlation", "chair").value) == pytest.approx(1)
-    assert float(found(made, "view_area", "correlation", "table").value) == pytest.approx(-1)
+    assert float(
+        found(made, "view_area", "correlation", "chair").value
+    ) == pytest.approx(1)
+    assert float(
+        found(made, "view_area", "correlation", "table").value
+    ) == pytest.approx(-1)
     labels = Predictions.load(made / "test.npz").labels
     mean = np.where(labels < 2, 1, -1).mean()
     assert float(found(made, "view_area", "correlation").value) == pytest.approx(mean)
@@ -123,5 +131,10 @@ def test_the_table_and_the_figure_are_there_for_a_paper(made):
         "table.tex",
     }
     wide = pd.read_csv(made / "out" / "table.csv")
-    assert set(wide["measure"]) >= {"random", "view area", "confidence", "unidirectional"}
+    assert set(wide["measure"]) >= {
+        "random",
+        "view area",
+        "confidence",
+        "unidirectional",
+    }
     assert (made / "out" / "measures.pdf").read_bytes().startswith(b"%PDF")

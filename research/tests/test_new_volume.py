@@ -82,7 +82,8 @@ def after(*poses, radius=0.6, grid=GRID):
 
 
 @pytest.mark.parametrize(
-    ("elevation", "azimuth"), [(0, 0), (0, 45), (0, 90), (0, 135), (0, 180), (54, 90), (72, 225)]
+    ("elevation", "azimuth"),
+    [(0, 0), (0, 45), (0, 90), (0, 135), (0, 180), (54, 90), (72, 225)],
 )
 def test_new_volume_is_the_shadow_that_the_seen_cap_does_not_hide(elevation, azimuth):
     radius = 0.6
@@ -132,10 +133,15 @@ def test_what_a_wall_hides_is_new_from_behind_it():
 
 @pytest.mark.parametrize("together", [1, 3000, 10**9])
 @pytest.mark.parametrize("gain", [new_volume, new_surface])
-def test_cameras_that_are_asked_together_see_what_each_sees_alone(gain, together, monkeypatch):
+def test_cameras_that_are_asked_together_see_what_each_sees_alone(
+    gain,
+    together,
+    monkeypatch,
+):
     """Also those that stand so near that what they see is drawn in wide pixels."""
     cells = np.random.default_rng(0).choice(
-        np.array([UNSEEN] * 6 + [FREE] * 3 + [OBJECT], np.uint8), (12, 12, 12)
+        np.array([UNSEEN] * 6 + [FREE] * 3 + [OBJECT], np.uint8),
+        (12, 12, 12),
     )
     occupancy = Occupancy(VoxelGrid(12), cells)
     eyes = np.concatenate([scale * SPHERE.directions[::5] for scale in (1.3, 2, 3)])
@@ -151,7 +157,9 @@ def test_a_blocker_near_the_camera_has_no_holes():
     grid = VoxelGrid(64, half=2.0)
     cells = np.full((64,) * 3, FREE)
     x, y, z = (m.reshape(cells.shape) for m in grid.middles)
-    cells[(np.abs(x - 1.6) < grid.pitch / 2) & (np.abs(y) < 1) & (np.abs(z) < 1)] = OCCLUDER
+    cells[(np.abs(x - 1.6) < grid.pitch / 2) & (np.abs(y) < 1) & (np.abs(z) < 1)] = (
+        OCCLUDER
+    )
     cells[(x * x + y * y + z * z < 0.5**2)] = UNSEEN
     eyes = np.array([[2.1, 0, 0], [0, 2.5, 0]])
     found = new_volume(Occupancy(grid, cells), eyes) / grid.pitch**3

@@ -48,7 +48,10 @@ def test_a_ball_shows_what_lies_before_the_tangent_plane():
     """A point p of the unit sphere is seen from c exactly if p . c > 1."""
     points, depth, intrinsics = observation(trimesh.creation.icosphere(5))
     share = shared_points(points, depth, SPHERE.poses, intrinsics)
-    true = np.stack([(points @ centre > 1).mean(-1) for centre in SPHERE.poses[:, :3, 3]], 1)
+    true = np.stack(
+        [(points @ centre > 1).mean(-1) for centre in SPHERE.poses[:, :3, 3]],
+        1,
+    )
     np.testing.assert_array_equal(share.diagonal(), 1)
     # the points at the rim, where it is decided by less than a pixel
     assert np.abs(share - true).max() < 0.08
@@ -70,7 +73,9 @@ def test_a_hollow_shape_hides_its_own_parts():
     for view, other in [(0, 4), (0, 34), (9, 11), (38, 2), (20, 20)]:
         seen = (
             first_hit(
-                mesh.vertices[mesh.faces], SPHERE.poses[other, :3, 3], points[view].astype(float)
+                mesh.vertices[mesh.faces],
+                SPHERE.poses[other, :3, 3],
+                points[view].astype(float),
             )
             > 0.999
         )
@@ -95,15 +100,29 @@ def test_the_command_writes_arrays_and_figure(views, tmp_path):
     objects = range(len(store))
     share = np.stack(
         [
-            shared_points(store.points(i), store.depth(i), SPHERE.poses, store.intrinsics)
+            shared_points(
+                store.points(i),
+                store.depth(i),
+                SPHERE.poses,
+                store.intrinsics,
+            )
             for i in objects
         ]
     )
     np.testing.assert_allclose(found["share"], share.mean(0), rtol=1e-5)
-    np.testing.assert_allclose(found["maps"], overlap_maps(share).mean(0), rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(
+        found["maps"],
+        overlap_maps(share).mean(0),
+        rtol=1e-5,
+        atol=1e-7,
+    )
     assert (tmp_path / "all.png").read_bytes().startswith(b"\x89PNG")
     overlap(views, tmp_path / "a", label="chair", workers=0)
-    np.testing.assert_allclose(np.load(tmp_path / "a.npz")["share"], share[:6].mean(0), rtol=1e-5)
+    np.testing.assert_allclose(
+        np.load(tmp_path / "a.npz")["share"],
+        share[:6].mean(0),
+        rtol=1e-5,
+    )
     assert np.load(tmp_path / "a.npz")["objects"] == 6
     with pytest.raises(DatasetError, match="has no class 'c'; there are chair"):
         overlap(views, tmp_path / "c", label="c")

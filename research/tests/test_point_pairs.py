@@ -22,7 +22,10 @@ def block(*boxes):
 
 
 MESHES = {
-    "corner": block(((0, 0, 0), (0.12, 0.03, 0.03)), ((0, 0, 0.03), (0.03, 0.03, 0.09))),
+    "corner": block(
+        ((0, 0, 0), (0.12, 0.03, 0.03)),
+        ((0, 0, 0.03), (0.03, 0.03, 0.09)),
+    ),
     "brick": block(((0, 0, 0), (0.1, 0.06, 0.04))),
 }
 
@@ -35,7 +38,9 @@ def pairs():
 @pytest.fixture(scope="module")
 def seen():
     poses = nextview.ViewSphere.named("40").poses
-    return {name: SimulatedCamera(mesh).observe(poses[12]) for name, mesh in MESHES.items()}
+    return {
+        name: SimulatedCamera(mesh).observe(poses[12]) for name, mesh in MESHES.items()
+    }
 
 
 def test_points_lie_on_the_surface_and_normals_are_of_it():
@@ -43,7 +48,11 @@ def test_points_lie_on_the_surface_and_normals_are_of_it():
     points = cloud[:, :3] - np.array([0.05, 0.03, 0.02])
     face = (np.abs(points) / np.array([0.05, 0.03, 0.02])).argmax(1)
     rows = np.arange(len(points))
-    assert np.allclose(np.abs(points[rows, face]), np.array([0.05, 0.03, 0.02])[face], atol=1e-6)
+    assert np.allclose(
+        np.abs(points[rows, face]),
+        np.array([0.05, 0.03, 0.02])[face],
+        atol=1e-6,
+    )
     assert np.allclose(cloud[rows, 3 + face], np.sign(points[rows, face]), atol=1e-5)
 
 

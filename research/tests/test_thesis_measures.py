@@ -74,9 +74,13 @@ def test_a_cube():
     # 12 edges that bend by a right angle, of which half the curvature lies on the three sides; 8
     # corners alike.
     assert MEASURES["mean_curvature"](view) == pytest.approx(
-        12 * SIDE * (np.pi / 2) / 2 / 2, rel=0.01
+        12 * SIDE * (np.pi / 2) / 2 / 2,
+        rel=0.01,
     )
-    assert MEASURES["gaussian_curvature"](view) == pytest.approx(8 * (np.pi / 2) / 2, rel=0.02)
+    assert MEASURES["gaussian_curvature"](view) == pytest.approx(
+        8 * (np.pi / 2) / 2,
+        rel=0.02,
+    )
     # six triangles, unequal
     assert MEASURES["viewpoint_entropy"](view) == pytest.approx(np.log2(6), abs=0.2)
     # three directions, unequal
@@ -113,7 +117,9 @@ def test_a_flat_square_does_not_bend():
     surface = surface_of(top)
     assert surface.mean_of_faces.sum() == pytest.approx(0, abs=1e-9)
     corners = np.isclose(np.abs(surface.deficits), np.pi / 2)
-    assert corners.sum() == 4  # of the open square; along its edges and inside nothing turns
+    assert (
+        corners.sum() == 4
+    )  # of the open square; along its edges and inside nothing turns
     assert np.abs(surface.deficits[~corners]).max() < 1e-9
 
 
@@ -121,7 +127,11 @@ def test_views_from_above_and_of_the_base():
     elevations = np.array([-60, -20, 0, 22.5, 45, 90])
     poses = [look_at_origin(np.radians(e), 0.3, 3) for e in elevations]
     values = [measured("above_preference", CUBE, pose, 64) for pose in poses]
-    np.testing.assert_allclose(values, np.exp(-(((elevations - 22.5) / 45) ** 2) / 2), atol=1e-6)
+    np.testing.assert_allclose(
+        values,
+        np.exp(-(((elevations - 22.5) / 45) ** 2) / 2),
+        atol=1e-6,
+    )
     avoided = [measured("base_avoidance", CUBE, pose, 64) for pose in poses]
     assert avoided[2:] == [1] * 4
     below = view_of(CUBE, look_at_origin(np.radians(-90), 0, 3))
@@ -168,8 +178,13 @@ def test_a_slanted_plane_tells_no_more_than_a_frontal_one(azimuth):
     for slant in (10, 18, 33, 45, 60):
         slanted = plane(slant, azimuth)
         assert np.ptp(visible_normals(slanted), axis=1).max() < 1e-4
-        assert gradient_entropy(slanted) == pytest.approx(gradient_entropy(frontal), abs=0.1)
-        assert MEASURES["depth_entropy"](slanted) > MEASURES["depth_entropy"](frontal) + 2
+        assert gradient_entropy(slanted) == pytest.approx(
+            gradient_entropy(frontal),
+            abs=0.1,
+        )
+        assert (
+            MEASURES["depth_entropy"](slanted) > MEASURES["depth_entropy"](frontal) + 2
+        )
     assert gradient_entropy(frontal) == pytest.approx(0, abs=1e-9)
 
 
@@ -180,7 +195,10 @@ def test_directions_of_a_ball():
     far = 20.0
     view = view_of(BALL, look_at_origin(0.3, 0.5, far), 448, far)
     own = np.log2(2 * np.pi * np.e * 0.1**2)  # of the blur
-    assert gradient_entropy(view) == pytest.approx(np.log2(np.pi * np.sqrt(np.e)) - own, abs=0.15)
+    assert gradient_entropy(view) == pytest.approx(
+        np.log2(np.pi * np.sqrt(np.e)) - own,
+        abs=0.15,
+    )
 
 
 # Independent implementations
@@ -206,13 +224,18 @@ def test_trimesh_agrees(solid):
     # Trimesh's has the sign of the edge, convex or not.
     signed = np.where(solid.face_adjacency_convex, 1, -1) * solid.face_adjacency_angles
     lengths = np.linalg.norm(
-        np.diff(solid.vertices[solid.face_adjacency_edges], axis=1)[:, 0], axis=1
+        np.diff(solid.vertices[solid.face_adjacency_edges], axis=1)[:, 0],
+        axis=1,
     )
     assert surface.mean_of_faces.sum() == pytest.approx(
-        (np.abs(signed) * lengths).sum() / 2, rel=1e-4
+        (np.abs(signed) * lengths).sum() / 2,
+        rel=1e-4,
     )
     if solid.is_convex:
-        assert surface.mean_of_faces.sum() == pytest.approx(solid.integral_mean_curvature, rel=1e-4)
+        assert surface.mean_of_faces.sum() == pytest.approx(
+            solid.integral_mean_curvature,
+            rel=1e-4,
+        )
 
 
 def test_face_ids_are_those_of_rays_cast_by_trimesh_geometry():
@@ -224,12 +247,19 @@ def test_face_ids_are_those_of_rays_cast_by_trimesh_geometry():
     assert (ids >= 0).all()
     assert (view.face_ids[view.depth == 0] == -1).all()
     rays = (
-        np.stack([column + 0.5, row + 0.5, np.ones(len(row))], 1) @ np.linalg.inv(view.intrinsics).T
+        np.stack([column + 0.5, row + 0.5, np.ones(len(row))], 1)
+        @ np.linalg.inv(view.intrinsics).T
     )
     points = (rays * view.depth[row, column, None]) @ CORNER[:3, :3].T + CORNER[:3, 3]
-    barycentric = trimesh.triangles.points_to_barycentric(mesh.vertices[mesh.faces[ids]], points)
+    barycentric = trimesh.triangles.points_to_barycentric(
+        mesh.vertices[mesh.faces[ids]],
+        points,
+    )
     assert barycentric.min() > -1e-3
-    triangle = trimesh.triangles.barycentric_to_points(mesh.vertices[mesh.faces[ids]], barycentric)
+    triangle = trimesh.triangles.barycentric_to_points(
+        mesh.vertices[mesh.faces[ids]],
+        barycentric,
+    )
     assert np.abs(triangle - points).max() < 1e-3
 
 
@@ -240,19 +270,30 @@ def test_a_wire_before_a_wall_is_seen_in_each_pixel_that_it_fills(gap, aside):
     """As wide as one pixel, so that the pixels on both sides of it show one face of the wall."""
     wall = np.array([[-0.6, -0.6, 0], [0.6, -0.6, 0], [0.6, 0.6, 0], [-0.6, 0.6, 0]])
     wire = wall * [0.012, 0.9, 0] + [aside, 0, gap]
-    corners = np.concatenate([wall, wire])[:, [2, 0, 1]]  # they face x, where the camera is
-    mesh = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]), 1.0, "wire")
+    corners = np.concatenate([wall, wire])[
+        :,
+        [2, 0, 1],
+    ]  # they face x, where the camera is
+    mesh = Mesh(
+        corners,
+        np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]),
+        1.0,
+        "wire",
+    )
     camera = SimulatedCamera(mesh, 224)
     for azimuth in (0, 0.5):
         pose = look_at_origin(0.2, azimuth, 3.0)
         seen = camera.observe(pose).depth
         row, column = np.nonzero(seen)
-        ids = FaceCamera(mesh, 224).face_ids(pose, np.rint(seen * 1e4) / 1e4)[row, column]
+        ids = FaceCamera(mesh, 224).face_ids(pose, np.rint(seen * 1e4) / 1e4)[
+            row,
+            column,
+        ]
         x = column + 0.5
         y = row + 0.5
-        points = (np.stack([x, y, np.ones(len(x))], 1) @ np.linalg.inv(camera.intrinsics).T) * seen[
-            row, column, None
-        ]
+        points = (
+            np.stack([x, y, np.ones(len(x))], 1) @ np.linalg.inv(camera.intrinsics).T
+        ) * seen[row, column, None]
         before = (points @ pose[:3, :3].T + pose[:3, 3])[:, 0] > gap / 2
         assert before.sum() > 50
         np.testing.assert_array_equal(ids >= 2, before)
@@ -284,10 +325,22 @@ def test_nothing_depends_on_where_object_and_camera_are_together(name):
         else Rotation.from_euler("xyz", [40, 110, 200])
     )
     move = np.eye(4)
-    move[:3, :3], move[:3, 3] = turn.as_matrix(), (0, 0, 0) if upright else (0.3, -0.2, 0.1)
-    moved = Mesh(mesh.vertices @ move[:3, :3].T + move[:3, 3], mesh.faces, mesh.centre, mesh.radius)
+    move[:3, :3], move[:3, 3] = (
+        turn.as_matrix(),
+        (0, 0, 0) if upright else (0.3, -0.2, 0.1),
+    )
+    moved = Mesh(
+        mesh.vertices @ move[:3, :3].T + move[:3, 3],
+        mesh.faces,
+        mesh.centre,
+        mesh.radius,
+    )
     # A few pixels at edges fall to the other side.
-    assert measured(name, moved, move @ CORNER, 96) == pytest.approx(still, rel=0.03, abs=0.03)
+    assert measured(name, moved, move @ CORNER, 96) == pytest.approx(
+        still,
+        rel=0.03,
+        abs=0.03,
+    )
 
 
 REMESHED = {
@@ -305,11 +358,14 @@ four. A half hidden face has half of the curvature of its edges, and its parts m
 @pytest.mark.parametrize("name", REMESHED)
 def test_cutting_faces_changes_little(name):
     mesh = load_mesh(SAMPLES / "chair.off")
-    fine = mesh_of(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).subdivide())
+    fine = mesh_of(
+        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).subdivide()
+    )
     for view in (9, 20, 35):
         before = measured(name, mesh, SPHERE.poses[view], 128)
         assert measured(name, fine, SPHERE.poses[view], 128) == pytest.approx(
-            before, rel=REMESHED[name]
+            before,
+            rel=REMESHED[name],
         )
 
 
@@ -335,7 +391,9 @@ def test_neither_shared_corners_nor_the_turn_of_faces_count(name):
     # which of two equal edges is cut first depends on the order
     near = 0.02 if name == "mesh_saliency" else 1e-3
     assert measured(name, loose, CORNER, 96) == pytest.approx(
-        measured(name, mesh, CORNER, 96), rel=near, abs=1e-6
+        measured(name, mesh, CORNER, 96),
+        rel=near,
+        abs=1e-6,
     )
 
 
@@ -353,7 +411,10 @@ def test_broken_meshes_have_finite_measures(name):
             np.vstack([box.vertices, [[0, 0, 2]]]),
             np.vstack([box.faces, [[0, 1, 8]]]),
         ),
-        "doubled": (np.vstack([box.vertices] * 2), np.vstack([box.faces, box.faces[:, ::-1] + 8])),
+        "doubled": (
+            np.vstack([box.vertices] * 2),
+            np.vstack([box.faces, box.faces[:, ::-1] + 8]),
+        ),
     }
     for vertices, faces in broken.values():
         value = measured(name, make_mesh(vertices, faces), CORNER, 48)
@@ -369,7 +430,9 @@ def test_real_meshes_have_finite_measures():
         for pose in SPHERE.poses[[0, 21]]:
             view = view_of(mesh, pose, 112)
             values = {name: function(view) for name, function in MEASURES.items()}
-            assert all(np.isfinite(value) and value >= 0 for value in values.values()), (
+            assert all(
+                np.isfinite(value) and value >= 0 for value in values.values()
+            ), (
                 entries[i].path,
                 values,
             )

@@ -54,7 +54,12 @@ def state_of(sphere, *episodes, **maps) -> EpisodeState:
     flat = np.full((len(episodes), 2), 0.5)
     current = np.array([views[-1] for views in episodes])
     return EpisodeState(
-        current, visited, flat, Evidence(flat, maps), len(episodes[0]), np.arange(len(episodes))
+        current,
+        visited,
+        flat,
+        Evidence(flat, maps),
+        len(episodes[0]),
+        np.arange(len(episodes)),
     )
 
 
@@ -74,7 +79,10 @@ def test_after_one_view_of_a_ball_the_other_side_is_most_new(gain):
     values = policy.view_values(state)
     assert (values[[0, 1], [8, 12]] < 0.1 * values.max(1)).all()
     for row, view in enumerate((8, 12)):  # each row by itself
-        alone = replace(state_of(SPHERE, [view]), observations=[state.observations[row]])
+        alone = replace(
+            state_of(SPHERE, [view]),
+            observations=[state.observations[row]],
+        )
         np.testing.assert_array_equal(policy.view_values(alone)[0], values[row])
 
 
@@ -105,7 +113,10 @@ def test_peaks_of_a_sphere_are_those_of_a_maximum_filter_that_wraps():
     for _ in range(20):
         values = rng.integers(0, 6, (1, 5, 8)) / 5.0
         wrapped = np.tile(values[0], (1, 3))
-        peaks = (wrapped == maximum_filter(wrapped, 3, mode="constant", cval=-np.inf))[:, 8:16]
+        peaks = (wrapped == maximum_filter(wrapped, 3, mode="constant", cval=-np.inf))[
+            :,
+            8:16,
+        ]
         order = np.argsort(-sphere_peaks(values)[0].ravel(), kind="stable")
         expected = np.lexsort((np.arange(40), -values[0].ravel(), ~peaks.ravel()))
         np.testing.assert_array_equal(order, expected)
@@ -117,10 +128,18 @@ def test_the_map_of_the_sphere_is_counted_from_the_view():
     on_sphere = SpherePeak(SPHERE, "lem-sphere").view_values(state)
     for row, azimuth in enumerate((3, 0)):
         for view in range(40):
-            assert on_sphere[row, view] == values[row, view // 8, (view % 8 - azimuth) % 8]
-    chosen = SpherePeak(SPHERE, "lem-sphere").next_views(state, np.random.default_rng(0))
+            assert (
+                on_sphere[row, view] == values[row, view // 8, (view % 8 - azimuth) % 8]
+            )
+    chosen = SpherePeak(SPHERE, "lem-sphere").next_views(
+        state,
+        np.random.default_rng(0),
+    )
     scores = SpherePeak(SPHERE, "lem-sphere").scores(state)
-    assert scores[[0, 1], chosen].tolist() == np.where(state.free, scores, -9).max(1).tolist()
+    assert (
+        scores[[0, 1], chosen].tolist()
+        == np.where(state.free, scores, -9).max(1).tolist()
+    )
 
 
 # True measures
@@ -131,14 +150,18 @@ def test_the_oracle_of_a_measure_goes_to_the_highest_view_left():
     best = np.argsort(-values, 1)
     policy = OracleMeasure(SPHERE, values)
     state = state_of(SPHERE, [best[0, 0], best[0, 1]], [best[1, 1], best[1, 2]])
-    assert policy.next_views(state, np.random.default_rng(0)).tolist() == [best[0, 2], best[1, 0]]
+    assert policy.next_views(state, np.random.default_rng(0)).tolist() == [
+        best[0, 2],
+        best[1, 0],
+    ]
 
 
 def test_the_oracle_of_peaks_leaves_out_the_slope_below_a_peak():
     values = np.zeros((1, 40))
     values[0, [8, 9, 28]] = 1.0, 0.9, 0.5  # 9 is next to 8 and no peak
     chosen = OracleMeasure(SPHERE, values, peaks=True).next_views(
-        state_of(SPHERE, [8]), np.random.default_rng(0)
+        state_of(SPHERE, [8]),
+        np.random.default_rng(0),
     )
     assert chosen.tolist() == [28]
 
@@ -194,12 +217,21 @@ def test_the_benchmark_goes_the_way_that_was_planned(stored):
         assert ways.shape == (2, 6, PLANNED)
         np.testing.assert_array_equal(ways[:, :, 0], np.tile(np.arange(6), (2, 1)))
         paths = replay(name, specs, 3, 0)
-        np.testing.assert_array_equal(paths.views, ways[specs.objects, specs.starts, :3])
+        np.testing.assert_array_equal(
+            paths.views,
+            ways[specs.objects, specs.starts, :3],
+        )
         # by hand
         seen = []
         way = ways[1, 5].astype(int)
         for k in range(3):
-            seen.append(Observation(views.depth(1)[way[k]], RING.poses[way[k]], views.intrinsics))
+            seen.append(
+                Observation(
+                    views.depth(1)[way[k]],
+                    RING.poses[way[k]],
+                    views.intrinsics,
+                )
+            )
             gains = gain(occupancy_of(seen, VoxelGrid(64)), RING.poses[:, :3, 3])
             gains[way[: k + 1]] = -1
             assert gains[way[k + 1]] >= gains.max() - 1e-6
@@ -223,21 +255,29 @@ def test_what_was_planned_is_where_the_policy_goes_by_itself(stored, name):
 
             def observe(episodes, at, i=i):
                 frames = [
-                    Observation(views.depth(i)[view].copy(), RING.poses[view], views.intrinsics)
+                    Observation(
+                        views.depth(i)[view].copy(),
+                        RING.poses[view],
+                        views.intrinsics,
+                    )
                     for view in at
                 ]
                 return Evidence(np.zeros((len(at), 2)), observations=frames)
 
             alone = run_episodes(observe, RING, policy, np.array([start]), rule, rng)
             np.testing.assert_array_equal(
-                views.read(f"plans/{name}", i)[start], alone.outcome.views[0]
+                views.read(f"plans/{name}", i)[start],
+                alone.outcome.views[0],
             )
 
 
 def test_true_measures_come_from_the_store(stored):
     store, predictions = stored
     specs = make_specs(predictions, 4, 0)
-    with pytest.raises(EntryError, match=r"nextview measure \S+ --measures view_area makes it"):
+    with pytest.raises(
+        EntryError,
+        match=r"nextview measure \S+ --measures view_area makes it",
+    ):
         replay("true-view_area-all", specs, 3, 0)
     list(measure(store, ["view_area"], workers=0))
     area = ViewStore.open(store).rows("measures/view_area")[specs.objects]
@@ -247,7 +287,10 @@ def test_true_measures_come_from_the_store(stored):
         assert sorted(area[row, way[1:]]) == pytest.approx(sorted(area[row, left])[-2:])
     best = replay("true-view_area-4", specs, 3, 0)
     assert best.fixed
-    np.testing.assert_allclose(area[np.arange(8)[:, None], best.views], -np.sort(-area, 1)[:, :4])
+    np.testing.assert_allclose(
+        area[np.arange(8)[:, None], best.views],
+        -np.sort(-area, 1)[:, :4],
+    )
     entropy = replay("true-depth_entropy-4", specs, 3, 0).views
     np.testing.assert_array_equal(entropy, replay("high-entropy-4", specs, 3, 0).views)
     assert is_oracle("true-view_area-all")

@@ -61,13 +61,17 @@ def missing_extra(
         project: whose parts they are, as pip is told.
     """
     package = (error.name or "").partition(".")[0]
-    extra = next((extra for extra, of_extra in packages.items() if package in of_extra), None)
+    extra = next(
+        (extra for extra, of_extra in packages.items() if package in of_extra),
+        None,
+    )
     return None if extra is None else f"this {needs_package(package, extra, project)}"
 
 
 @contextmanager
 def extras(
-    packages: Mapping[str, tuple[str, ...]] = EXTRAS, project: str = "nextview"
+    packages: Mapping[str, tuple[str, ...]] = EXTRAS,
+    project: str = "nextview",
 ) -> Iterator[None]:
     """Stands around imports from optional parts of the installation.
 
@@ -98,7 +102,9 @@ def one_line(text: str, most: int = 80) -> str:
         most: length in characters.
     """
     text = " ".join(text[: 10 * most].split())
-    text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    text = "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode() for c in text
+    )
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
@@ -140,7 +146,9 @@ def whole(value: Any, what: str, least: int = 0, most: int = 2**31 - 1) -> int:
         or not least <= int(value) <= most
     ):
         reach = f"from {least} on" if most == 2**31 - 1 else f"from {least} to {most}"
-        raise UsageError(f"{what} is a whole number {reach}, not {one_line(repr(value))}")
+        raise UsageError(
+            f"{what} is a whole number {reach}, not {one_line(repr(value))}"
+        )
     return int(value)
 
 
@@ -159,7 +167,11 @@ def one_of(value: Any, known: Iterable[Any], what: str) -> None:
 
 
 def number(
-    value: Any, what: str, least: float = -np.inf, most: float = np.inf, above: float = -np.inf
+    value: Any,
+    what: str,
+    least: float = -np.inf,
+    most: float = np.inf,
+    above: float = -np.inf,
 ) -> float:
     """A finite number within limits, ``above`` the last excluded; UsageError if it is none.
 
@@ -171,7 +183,11 @@ def number(
         above: the value has to be larger than this.
     """
     fits = isinstance(value, Real) and not isinstance(value, bool | np.bool_)
-    if not fits or not np.isfinite(float(value)) or not (least <= value <= most and value > above):
+    if (
+        not fits
+        or not np.isfinite(float(value))
+        or not (least <= value <= most and value > above)
+    ):
         reach = []
         if least > -np.inf:
             reach.append(f"of at least {least:g}")
@@ -233,7 +249,9 @@ def points(value: Any, what: str) -> Float:
     except (TypeError, ValueError):
         array = np.zeros(0)
     if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
-        raise UsageError(f"{what} are points, (N, 3) finite numbers, not {one_line(repr(value))}")
+        raise UsageError(
+            f"{what} are points, (N, 3) finite numbers, not {one_line(repr(value))}"
+        )
     return array
 
 
@@ -281,5 +299,9 @@ def plugin_errors(error: Callable[[str], NextviewError]) -> Iterator[None]:
             for f in traceback.extract_tb(raised.__traceback__)
             if not f.filename.startswith(_NOT_PLUGINS)
         ]
-        text += f", at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
+        text += (
+            f", at {Path(frames[-1].filename).name}:{frames[-1].lineno}"
+            if frames
+            else ""
+        )
         raise error(text) from raised

@@ -31,10 +31,16 @@ T = TypeVar("T")
 # a field of a record: a hash in hexadecimal digits
 HashText = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # errors of a full disk
-MARKER = "nextview-unfinished.json"  # in each temporary folder: an ``Unfinished`` record
-LONGEST_OUTPUT_NAME = 40  # letters of an output's name that the name of its temporary folder holds
+MARKER = (
+    "nextview-unfinished.json"  # in each temporary folder: an ``Unfinished`` record
+)
+LONGEST_OUTPUT_NAME = (
+    40  # letters of an output's name that the name of its temporary folder holds
+)
 LONGEST_PATH = 300  # letters of a path that a sentence shows
-LARGEST_RECORD = 64 * 2**20  # bytes of a JSON record; a card takes some hundred thousand
+LARGEST_RECORD = (
+    64 * 2**20
+)  # bytes of a JSON record; a card takes some hundred thousand
 
 
 def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None:
@@ -60,13 +66,17 @@ def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None
         if kind != ("folder" if folder else "file"):
             raise ResultsError(f"{path}: is a {kind}; give another name")
         if not overwrite and not (folder and not any(path.iterdir())):
-            raise ResultsError(f"{path}: exists; give another name, or --overwrite to replace it")
+            raise ResultsError(
+                f"{path}: exists; give another name, or --overwrite to replace it"
+            )
 
     above = next(p for p in path.absolute().parents if p.exists())
     if not above.is_dir():
         raise ResultsError(f"{path}: cannot be written ({above} is not a folder)")
     if not os.access(above, os.W_OK | os.X_OK):
-        raise ResultsError(f"{path}: cannot be written (no permission to write in {above})")
+        raise ResultsError(
+            f"{path}: cannot be written (no permission to write in {above})"
+        )
 
 
 @contextmanager
@@ -90,7 +100,10 @@ def new_file(path: Path, overwrite: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def new_folder(
-    path: Path, overwrite: bool = False, last: str = "", withdraw: bool = False
+    path: Path,
+    overwrite: bool = False,
+    last: str = "",
+    withdraw: bool = False,
 ) -> Iterator[Path]:
     """Write a folder of files: yields a temporary folder beside it.
 
@@ -143,7 +156,9 @@ def _replace(part: Path, folder: Path, files: Sequence[Path], last: str) -> None
 
     Paths are relative to the folders.
     """
-    for file in sorted(files, key=lambda file: (file.as_posix() == last, -len(file.parts), file)):
+    for file in sorted(
+        files, key=lambda file: (file.as_posix() == last, -len(file.parts), file)
+    ):
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         if file.as_posix() == last:
             _sync_folder(folder)  # what it names is on the disk before it is
@@ -216,7 +231,10 @@ def _marked_folder(path: Path, key: str) -> Path:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         folder = Path(
-            tempfile.mkdtemp(prefix=f".{path.name[:LONGEST_OUTPUT_NAME]}-", dir=path.parent)
+            tempfile.mkdtemp(
+                prefix=f".{path.name[:LONGEST_OUTPUT_NAME]}-",
+                dir=path.parent,
+            )
         )
         (folder / MARKER).write_bytes(msgspec.json.encode(Unfinished(path.name, key)))
     except OSError as error:
@@ -276,7 +294,9 @@ def _beside(path: Path) -> Iterator[Path]:
         except OSError as error:
             if error.errno not in FULL:
                 raise
-            raise ResultsError(f"{path}: cannot be written ({error.strerror})") from None
+            raise ResultsError(
+                f"{path}: cannot be written ({error.strerror})"
+            ) from None
         finally:
             _remove(temporary)
 
@@ -305,7 +325,10 @@ def _sync_folder(path: Path) -> None:
         return
     # no file is lost without it: some network file systems refuse it, as does a folder that
     with suppress(OSError):
-        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)  # can be written but not read
+        descriptor = os.open(
+            path,
+            os.O_RDONLY | os.O_DIRECTORY,
+        )  # can be written but not read
         try:
             os.fsync(descriptor)
         finally:
@@ -318,12 +341,17 @@ def only_one(path: Path) -> Iterator[None]:
 
     DatasetError is raised if another one is writing, or the path cannot be written.
     """
-    from filelock import FileLock, Timeout  # here, as whoever only recognises needs none
+    from filelock import (
+        FileLock,
+        Timeout,
+    )  # here, as whoever only recognises needs none
 
     place = path.absolute()
     file = place.with_name(f".{place.name}.lock")
     lock = FileLock(file, timeout=0)
-    if file.is_symlink() or (file.exists() and (not file.is_file() or file.stat().st_size > 0)):
+    if file.is_symlink() or (
+        file.exists() and (not file.is_file() or file.stat().st_size > 0)
+    ):
         # a lock is an empty file, where the system has locks
         what = "another run's lock, or no file of this program"
         raise DatasetError(f"{path}: cannot be written while {file} is there: {what}")
@@ -336,7 +364,9 @@ def only_one(path: Path) -> Iterator[None]:
                 f"{path}: another run is writing it; wait for that one or stop it"
             ) from None
         except OSError as error:
-            raise DatasetError(f"{path}: cannot be written ({error.strerror})") from None
+            raise DatasetError(
+                f"{path}: cannot be written ({error.strerror})"
+            ) from None
         try:
             yield
         finally:
@@ -346,7 +376,10 @@ def only_one(path: Path) -> Iterator[None]:
 
 
 def regular_file(
-    path: Path, what: str, error: type[NextviewError], largest: int | None = None
+    path: Path,
+    what: str,
+    error: type[NextviewError],
+    largest: int | None = None,
 ) -> None:
     """Check that a path names a regular file.
 
@@ -371,7 +404,10 @@ def regular_file(
 
 
 def read_record(
-    path: Path, record: type[T], what: str, error: type[NextviewError] = ModelError
+    path: Path,
+    record: type[T],
+    what: str,
+    error: type[NextviewError] = ModelError,
 ) -> T:
     """Read a typed record from a JSON file.
 
@@ -392,7 +428,10 @@ def read_record(
 
 
 def decode_record(
-    content: bytes | dict[str, Any], record: type[T], where: str, error: type[NextviewError]
+    content: bytes | dict[str, Any],
+    record: type[T],
+    where: str,
+    error: type[NextviewError],
 ) -> T:
     """A typed record from JSON, or from the objects that JSON was read to.
 
@@ -422,7 +461,8 @@ def write_record(path: Path, record: Any, overwrite: bool = False) -> None:
     """
     with new_file(path, overwrite) as part:
         part.write_bytes(
-            msgspec.json.format(msgspec.json.encode(record, enc_hook=_plain), indent=1) + b"\n"
+            msgspec.json.format(msgspec.json.encode(record, enc_hook=_plain), indent=1)
+            + b"\n"
         )
 
 
@@ -451,12 +491,17 @@ def checked_bytes(path: Path, sha256: str, what: str = "weights") -> bytes:
     regular_file(path, what, ModelError)
     content = path.read_bytes()
     if hashlib.sha256(content).hexdigest() != sha256:
-        raise ModelError(f"{path}: is not the file that its card describes (the SHA-256 differs)")
+        raise ModelError(
+            f"{path}: is not the file that its card describes (the SHA-256 differs)"
+        )
     return content
 
 
 def arrays_in(
-    content: bytes, names: Sequence[str], where: str, optional: Sequence[str] = ()
+    content: bytes,
+    names: Sequence[str],
+    where: str,
+    optional: Sequence[str] = (),
 ) -> dict[str, np.ndarray]:
     """Read the named arrays from the content of a safetensors file.
 

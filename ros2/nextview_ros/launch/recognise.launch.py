@@ -12,8 +12,14 @@ ARGUMENTS = {
     "camera": ("/camera/depth", "namespace of the depth camera"),
     "image": ("image_rect_raw", "topic of the depth images below it"),
     "world_frame": ("base_link", "frame of the poses, z up"),
-    "rectified": ("true", "the images are rectified: P of camera_info counts, not K and D"),
-    "axes": ("opencv", "axes of the images' frame: opencv for an optical frame, ros for a body's"),
+    "rectified": (
+        "true",
+        "the images are rectified: P of camera_info counts, not K and D",
+    ),
+    "axes": (
+        "opencv",
+        "axes of the images' frame: opencv for an optical frame, ros for a body's",
+    ),
     "models": ("modelnet10", "bundled models, or a folder"),
     "policy": ("", "how the next view is chosen; empty for what goes with the models"),
     "life_size": ("false", "the objects are as large as their kind is in life"),

@@ -26,7 +26,11 @@ neighbours.
 
 
 def frame_of(
-    image: Any, info: Any, transform: Any, rectified: bool = False, axes: str = "opencv"
+    image: Any,
+    info: Any,
+    transform: Any,
+    rectified: bool = False,
+    axes: str = "opencv",
 ) -> Frame:
     """What a session takes.
 
@@ -57,7 +61,11 @@ def frame_of(
 
 
 def frame_at(
-    image: Any, info: Any, pose: Float, rectified: bool = False, axes: str = "opencv"
+    image: Any,
+    info: Any,
+    pose: Float,
+    rectified: bool = False,
+    axes: str = "opencv",
 ) -> Frame:
     """The same, with the pose of the image's frame in the world as a matrix, (4, 4), metres."""
     if (image.width, image.height) != (info.width, info.height):

@@ -76,14 +76,22 @@ class CameraPoses:
 
     def __init__(self, node: Node, source: str, world: str, group: Any) -> None:
         if source not in POSE_SOURCES:
-            raise UsageError(f"poses come from {' or '.join(POSE_SOURCES)}, not {source!r}")
+            raise UsageError(
+                f"poses come from {' or '.join(POSE_SOURCES)}, not {source!r}"
+            )
         self.node = node
         self.source = source
         self.world = world
         self.tree = TransformTree(kept=TRANSFORMS)
         self.arrived = threading.Condition()
         if source == "topic":
-            node.create_subscription(PoseStamped, CAMERA, self.take_pose, 100, callback_group=group)
+            node.create_subscription(
+                PoseStamped,
+                CAMERA,
+                self.take_pose,
+                100,
+                callback_group=group,
+            )
             return
         try:
             from tf2_msgs.msg import TFMessage
@@ -93,9 +101,18 @@ class CameraPoses:
                 " camera's pose on camera_pose"
             ) from None
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        for topic, quality, fixed in (("/tf", 100, False), ("/tf_static", latched, True)):
+        for topic, quality, fixed in (
+            ("/tf", 100, False),
+            ("/tf_static", latched, True),
+        ):
             take = partial(self.take_transforms, fixed)
-            node.create_subscription(TFMessage, topic, take, quality, callback_group=group)
+            node.create_subscription(
+                TFMessage,
+                topic,
+                take,
+                quality,
+                callback_group=group,
+            )
 
     def take_transforms(self, fixed: bool, message: Any) -> None:
         """Take in what tf says."""
@@ -106,12 +123,23 @@ class CameraPoses:
         """Take in a pose of the camera."""
         self._add(CAMERA, message.header, message.pose)
 
-    def _add(self, child: str, header: Any, transform: Any, fixed: bool = False) -> None:
+    def _add(
+        self,
+        child: str,
+        header: Any,
+        transform: Any,
+        fixed: bool = False,
+    ) -> None:
         position, quaternion = parts_of(transform)
         with self.arrived:
             try:
                 self.tree.add(
-                    child, header.frame_id, seconds(header.stamp), position, quaternion, fixed
+                    child,
+                    header.frame_id,
+                    seconds(header.stamp),
+                    position,
+                    quaternion,
+                    fixed,
                 )
             except TransformError as error:
                 self.node.get_logger().warning(str(error))

@@ -78,15 +78,29 @@ class RecogniseNode(Node):
             threading.Event(),
             threading.Condition(),
         )
-        self.begun = threading.Event()  # set while no accepted goal waits for its session
+        self.begun = (
+            threading.Event()
+        )  # set while no accepted goal waits for its session
         self.latest = None
         group = ReentrantCallbackGroup()
-        self.poses = CameraPoses(self, self.value("poses"), self.value("world_frame"), group)
+        self.poses = CameraPoses(
+            self,
+            self.value("poses"),
+            self.value("world_frame"),
+            group,
+        )
         self.pairs = Pairs(self.keep)
-        for kind, topic, name in ((Image, "depth", "image"), (CameraInfo, "camera_info", "info")):
+        for kind, topic, name in (
+            (Image, "depth", "image"),
+            (CameraInfo, "camera_info", "info"),
+        ):
             take = partial(self.pairs.take, name)
             self.create_subscription(
-                kind, topic, take, qos_profile_sensor_data, callback_group=group
+                kind,
+                topic,
+                take,
+                qos_profile_sensor_data,
+                callback_group=group,
             )
 
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -94,7 +108,11 @@ class RecogniseNode(Node):
         self.next_poses = self.create_publisher(PoseArray, "next_poses", latched)
         self.detections = None
         if Detection3DArray is not None:
-            self.detections = self.create_publisher(Detection3DArray, "detections", latched)
+            self.detections = self.create_publisher(
+                Detection3DArray,
+                "detections",
+                latched,
+            )
 
         self.create_service(Trigger, "look", self.look, callback_group=group)
         self.create_service(Trigger, "failed", self.failed, callback_group=group)
@@ -131,12 +149,19 @@ class RecogniseNode(Node):
         patience = self.value("patience")
         with self.arrived:
             fresh = self.arrived.wait_for(
-                lambda: self.latest is not None and seconds(self.latest[0].header.stamp) >= now,
+                lambda: (
+                    self.latest is not None
+                    and seconds(self.latest[0].header.stamp) >= now
+                ),
                 patience,
             )
             latest = self.latest
         if not fresh:
-            why = self.pairs.missing() if latest is None else "the images are older than the look"
+            why = (
+                self.pairs.missing()
+                if latest is None
+                else "the images are older than the look"
+            )
             raise nextview.ObservationError(
                 f"no depth image with its camera_info came within {patience} s: {why}"
             )
@@ -163,7 +188,9 @@ class RecogniseNode(Node):
             with self.busy:
                 self.session, self.goal = session, goal
             self.begun.set()
-            while not self.ended.wait(0.1) and not goal.is_cancel_requested and rclpy.ok():
+            while (
+                not self.ended.wait(0.1) and not goal.is_cancel_requested and rclpy.ok()
+            ):
                 pass
         except nextview.NextviewError as error:
             self.get_logger().error(str(error))
@@ -175,7 +202,9 @@ class RecogniseNode(Node):
             self.begun.set()
         if not session.done:
             goal.canceled() if goal.is_cancel_requested else goal.abort()
-            return without_answer(f"ended after {len(session.views)} views, before it was sure")
+            return without_answer(
+                f"ended after {len(session.views)} views, before it was sure"
+            )
         goal.succeed()
         found = session.result
         if self.detections is not None:
@@ -190,7 +219,9 @@ class RecogniseNode(Node):
             views=len(found.views),
             pose=self.pose_of(found),
             pose_of=found.pose_of or "",
-            pose_degrees=0.0 if found.pose_uncertainty is None else found.pose_uncertainty.degrees,
+            pose_degrees=0.0
+            if found.pose_uncertainty is None
+            else found.pose_uncertainty.degrees,
             pose_millimetres=0.0
             if found.pose_uncertainty is None
             else found.pose_uncertainty.millimetres,
@@ -199,7 +230,10 @@ class RecogniseNode(Node):
 
     def header(self) -> Header:
         """That of a message in the world's frame, of now."""
-        return Header(frame_id=self.value("world_frame"), stamp=self.get_clock().now().to_msg())
+        return Header(
+            frame_id=self.value("world_frame"),
+            stamp=self.get_clock().now().to_msg(),
+        )
 
     def pose_of(self, found: nextview.Recognition) -> PoseStamped:
         """Where the thing is that was named; an empty message where that is not known."""
@@ -216,28 +250,43 @@ class RecogniseNode(Node):
             asked.max_views or self.value("max_views"),
         )
         stopping = Stopping.of(
-            self.system.models.recogniser.calibration, threshold, max_views=max_views
+            self.system.models.recogniser.calibration,
+            threshold,
+            max_views=max_views,
         )
         near = [[point.x, point.y, point.z] for point in asked.near]
         # Things are as large as they were taught, and known by it.
         life_size = self.value("life_size") or isinstance(
-            self.system.models.recogniser, JudgesTogether
+            self.system.models.recogniser,
+            JudgesTogether,
         )
         thing = ObservedObject(point=near[0] if near else None, life_size=life_size)
-        limits = {name: self.limit(name) for name in ("min_height", "max_height", "clearance")}
+        limits = {
+            name: self.limit(name) for name in ("min_height", "max_height", "clearance")
+        }
         return replace(self.system, stopping=stopping).session(
-            object=thing, distance=asked.distance or None, **limits
+            object=thing,
+            distance=asked.distance or None,
+            **limits,
         )
 
     # The services
 
-    def look(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def look(
+        self,
+        request: Trigger.Request,
+        response: Trigger.Response,
+    ) -> Trigger.Response:
         """The camera stands where it was asked to be, or for the first view anywhere: take in
         what it sees.
         """
         return self.answer(response, lambda session: session.update(self.frame()))
 
-    def failed(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def failed(
+        self,
+        request: Trigger.Request,
+        response: Trigger.Response,
+    ) -> Trigger.Response:
         """The camera cannot be brought to the pose that was asked for."""
         return self.answer(response, give_up)
 
@@ -260,10 +309,15 @@ class RecogniseNode(Node):
     def tell(self) -> str:
         """Publish the next pose and the feedback; what was said in words."""
         session, feedback = self.session, Recognise.Feedback()
-        feedback.views, feedback.classes = len(session.views), list(session.models.classes)
+        feedback.views, feedback.classes = (
+            len(session.views),
+            list(session.models.classes),
+        )
         if session.views:
             feedback.belief = session.views[-1].belief.tolist()
-            feedback.warnings = [warning.message for warning in session.views[-1].warnings]
+            feedback.warnings = [
+                warning.message for warning in session.views[-1].warnings
+            ]
         if not session.done:
             target = feedback.next_pose
             target.header = self.header()

@@ -46,7 +46,10 @@ def ranked_poses(session: nextview.Session) -> list[Float]:
 
 def pose_array(poses: list[Float], header: Any, axes: str) -> PoseArray:
     """Camera poses as a message."""
-    return PoseArray(header=header, poses=[fill_pose(Pose(), pose, axes) for pose in poses])
+    return PoseArray(
+        header=header,
+        poses=[fill_pose(Pose(), pose, axes) for pose in poses],
+    )
 
 
 def detections(result: nextview.Recognition, header: Any) -> Any:
@@ -66,7 +69,13 @@ def detections(result: nextview.Recognition, header: Any) -> Any:
     elif result.pose_candidates:
         of_thing = result.pose_candidates
         detection.results = [
-            _hypothesis(one.thing, one.probability, one.pose, one.degrees, one.millimetres)
+            _hypothesis(
+                one.thing,
+                one.probability,
+                one.pose,
+                one.degrees,
+                one.millimetres,
+            )
             for one in of_thing
             if one.probability >= LEAST_SCORE
         ]
@@ -76,10 +85,16 @@ def detections(result: nextview.Recognition, header: Any) -> Any:
         scores = sorted(result.beliefs.items(), key=lambda pair: -pair[1])
         for name, score in scores:
             if score >= LEAST_SCORE:
-                one = _hypothesis(name, score, place, 0.0, 1000 * (result.radius or 0.0))
-                one.pose.covariance[21] = one.pose.covariance[28] = one.pose.covariance[35] = (
-                    ANY_TURN
+                one = _hypothesis(
+                    name,
+                    score,
+                    place,
+                    0.0,
+                    1000 * (result.radius or 0.0),
                 )
+                one.pose.covariance[21] = one.pose.covariance[28] = one.pose.covariance[
+                    35
+                ] = ANY_TURN
                 detection.results.append(one)
 
     centre = result.poses_in.from_object
@@ -89,7 +104,13 @@ def detections(result: nextview.Recognition, header: Any) -> Any:
     return Detection3DArray(header=header, detections=[detection])
 
 
-def _hypothesis(name: str, score: float, pose: Float, degrees: float, millimetres: float) -> Any:
+def _hypothesis(
+    name: str,
+    score: float,
+    pose: Float,
+    degrees: float,
+    millimetres: float,
+) -> Any:
     """A hypothesis; the deviations are of all axes together."""
     one = ObjectHypothesisWithPose()
     one.hypothesis.class_id = name

@@ -74,7 +74,14 @@ MAP_ORACLE = re.compile(r"(true-)?(.+?)(-peak|-oracle-valley)?")
 classes, by the belief; "true-MAP-peak" always to its peaks. With "-oracle-valley" the true class
 decides, also on the predicted map."""
 MORE = f"{LEM}{SPHERE_SUFFIX}-peak"  # by Parisotto et al., see ``maps.SpherePeak``; always compared
-FIXED_ENTRIES = ("best", "worst", "high-entropy", "low-entropy", "random-fixed", "orbit")
+FIXED_ENTRIES = (
+    "best",
+    "worst",
+    "high-entropy",
+    "low-entropy",
+    "random-fixed",
+    "orbit",
+)
 """Fixed views by name, followed by their number: "best-5", "orbit-8". They go on to the end
 whatever is believed.
 
@@ -89,7 +96,11 @@ fixed views: the K highest."""
 
 def is_oracle(policy: str) -> bool:
     """Whether a policy takes what a robot cannot know."""
-    return policy in ORACLES or policy.startswith(TRUE) or policy.endswith("-oracle-valley")
+    return (
+        policy in ORACLES
+        or policy.startswith(TRUE)
+        or policy.endswith("-oracle-valley")
+    )
 
 
 def knows_truth(entry: str) -> bool:
@@ -109,9 +120,22 @@ def default_entries(specs: EpisodeSpecs) -> list[str]:
     sphere = specs.predictions.sphere
     n = sphere.azimuths
     v = len(sphere)
-    maps = [name for name in in_order(specs.predictions.maps) if not name.endswith(SPHERE_SUFFIX)]
-    names = [*policy_names(), *(each for name in maps for each in (name, f"{name}-peak")), MORE]
-    names = [name for name in (*names, *bundled_policies(), *ORACLES) if name not in IN_SCENES]
+    maps = [
+        name
+        for name in in_order(specs.predictions.maps)
+        if not name.endswith(SPHERE_SUFFIX)
+    ]
+
+    names = [
+        *policy_names(),
+        *(each for name in maps for each in (name, f"{name}-peak")),
+        MORE,
+    ]
+    names = [
+        name
+        for name in (*names, *bundled_policies(), *ORACLES)
+        if name not in IN_SCENES
+    ]
     if specs.scenes is not None:
         return [name for name in (*names, *IN_SCENES) if _ready(name, specs)]
     names = [name for name in names if _ready(name, specs)]
@@ -133,11 +157,14 @@ def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
         EntryError: the predictions lack what the policy needs.
     """
     policy = _make(name, specs)
-    if "observations" in policy.needs:  # predictions hold no depth; the ways are planned
+    if (
+        "observations" in policy.needs
+    ):  # predictions hold no depth; the ways are planned
         return ViewList(
-            stored_rows(specs.predictions, f"plans/{name}")[specs.objects, specs.starts].astype(
-                np.int64
-            )
+            stored_rows(specs.predictions, f"plans/{name}")[
+                specs.objects,
+                specs.starts,
+            ].astype(np.int64)
         )
 
     p = specs.predictions
@@ -147,7 +174,11 @@ def entry_policy(name: str, specs: EpisodeSpecs) -> Policy:
     lacking = [wanted for wanted in policy.needs if wanted not in there]
     if lacking:
         bins = lacking[0] == "azimuth_bins"
-        what = "what the recogniser says of the azimuth bins" if bins else f"the map {lacking[0]!r}"
+        what = (
+            "what the recogniser says of the azimuth bins"
+            if bins
+            else f"the map {lacking[0]!r}"
+        )
         raise EntryError(f"policy {name} needs {what}, which these predictions lack")
 
     return policy
@@ -175,7 +206,9 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
     match = MAP_ORACLE.fullmatch(name)
     true, base, how = match.groups("") if match else ("", "", "")
     predicted = [
-        name for name in p.maps if how == "-oracle-valley" and not name.endswith(SPHERE_SUFFIX)
+        name
+        for name in p.maps
+        if how == "-oracle-valley" and not name.endswith(SPHERE_SUFFIX)
     ]
     base = map_name(base) if true else base  # the true map of a measure, by either name
     if base in (known_maps(p) if true else predicted):
@@ -186,10 +219,18 @@ def _make(name: str, specs: EpisodeSpecs) -> Policy:
             f"no true map is called {name!r}; there are {there}, and more after nextview measure"
         )
 
-    known = plain in policy_names() or map_policy(plain, p.sphere, (), p.maps) is not None
+    known = (
+        plain in policy_names() or map_policy(plain, p.sphere, (), p.maps) is not None
+    )
     card = plain.removeprefix(VISIBLE)
     if known or card in bundled_policies() or card.endswith(".json") or ":" in name:
-        return make_policy(name, p.sphere, specs.valley_classes(plain), p.classes, p.maps)
+        return make_policy(
+            name,
+            p.sphere,
+            specs.valley_classes(plain),
+            p.classes,
+            p.maps,
+        )
     if plain == DISCRIMINATE:
         raise EntryError(
             "the policy discriminate needs the memory of taught things that made these predictions:"
@@ -222,7 +263,11 @@ def _ready(name: str, specs: EpisodeSpecs) -> bool:
     return True
 
 
-def fixed_views(name: str, specs: EpisodeSpecs, rng: np.random.Generator) -> Index | None:
+def fixed_views(
+    name: str,
+    specs: EpisodeSpecs,
+    rng: np.random.Generator,
+) -> Index | None:
     """Return the views of an entry that always takes the same views.
 
     Args:
@@ -236,7 +281,10 @@ def fixed_views(name: str, specs: EpisodeSpecs, rng: np.random.Generator) -> Ind
     Raises:
         EntryError: there are fewer views than the name asks for.
     """
-    match = re.fullmatch(rf"({'|'.join([*FIXED_ENTRIES, 'true-[a-z0-9_]+'])})-(\d+)", name)
+    match = re.fullmatch(
+        rf"({'|'.join([*FIXED_ENTRIES, 'true-[a-z0-9_]+'])})-(\d+)",
+        name,
+    )
     if not match:
         return None
 
@@ -256,10 +304,16 @@ def fixed_views(name: str, specs: EpisodeSpecs, rng: np.random.Generator) -> Ind
     if kind == "random-fixed":
         return ranked(rng.random((len(objects), len(p.sphere))), k)
     if kind.startswith("true-"):
-        return ranked(true_measure(p, kind.removeprefix(TRUE)).astype(np.float64), k)[objects]
+        return ranked(true_measure(p, kind.removeprefix(TRUE)).astype(np.float64), k)[
+            objects
+        ]
 
     if kind in ("high-entropy", "low-entropy"):
         values = p.depth_entropy.astype(np.float64)
     else:
-        values = log_softmax(p.logits.astype(np.float64), axis=2)[np.arange(len(p)), :, p.labels]
+        values = log_softmax(p.logits.astype(np.float64), axis=2)[
+            np.arange(len(p)),
+            :,
+            p.labels,
+        ]
     return ranked(values if kind in ("high-entropy", "best") else -values, k)[objects]

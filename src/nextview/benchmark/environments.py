@@ -104,12 +104,17 @@ class Rules:
             raise UsageError(
                 f"inputs are some of {', '.join(INPUTS)} and maps, not {', '.join(self.inputs)}"
             )
-        for value, known in ((self.frame, get_args(CellFrame)), (self.objective, OBJECTIVES)):
+        for value, known in (
+            (self.frame, get_args(CellFrame)),
+            (self.objective, OBJECTIVES),
+        ):
             if value not in known:
                 raise UsageError(f"{value!r} is none of {', '.join(known)}")
         number(self.view_price, "the view_price", 0)
         number(self.travel_price, "the travel_price", 0)
-        Stopping(0.5 if self.threshold is None else self.threshold)  # says what is wrong with it
+        Stopping(
+            0.5 if self.threshold is None else self.threshold
+        )  # says what is wrong with it
 
     @property
     def maps(self) -> tuple[str, ...]:
@@ -154,7 +159,9 @@ def rows(values: Any, n: int, below: int, what: str) -> Index:
         or not ((array >= 0) & (array < below)).all()
     ):
         many = "a whole number" if n == 1 else f"{n} whole numbers"
-        raise UsageError(f"{what}: {many} from 0 to {below - 1}, not {one_line(repr(values))}")
+        raise UsageError(
+            f"{what}: {many} from 0 to {below - 1}, not {one_line(repr(values))}"
+        )
     return array.astype(np.int64)
 
 
@@ -183,7 +190,12 @@ class EnvironmentTask:
     def __post_init__(self) -> None:
         whole(self.rules.max_views, "the number of views", 2, len(self.sphere))
 
-    def begin(self, n: int, rng: np.random.Generator, options: Info | None = None) -> "Cohort":
+    def begin(
+        self,
+        n: int,
+        rng: np.random.Generator,
+        options: Info | None = None,
+    ) -> "Cohort":
         """Begin episodes.
 
         Args:
@@ -203,7 +215,10 @@ class EnvironmentTask:
         starts = rng.integers(len(self.sphere), size=n)
         given = {"object": objects, "start": starts} | (options or {})
         below = {"object": len(self.labels), "start": len(self.sphere)}
-        return Cohort(self, *(rows(given[name], n, most, name) for name, most in below.items()))
+        return Cohort(
+            self,
+            *(rows(given[name], n, most, name) for name, most in below.items()),
+        )
 
     @property
     def observation_space(self) -> gymnasium.spaces.Box:
@@ -222,7 +237,8 @@ class EnvironmentTask:
         )
 
         return gymnasium.spaces.Box(
-            np.where(high > 1, -MAP_LIMIT, 0).astype(np.float32), high.astype(np.float32)
+            np.where(high > 1, -MAP_LIMIT, 0).astype(np.float32),
+            high.astype(np.float32),
         )
 
     @property
@@ -255,7 +271,11 @@ def replayed(
         PredictionsError: there are no objects of the split, or a map or the azimuth bins are
             missing.
     """
-    p = predictions if isinstance(predictions, Predictions) else Predictions.load(Path(predictions))
+    p = (
+        predictions
+        if isinstance(predictions, Predictions)
+        else Predictions.load(Path(predictions))
+    )
     if split == "train" and not p.splits.any():
         log.warning(
             "the predictions name no splits, as those of taught things: all %d objects are taken",
@@ -273,14 +293,22 @@ def replayed(
                 f"these predictions hold no map {name!r}; inputs are some of {known}"
             )
 
-    if ("azimuth_bin" in rules.inputs or rules.frame == "object") and p.azimuth_bins is None:
+    if (
+        "azimuth_bin" in rules.inputs or rules.frame == "object"
+    ) and p.azimuth_bins is None:
         raise PredictionsError(
             "these predictions hold no azimuth bins, which the inputs or the frame need"
         )
 
     p = replace(p, maps={name: p.maps[name] for name in rules.maps})
     return EnvironmentTask(
-        p.labels, p.classes, p.sphere, p.calibration, p.evidence, rules, balanced
+        p.labels,
+        p.classes,
+        p.sphere,
+        p.calibration,
+        p.evidence,
+        rules,
+        balanced,
     )
 
 
@@ -308,9 +336,11 @@ class Asked:
         Returns:
             The next view of each episode, (B,) int64.
         """
-        return np.where(state.free, self.sphere.travel[self.views[state.episodes]], np.inf).argmin(
-            1
-        )
+        return np.where(
+            state.free,
+            self.sphere.travel[self.views[state.episodes]],
+            np.inf,
+        ).argmin(1)
 
 
 @dataclass(frozen=True)
@@ -347,7 +377,14 @@ class Cohort:
         # nothing is drawn
         rng = np.random.default_rng(0)
         stopping = task.rules.stopping(task.calibration)
-        self.episodes = Episodes(task.sphere, self._asked, starts, stopping, rng, task.calibration)
+        self.episodes = Episodes(
+            task.sphere,
+            self._asked,
+            starts,
+            stopping,
+            rng,
+            task.calibration,
+        )
         self._visited = np.zeros((len(objects), len(task.sphere)), bool)
         self._value = np.zeros(len(objects))
         self._travel = np.zeros(len(objects))
@@ -382,10 +419,25 @@ class Cohort:
         visited = self._visited[running]
         labels = task.labels[objects]
 
-        azimuth_bins = calibration.azimuth_bins(step.total, n_seen, classes, sphere.azimuth[views])
-        state = EpisodeState(views, visited, step.belief, step.evidence, k, running, azimuth_bins)
+        azimuth_bins = calibration.azimuth_bins(
+            step.total,
+            n_seen,
+            classes,
+            sphere.azimuth[views],
+        )
+        state = EpisodeState(
+            views,
+            visited,
+            step.belief,
+            step.evidence,
+            k,
+            running,
+            azimuth_bins,
+        )
         value = value_of(
-            calibration.log_belief(step.total, n_seen, classes), labels, task.rules.objective
+            calibration.log_belief(step.total, n_seen, classes),
+            labels,
+            task.rules.objective,
         )
 
         change = value - self._value[running] if k > 1 else np.zeros(len(running))
@@ -403,7 +455,9 @@ class Cohort:
             "prediction_target": labels,
             "action_mask": (~np.take_along_axis(visited, reached, 1)).astype(np.int8),
         }
-        seen = features(sphere, state, task.rules.inputs, task.rules.frame).astype(np.float32)
+        seen = features(sphere, state, task.rules.inputs, task.rules.frame).astype(
+            np.float32
+        )
         return Seen(seen, change, price, step.stopped, info)
 
 
@@ -418,7 +472,12 @@ class TaskEnv(gymnasium.Env[Any, Any]):
         self.action_space = task.action_space
         self._cohort: Cohort | None = None
 
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        options: Info | None = None,
+    ) -> tuple[Any, Info]:
         """Begin an episode; see Gymnasium.
 
         Args:
@@ -490,7 +549,10 @@ class TaskVectorEnv(VectorEnv[Float32, Any, NDArray[Any]]):
         self._cohorts: list[tuple[Cohort, Index]] = []
 
     def reset(
-        self, *, seed: int | None = None, options: Info | None = None
+        self,
+        *,
+        seed: int | None = None,
+        options: Info | None = None,
     ) -> tuple[Float32, Info]:
         """Begin an episode in every environment; see Gymnasium.
 
@@ -531,7 +593,8 @@ class TaskVectorEnv(VectorEnv[Float32, Any, NDArray[Any]]):
         order = np.argsort(np.concatenate(wheres))
         names = ("observation", "change", "price", "ended")
         joined = {
-            name: np.concatenate([getattr(part, name) for part in parts])[order] for name in names
+            name: np.concatenate([getattr(part, name) for part in parts])[order]
+            for name in names
         }
         info = {
             name: np.concatenate([part.info[name] for part in parts])[order]
@@ -540,7 +603,9 @@ class TaskVectorEnv(VectorEnv[Float32, Any, NDArray[Any]]):
 
         seen = Seen(**joined, info=info)
         self._cohorts = [
-            (cohort, members) for cohort, members in self._cohorts if len(cohort.episodes.running)
+            (cohort, members)
+            for cohort, members in self._cohorts
+            if len(cohort.episodes.running)
         ]
 
         over = np.flatnonzero(seen.ended)
@@ -574,7 +639,10 @@ class RecogniseVectorEnv(TaskVectorEnv):
         balanced: bool = False,
         **rules: Any,
     ) -> None:
-        super().__init__(replayed(predictions, split, balanced, Rules(**rules)), num_envs)
+        super().__init__(
+            replayed(predictions, split, balanced, Rules(**rules)),
+            num_envs,
+        )
 
 
 class RecogniseMeshEnv(TaskEnv):
@@ -606,7 +674,8 @@ class RecogniseMeshEnv(TaskEnv):
         sphere = ViewSphere.named(viewpoints)
 
         self._models = Models(
-            NetworkRecogniser(found.recogniser), open_maps(found.maps, given.maps)
+            NetworkRecogniser(found.recogniser),
+            open_maps(found.maps, given.maps),
         )
         classes = self._models.classes
         calibration = self._models.recogniser.calibration
@@ -615,7 +684,9 @@ class RecogniseMeshEnv(TaskEnv):
             (name, partial(sample_mesh, name)) for name in SAMPLE_MESHES
         ]
         if meshes is not None:
-            entries = [e for e in list_dataset(Path(meshes)) if split in (None, e.split)]
+            entries = [
+                e for e in list_dataset(Path(meshes)) if split in (None, e.split)
+            ]
             objects = [(e.label, partial(load_mesh, e.path)) for e in entries]
 
         if not objects:
@@ -634,19 +705,34 @@ class RecogniseMeshEnv(TaskEnv):
             lambda k: SimulatedCamera(objects[k][1](), size, sphere.distance)
         )
         super().__init__(
-            EnvironmentTask(labels, classes, sphere, calibration, self._rendered, given, balanced)
+            EnvironmentTask(
+                labels,
+                classes,
+                sphere,
+                calibration,
+                self._rendered,
+                given,
+                balanced,
+            )
         )
 
         self._depth = depth
         if depth:
-            image = gymnasium.spaces.Box(0, np.float32(sphere.distance + 1), (size, size))
+            image = gymnasium.spaces.Box(
+                0,
+                np.float32(sphere.distance + 1),
+                (size, size),
+            )
             self.observation_space = gymnasium.spaces.Dict(
                 {"state": self.task.observation_space, "depth": image}
             )
 
     def _rendered(self, objects: Index, views: Index) -> Evidence:
         poses = self.task.sphere.poses
-        seen = [self._camera(int(k)).observe(poses[v]) for k, v in zip(objects, views, strict=True)]
+        seen = [
+            self._camera(int(k)).observe(poses[v])
+            for k, v in zip(objects, views, strict=True)
+        ]
         self._last = seen[-1]
         return self._models.evidence(seen)
 

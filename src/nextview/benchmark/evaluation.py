@@ -8,7 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.benchmark import statistics as st
-from nextview.benchmark.published import comparable_classes, published_map, published_recognisers
+from nextview.benchmark.published import (
+    comparable_classes,
+    published_map,
+    published_recognisers,
+)
 from nextview.benchmark.true_maps import known_maps, true_map
 from nextview.checks import extras
 from nextview.data import metrics
@@ -55,7 +59,9 @@ class Evaluation:
     def tables(self) -> dict[str, pd.DataFrame]:
         """The tables by name."""
         return {
-            name: table for name, table in vars(self).items() if isinstance(table, pd.DataFrame)
+            name: table
+            for name, table in vars(self).items()
+            if isinstance(table, pd.DataFrame)
         }
 
 
@@ -77,22 +83,39 @@ def evaluate(p: Predictions, samples: int, rng: np.random.Generator) -> Evaluati
         raise ResultsError(
             f"the recogniser knows one class only, {p.classes[0]}: there is nothing to tell apart"
         )
+
     if samples < 1:
-        raise ResultsError(f"at least one sample of the bootstrap is needed, not {samples}")
+        raise ResultsError(
+            f"at least one sample of the bootstrap is needed, not {samples}"
+        )
+
     weights = st.resample(len(p), samples, rng)
-    right, confidence = fused_views(p.log_evidence, p.labels, p.calibration, rng, len(p.classes))
+    right, confidence = fused_views(
+        p.log_evidence,
+        p.labels,
+        p.calibration,
+        rng,
+        len(p.classes),
+    )
     judged, (maps, left_out) = _judged(p), _maps(p, weights)
     accuracy = _accuracy(p, judged, weights)
     fusion = _fusion(p, right, confidence, weights)
     return Evaluation(
-        accuracy, fusion, _confusion(p, judged), _reliability(right, confidence), maps, left_out
+        accuracy,
+        fusion,
+        _confusion(p, judged),
+        _reliability(right, confidence),
+        maps,
+        left_out,
     )
 
 
 def _judged(p: Predictions) -> dict[int, NDArray]:
     """Return logits of single views and log-beliefs of all views, (N, answers, C) each."""
     fused = p.calibration.log_belief(
-        p.log_evidence.astype(np.float64).sum(1), len(p.sphere), len(p.classes)
+        p.log_evidence.astype(np.float64).sum(1),
+        len(p.sphere),
+        len(p.classes),
     )
     return {1: p.logits, len(p.sphere): fused[:, None]}
 
@@ -119,20 +142,32 @@ def fused_views(
     """
     n, v, _ = log_evidence.shape
     order = rng.permuted(np.tile(np.arange(v), (n, 1)), axis=1)
-    shuffled = np.take_along_axis(log_evidence.astype(np.float64), order[:, :, None], axis=1)
+    shuffled = np.take_along_axis(
+        log_evidence.astype(np.float64),
+        order[:, :, None],
+        axis=1,
+    )
     right = np.empty((v, n, v), bool)
     confidence = np.empty((v, n, v), np.float32)
+
     for turn in range(v):
         belief = calibration.belief(
-            np.roll(shuffled, -turn, axis=1).cumsum(1), np.arange(1, v + 1), classes
+            np.roll(shuffled, -turn, axis=1).cumsum(1),
+            np.arange(1, v + 1),
+            classes,
         )
         right[:, :, turn] = (belief.argmax(2) == labels[:, None]).T
         confidence[:, :, turn] = belief.max(2).T
+
     return right, confidence
 
 
 def _means(
-    top: Float, bottom: Float, labels: Index, classes: tuple[str, ...], weights: Float | None
+    top: Float,
+    bottom: Float,
+    labels: Index,
+    classes: tuple[str, ...],
+    weights: Float | None,
 ) -> Iterator[tuple[str, str, Float, Float, Float]]:
     """Return ratios of sums over objects, (N, M): over all, over classes, and by class.
 
@@ -143,12 +178,19 @@ def _means(
     for label, over, here in (("", "", every), ("", "class_", every), *in_classes):
         drawn = np.zeros((1, len(labels))) if weights is None else weights
         value, samples = st.estimate(
-            top[here], bottom[here], drawn[:, here], labels if over else None
+            top[here],
+            bottom[here],
+            drawn[:, here],
+            labels if over else None,
         )
         yield label, over, value, *st.interval(samples)
 
 
-def _accuracy(p: Predictions, judged: dict[int, NDArray], weights: Float) -> pd.DataFrame:
+def _accuracy(
+    p: Predictions,
+    judged: dict[int, NDArray],
+    weights: Float,
+) -> pd.DataFrame:
     one = np.ones(len(p))
     clean = np.where(p.conflicting, 0.0, 1.0)
     by_shape = {} if p.of_size is None else _judged(p.by_shape())
@@ -160,15 +202,29 @@ def _accuracy(p: Predictions, judged: dict[int, NDArray], weights: Float) -> pd.
         if by_shape:
             scored["shape_accuracy"] = by_shape[n_views]
 
-        right = np.stack([(x.argmax(2) == p.labels[:, None]).mean(1) for x in scored.values()], 1)
-        bottom = np.stack([clean if measure == "clean_accuracy" else one for measure in scored], 1)
+        right = np.stack(
+            [(x.argmax(2) == p.labels[:, None]).mean(1) for x in scored.values()],
+            1,
+        )
+        bottom = np.stack(
+            [clean if measure == "clean_accuracy" else one for measure in scored],
+            1,
+        )
         for label, over, value, low, high in _means(
-            right * bottom, bottom, p.labels, p.classes, weights
+            right * bottom,
+            bottom,
+            p.labels,
+            p.classes,
+            weights,
         ):
             here = p.labels == p.classes.index(label) if label else slice(None)
-            for i, (measure, objects) in enumerate(zip(scored, bottom[here].sum(0), strict=True)):
+            for i, (measure, objects) in enumerate(
+                zip(scored, bottom[here].sum(0), strict=True)
+            ):
                 beside = (
-                    best[0][2] if best and (n_views, label, over, i) == (1, "", "", 0) else np.nan
+                    best[0][2]
+                    if best and (n_views, label, over, i) == (1, "", "", 0)
+                    else np.nan
                 )
                 rows.append(
                     (
@@ -185,11 +241,25 @@ def _accuracy(p: Predictions, judged: dict[int, NDArray], weights: Float) -> pd.
 
     return pd.DataFrame(
         rows,
-        columns=["n_views", "label", "measure", "objects", "value", "low", "high", "published"],
+        columns=[
+            "n_views",
+            "label",
+            "measure",
+            "objects",
+            "value",
+            "low",
+            "high",
+            "published",
+        ],
     )
 
 
-def _fusion(p: Predictions, right: Mask, confidence: Float32, weights: Float) -> pd.DataFrame:
+def _fusion(
+    p: Predictions,
+    right: Mask,
+    confidence: Float32,
+    weights: Float,
+) -> pd.DataFrame:
     top = right.mean(2).T
     one = np.ones_like(top)
     low, high = st.interval(metrics.ratio(top, one, weights))
@@ -204,7 +274,12 @@ def _fusion(p: Predictions, right: Mask, confidence: Float32, weights: Float) ->
             "accuracy": top.mean(0),
             "low": low,
             "high": high,
-            "class_accuracy": metrics.class_mean(top, one, p.labels, np.ones((1, len(p))))[0],
+            "class_accuracy": metrics.class_mean(
+                top,
+                one,
+                p.labels,
+                np.ones((1, len(p))),
+            )[0],
             "confidence": confidence.mean((1, 2), np.float64),
             "calibration_error": errors,
         }
@@ -227,12 +302,19 @@ def _reliability(right: Mask, confidence: Float32) -> pd.DataFrame:
     rows = []
     v = len(right)
     for n_views in [k for k in RELIABILITY_LOOKS if k < v] + [v]:
-        turns = slice(None) if n_views < v else slice(1)  # all views are the same in every order
+        turns = (
+            slice(None) if n_views < v else slice(1)
+        )  # all views are the same in every order
         belief = confidence[n_views - 1, :, turns].ravel().astype(np.float64)
         answers = right[n_views - 1, :, turns]
         sure, share, count = metrics.reliability(belief, answers.ravel())
-        rows += [(n_views, i, sure[i], share[i], count[i]) for i in np.flatnonzero(count)]
-    return pd.DataFrame(rows, columns=["n_views", "bin", "confidence", "accuracy", "answers"])
+        rows += [
+            (n_views, i, sure[i], share[i], count[i]) for i in np.flatnonzero(count)
+        ]
+    return pd.DataFrame(
+        rows,
+        columns=["n_views", "bin", "confidence", "accuracy", "answers"],
+    )
 
 
 def judged_objects(p: Predictions, name: str) -> Index:
@@ -248,7 +330,11 @@ def judged_objects(p: Predictions, name: str) -> Index:
         Rows of the objects.
     """
     right = p.logits.argmax(2) == p.labels[:, None]
-    return np.flatnonzero(right.any(1)) if measure_of(name) == CONFIDENCE else np.arange(len(p))
+    return (
+        np.flatnonzero(right.any(1))
+        if measure_of(name) == CONFIDENCE
+        else np.arange(len(p))
+    )
 
 
 def baselines(true: Floats, labels: Index) -> dict[str, Floats]:
@@ -278,7 +364,9 @@ def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]
         if name.endswith("-sphere"):  # its window is judged
             continue
         if name not in known:
-            left_out[name] = f"what is true of this map is not known; known are {', '.join(known)}"
+            left_out[name] = (
+                f"what is true of this map is not known; known are {', '.join(known)}"
+            )
             continue
         kept = judged_objects(p, name)
         if len(kept) == 0:
@@ -293,24 +381,48 @@ def _maps(p: Predictions, weights: Float) -> tuple[pd.DataFrame, dict[str, str]]
         labels = p.labels[kept]
         for by, maps in {"network": predicted[kept], **baselines(true, labels)}.items():
             window = true.shape[2:]
-            errors = metrics.map_errors(maps.reshape(-1, *window), true.reshape(-1, *window))
-            top = np.stack([values.reshape(len(kept), -1).mean(1) for values in errors.values()], 1)
+            errors = metrics.map_errors(
+                maps.reshape(-1, *window),
+                true.reshape(-1, *window),
+            )
+            top = np.stack(
+                [values.reshape(len(kept), -1).mean(1) for values in errors.values()],
+                1,
+            )
             drawn = weights[:, kept] if by == "network" else None
             for label, over, value, low, high in _means(
-                top, np.ones_like(top), labels, p.classes, drawn
+                top,
+                np.ones_like(top),
+                labels,
+                p.classes,
+                drawn,
             ):
                 for i, measure in enumerate(errors):
                     beside = None
                     if by == "network":
                         beside = published_map(
-                            name, over + measure, comparable_classes(p), label or None
+                            name,
+                            over + measure,
+                            comparable_classes(p),
+                            label or None,
                         )
                     rows.append(
-                        (name, by, label, over + measure, value[i], low[i], high[i], beside)
+                        (
+                            name,
+                            by,
+                            label,
+                            over + measure,
+                            value[i],
+                            low[i],
+                            high[i],
+                            beside,
+                        )
                     )
     columns = ["map", "by", "label", "measure", "value", "low", "high", "published"]
 
-    return pd.DataFrame(rows, columns=columns).astype({"published": "float64"}), left_out
+    return pd.DataFrame(rows, columns=columns).astype(
+        {"published": "float64"}
+    ), left_out
 
 
 def scores_for_card(card: ModelCard, p: Predictions) -> dict[str, Any]:
@@ -337,5 +449,6 @@ def scores_for_card(card: ModelCard, p: Predictions) -> dict[str, Any]:
         )
     shape = (-1, p.sphere.rings, 3)
     return metrics.map_scores(
-        p.maps[card.kind][kept].reshape(shape), true_map(p, card.kind)[kept].reshape(shape)
+        p.maps[card.kind][kept].reshape(shape),
+        true_map(p, card.kind)[kept].reshape(shape),
     )

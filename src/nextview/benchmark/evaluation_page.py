@@ -72,7 +72,10 @@ def write_evaluation(
         if p.of_size is not None:
             what += ", of known size"
         scores = {
-            f"{settings.split or p.splits[0] or 'all'} ({len(p)} {what})": scores_for_card(card, p)
+            f"{settings.split or p.splits[0] or 'all'} ({len(p)} {what})": scores_for_card(
+                card,
+                p,
+            )
         }
         noted[card.card_path] = card.sha256, scores
     made = asdict(settings) | {
@@ -126,9 +129,9 @@ def page(e: Evaluation, p: Predictions, settings: dict[str, Any]) -> str:
     v = len(p.sphere)
     curve = e.fusion.set_index("n_views")
     c = p.calibration
-    counts = e.accuracy.query("n_views == 1 and measure == 'accuracy' and label != ''").set_index(
-        "label"
-    )["objects"]
+    counts = e.accuracy.query(
+        "n_views == 1 and measure == 'accuracy' and label != ''"
+    ).set_index("label")["objects"]
 
     made = {
         **origin(p, settings),
@@ -148,10 +151,13 @@ def page(e: Evaluation, p: Predictions, settings: dict[str, Any]) -> str:
         published=published_recognisers(comparable_classes(p), v),
         errors=curve["calibration_error"],
         fused_views=", ".join(
-            f"{k}: {curve.accuracy[k]:.3f}" for k in (1, 2, 5, 10, v) if k in curve.index
+            f"{k}: {curve.accuracy[k]:.3f}"
+            for k in (1, 2, 5, 10, v)
+            if k in curve.index
         ),
         bins=", ".join(
-            f"{curve.calibration_error[k]:.3f} after {k}" for k in e.reliability["n_views"].unique()
+            f"{curve.calibration_error[k]:.3f} after {k}"
+            for k in e.reliability["n_views"].unique()
         ),
         maps={
             kind: numbers(rows, "by", "label", "measure")

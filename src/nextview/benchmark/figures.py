@@ -47,7 +47,16 @@ POLICY_COLOURS = {
     "oracle-gain-all": "#777777",
 }
 # all others, in turn
-OWN = ("#7b2d00", "#3a7d00", "#7209b7", "#00a3a3", "#e0679b", "#b3a000", "#ff7043", "#5c6bc0")
+OWN = (
+    "#7b2d00",
+    "#3a7d00",
+    "#7209b7",
+    "#00a3a3",
+    "#e0679b",
+    "#b3a000",
+    "#ff7043",
+    "#5c6bc0",
+)
 MOST_CURVES = 8  # curves of policies that a robot could follow, at most
 
 
@@ -72,7 +81,8 @@ def compared(results: Results) -> list[str]:
     at = (summary["measure"] == "accuracy") & (summary["threshold"] == headline)
     accuracy = summary[at].set_index("policy")["value"]
     robots = sorted(
-        (n for n in names if not is_oracle(n)), key=lambda n: (n != reference, -accuracy[n])
+        (n for n in names if not is_oracle(n)),
+        key=lambda n: (n != reference, -accuracy[n]),
     )[:MOST_CURVES]
     return [n for n in names if n in robots] + [
         n for n in ("oracle-valley", *ceiling(results)) if n in names
@@ -94,8 +104,13 @@ def look_of(policy: str, results: Results) -> dict:
         for name in (*compared(results), *results.tables.sweep["policy"].unique())
         if name not in POLICY_COLOURS
     ]
-    colour = POLICY_COLOURS.get(policy) or OWN[list(dict.fromkeys(own)).index(policy) % len(OWN)]
-    line = ":" if policy.startswith("oracle-gain") else "--" if is_oracle(policy) else "-"
+    colour = (
+        POLICY_COLOURS.get(policy)
+        or OWN[list(dict.fromkeys(own)).index(policy) % len(OWN)]
+    )
+    line = (
+        ":" if policy.startswith("oracle-gain") else "--" if is_oracle(policy) else "-"
+    )
     return {"color": colour, "linestyle": line}
 
 
@@ -110,15 +125,26 @@ def threshold_curve(results: Results, measure: str = "class_accuracy") -> Figure
         The figure.
     """
     figure, axes = new_figure(4.6, 3.5)
-    table = results.tables.summary.query("measure == @measure and threshold == threshold")
+    table = results.tables.summary.query(
+        "measure == @measure and threshold == threshold"
+    )
     ticks = sorted(table["threshold"].unique())
-    for k, name in enumerate(names := [n for n in compared(results) if n in set(table["policy"])]):
+    for k, name in enumerate(
+        names := [n for n in compared(results) if n in set(table["policy"])]
+    ):
         rows = table[table["policy"] == name].sort_values("threshold")
         # side by side, so that the bars can be told apart
         x = np.arange(len(rows)) + (k - len(names) / 2) * 0.04
         look = look_of(name, results)
         axes.plot(x, rows["value"], marker="o", markersize=3.5, label=name, **look)
-        axes.vlines(x, rows["low"], rows["high"], color=look["color"], linewidth=0.8, alpha=0.55)
+        axes.vlines(
+            x,
+            rows["low"],
+            rows["high"],
+            color=look["color"],
+            linewidth=0.8,
+            alpha=0.55,
+        )
     axes.set_xticks(np.arange(len(ticks)), [f"{t:g}" for t in ticks])
     axes.set(xlabel="confidence threshold", ylabel=words(measure))
     percent_axis(axes.yaxis)
@@ -141,7 +167,9 @@ def budget_curve(results: Results, budget: str) -> Figure:
         rows = results.tables.sweep[results.tables.sweep["policy"] == name]
         axes.plot(rows[budget], rows["accuracy"], label=name, **look_of(name, results))
     axes.set(
-        xlabel={"n_views": "mean views", "travel_all": "mean travel, grid cells"}[budget],
+        xlabel={"n_views": "mean views", "travel_all": "mean travel, grid cells"}[
+            budget
+        ],
         ylabel="accuracy",
     )
     percent_axis(axes.yaxis)
@@ -161,9 +189,9 @@ def differences(results: Results, threshold: float) -> Figure:
     Returns:
         The figure.
     """
-    rows = results.tables.tests.query("threshold == @threshold and measure == 'accuracy'").iloc[
-        ::-1
-    ]
+    rows = results.tables.tests.query(
+        "threshold == @threshold and measure == 'accuracy'"
+    ).iloc[::-1]
     figure, axes = new_figure(4.6, 0.6 + 0.24 * max(3, len(rows)))
     row: Any  # a named tuple
 
@@ -171,12 +199,21 @@ def differences(results: Results, threshold: float) -> Figure:
         colour = look_of(row.policy, results)["color"]
         axes.hlines(y, 100 * row.low, 100 * row.high, color=colour, linewidth=1.6)
         inside = colour if row.p_holm < SIGNIFICANT else "white"
-        axes.plot(100 * row.difference, y, "o", color=colour, markersize=5, markerfacecolor=inside)
+        axes.plot(
+            100 * row.difference,
+            y,
+            "o",
+            color=colour,
+            markersize=5,
+            markerfacecolor=inside,
+        )
     axes.axvline(0, color=INK, linewidth=0.9)
     axes.set_yticks(np.arange(len(rows)), rows["policy"])
     axes.grid(axis="y", visible=False)
     axes.tick_params(axis="y", length=0)
-    axes.set_xlabel(f"accuracy, percentage points: difference to {results.settings['reference']}")
+    axes.set_xlabel(
+        f"accuracy, percentage points: difference to {results.settings['reference']}"
+    )
 
     return figure
 
@@ -202,11 +239,22 @@ def confusion_matrix(counts: NDArray, classes: Sequence[str], title: str) -> Fig
     for i, j in np.argwhere(share >= 0.01) if few else ():
         text: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 7.5}
         axes.text(
-            j, i, f"{100 * share[i, j]:.0f}", color="white" if share[i, j] > 0.55 else INK, **text
+            j,
+            i,
+            f"{100 * share[i, j]:.0f}",
+            color="white" if share[i, j] > 0.55 else INK,
+            **text,
         )
 
     size = 8.5 if few else 5
-    axes.set_xticks(ticks, names, rotation=50, ha="right", rotation_mode="anchor", fontsize=size)
+    axes.set_xticks(
+        ticks,
+        names,
+        rotation=50,
+        ha="right",
+        rotation_mode="anchor",
+        fontsize=size,
+    )
     axes.set_yticks(ticks, names, fontsize=size)
     axes.grid(visible=False)
     axes.tick_params(length=0)
@@ -228,12 +276,21 @@ def confusion(episodes: pd.DataFrame, classes: Sequence[str], title: str) -> Fig
         The figure.
     """
     label, answer = (
-        pd.Categorical(episodes[c], categories=list(classes)) for c in ("label", "answer")
+        pd.Categorical(episodes[c], categories=list(classes))
+        for c in ("label", "answer")
     )
-    return confusion_matrix(pd.crosstab(label, answer, dropna=False).to_numpy(), classes, title)
+    return confusion_matrix(
+        pd.crosstab(label, answer, dropna=False).to_numpy(),
+        classes,
+        title,
+    )
 
 
-def reliability_diagram(results: Results, policies: Sequence[str], threshold: float) -> Figure:
+def reliability_diagram(
+    results: Results,
+    policies: Sequence[str],
+    threshold: float,
+) -> Figure:
     """Draw the reliability of the confidence at which the episodes stopped.
 
     Bins of fewer than 20 episodes are left out.
@@ -260,18 +317,31 @@ def reliability_diagram(results: Results, policies: Sequence[str], threshold: fl
     return _reliability(curves, "when it stopped", "policy  calibration error")
 
 
-def _reliability(curves: dict[str, tuple[pd.DataFrame, dict]], when: str, title: str) -> Figure:
+def _reliability(
+    curves: dict[str, tuple[pd.DataFrame, dict]],
+    when: str,
+    title: str,
+) -> Figure:
     """Draw accuracy against confidence; the size of a dot is its number of answers."""
     figure, axes = new_figure(4.6, 3.9)
     axes.plot([0, 1], [0, 1], color=INK, linewidth=0.9)
     axes.set(
-        xlim=(0, 1.03), ylim=(0, 1.03), xlabel=f"confidence {when}", ylabel="share that was right"
+        xlim=(0, 1.03),
+        ylim=(0, 1.03),
+        xlabel=f"confidence {when}",
+        ylabel="share that was right",
     )
     axes.set_aspect("equal")
 
     for label, (table, look) in curves.items():
         rows = table[table["answers"] >= 20]
-        axes.plot(rows["confidence"], rows["accuracy"], linewidth=1.1, label=label, **look)
+        axes.plot(
+            rows["confidence"],
+            rows["accuracy"],
+            linewidth=1.1,
+            label=label,
+            **look,
+        )
         size = 8 + 220 * rows["answers"] / rows["answers"].sum()
         colour = look["color"]
 
@@ -301,10 +371,16 @@ def evaluated_confusion(e: Evaluation, n_views: int, classes: Sequence[str]) -> 
         The figure.
     """
     table = e.confusion[e.confusion["n_views"] == n_views].pivot(
-        index="label", columns="answer", values="answers"
+        index="label",
+        columns="answer",
+        values="answers",
     )
     title = "one view" if n_views == 1 else f"all {n_views} views fused"
-    return confusion_matrix(table.loc[list(classes), list(classes)].to_numpy(), classes, title)
+    return confusion_matrix(
+        table.loc[list(classes), list(classes)].to_numpy(),
+        classes,
+        title,
+    )
 
 
 def fusion_curve(e: Evaluation) -> Figure:
@@ -313,9 +389,19 @@ def fusion_curve(e: Evaluation) -> Figure:
     table = e.fusion
 
     axes.fill_between(
-        table["n_views"], table["low"], table["high"], color=BLUE, alpha=0.15, linewidth=0
+        table["n_views"],
+        table["low"],
+        table["high"],
+        color=BLUE,
+        alpha=0.15,
+        linewidth=0,
     )
-    axes.plot(table["n_views"], table["accuracy"], color=BLUE, label="over objects, 95 % interval")
+    axes.plot(
+        table["n_views"],
+        table["accuracy"],
+        color=BLUE,
+        label="over objects, 95 % interval",
+    )
     axes.plot(
         table["n_views"],
         table["class_accuracy"],
@@ -325,12 +411,16 @@ def fusion_curve(e: Evaluation) -> Figure:
         label="over classes",
     )
     axes.plot(
-        table["n_views"], table["confidence"], color=ACCENT, linestyle=":", label="mean confidence"
+        table["n_views"],
+        table["confidence"],
+        color=ACCENT,
+        linestyle=":",
+        label="mean confidence",
     )
 
-    published = e.accuracy.query("n_views == 1 and label == '' and measure == 'accuracy'")[
-        "published"
-    ].iloc[0]
+    published = e.accuracy.query(
+        "n_views == 1 and label == '' and measure == 'accuracy'"
+    )["published"].iloc[0]
     if np.isfinite(published):
         axes.plot(
             1,
@@ -361,7 +451,9 @@ def evaluated_reliability(e: Evaluation) -> Figure:
     curves = {}
     n: Any
     for (n, rows), colour in zip(
-        e.reliability.groupby("n_views"), ("#7cc4ec", LIGHT_BLUE, BLUE, INK), strict=False
+        e.reliability.groupby("n_views"),
+        ("#7cc4ec", LIGHT_BLUE, BLUE, INK),
+        strict=False,
     ):
         curves[f"{n} view{'s' * (n > 1)}  {errors[n]:.3f}"] = rows, {"color": colour}
     return _reliability(curves, "in the answer", "calibration error")

@@ -36,22 +36,26 @@ def leaderboard(tables: Tables, threshold: float) -> list[Any]:
     """
     rows = tables.summary[tables.summary["threshold"] == threshold]
     table = rows.pivot(index="policy", columns="measure", values="value")
-    table = table.join(rows[rows["measure"] == "accuracy"].set_index("policy")[["low", "high"]])
+    table = table.join(
+        rows[rows["measure"] == "accuracy"].set_index("policy")[["low", "high"]]
+    )
     table = table.join(
         _tests(tables, threshold).set_index("policy")[["difference", "p_holm"]]
     ).reset_index()
     table = table.rename(columns={"travel_all": "travel"}).assign(
         differs=table["p_holm"] < SIGNIFICANT
     )
-    return sorted(table.itertuples(index=False), key=lambda s: (is_oracle(s.policy), -s.accuracy))
+    return sorted(
+        table.itertuples(index=False), key=lambda s: (is_oracle(s.policy), -s.accuracy)
+    )
 
 
 def promised_risks(tables: Tables) -> list[Any]:
     """Return the rows of ``Tables.risks``, and whether a guarantee is broken beyond chance."""
     return list(
-        tables.risks.assign(broken=tables.risks["low"] > tables.risks["risk"]).itertuples(
-            index=False
-        )
+        tables.risks.assign(
+            broken=tables.risks["low"] > tables.risks["risk"]
+        ).itertuples(index=False)
     )
 
 
@@ -124,7 +128,9 @@ def too_few(tables: Tables, threshold: float, objects: int) -> str | None:
         The warning; None if there are enough.
     """
     tests = _robot_tests(tables, threshold)
-    half = float((tests["high"] - tests["low"]).median() / 2)  # NaN if nothing was compared
+    half = float(
+        (tests["high"] - tests["low"]).median() / 2
+    )  # NaN if nothing was compared
     if objects >= FEW_OBJECTS and not half > WIDE_INTERVAL:
         return None
     unclear = (

@@ -38,7 +38,9 @@ def numbers(frame: pd.DataFrame, *keys: str) -> dict[tuple, Number]:
         for row in frame[list(keys)].to_numpy(object).tolist()
     ]
     values = frame[list(Number._fields)].to_numpy(float).tolist()
-    return {tuple(name): Number(*value) for name, value in zip(names, values, strict=True)}
+    return {
+        tuple(name): Number(*value) for name, value in zip(names, values, strict=True)
+    }
 
 
 def percent(share: float) -> str:
@@ -74,8 +76,12 @@ def render(template: str, **given: Any) -> str:
         "words": words,
         "measure_of": measure_of,
         "fixed": lambda value, digits: f"{value:.{digits}f}",
-        "between": lambda number: f"{100 * number.low:.1f} {NONE} {percent(number.high)}",
-        "p_value": lambda p: NONE if np.isnan(p) else "< 0.001" if p < 0.001 else f"{p:.3f}",
+        "between": lambda number: (
+            f"{100 * number.low:.1f} {NONE} {percent(number.high)}"
+        ),
+        "p_value": lambda p: (
+            NONE if np.isnan(p) else "< 0.001" if p < 0.001 else f"{p:.3f}"
+        ),
     }
 
     return pages.get_template(template).render(given)
@@ -104,12 +110,19 @@ def write_figures(
         for name, figure in figures.items():
             (part / f"{name}.svg").write_text(to_svg(figure), encoding="utf-8")
             figure.savefig(
-                part / f"{name}.pdf", bbox_inches="tight", metadata={"CreationDate": None}
+                part / f"{name}.pdf",
+                bbox_inches="tight",
+                metadata={"CreationDate": None},
             )
         for name, table in tables.items():
             table.to_csv(part / f"{name}.csv", index=False)
             (part / f"{name}.tex").write_text(
-                table.to_latex(index=False, escape=True, float_format="%.4g", na_rep=""),
+                table.to_latex(
+                    index=False,
+                    escape=True,
+                    float_format="%.4g",
+                    na_rep="",
+                ),
                 encoding="utf-8",
             )
 
@@ -125,10 +138,15 @@ def origin(p: Predictions, settings: Mapping[str, Any]) -> dict[str, str]:
         Texts by their headings.
     """
     splits = zip(*np.unique(p.splits, return_counts=True), strict=True)
-    conflicting = [name for name, twice in zip(p.names, p.conflicting, strict=True) if twice]
+    conflicting = [
+        name for name, twice in zip(p.names, p.conflicting, strict=True) if twice
+    ]
     return {
         "predictions": f"{settings['predictions']}, SHA-256 {settings['predictions_sha256']}",
-        **{f"model: {kind}": f"{name}, SHA-256 {sha}" for kind, (name, sha) in p.models.items()},
+        **{
+            f"model: {kind}": f"{name}, SHA-256 {sha}"
+            for kind, (name, sha) in p.models.items()
+        },
         "splits": ", ".join(f"{n} {name or 'unnamed'}" for name, n in splits),
         "the same mesh under another label": ", ".join(conflicting) or "none",
     }

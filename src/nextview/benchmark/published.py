@@ -23,14 +23,22 @@ FIVE_VIEWS = {  # fixed views of tables 3 and 12, both of a network for 40 class
     "best-5": "best",
     "random-fixed-5": "random",
 }
-ACCURACY = {10: "table8_accuracy_per_class_modelnet10", 40: "table10_accuracy_per_class_modelnet40"}
-TRAVEL = {10: "table9_travel_per_class_modelnet10", 40: "table11_travel_per_class_modelnet40"}
+ACCURACY = {
+    10: "table8_accuracy_per_class_modelnet10",
+    40: "table10_accuracy_per_class_modelnet40",
+}
+TRAVEL = {
+    10: "table9_travel_per_class_modelnet10",
+    40: "table11_travel_per_class_modelnet40",
+}
 
 
 @cache
 def read_rows(name: str) -> list[dict[str, str]]:
     """A table that ships with the package, as it is written: a row by the names of its columns."""
-    with (files("nextview.benchmark") / "published" / f"{name}.csv").open(encoding="utf-8") as file:
+    with (files("nextview.benchmark") / "published" / f"{name}.csv").open(
+        encoding="utf-8"
+    ) as file:
         return list(csv.DictReader(file))
 
 
@@ -38,7 +46,10 @@ def read_rows(name: str) -> list[dict[str, str]]:
 def read_table(name: str) -> dict[str, dict[str, float]]:
     """The same with rows by their first column, then numbers by the name of the column."""
     rows = [list(row.items()) for row in read_rows(name)]
-    return {first: {column: float(value) for column, value in rest} for (_, first), *rest in rows}
+    return {
+        first: {column: float(value) for column, value in rest}
+        for (_, first), *rest in rows
+    }
 
 
 def published_classes(classes: tuple[str, ...]) -> int | None:
@@ -109,7 +120,10 @@ def published(
     return read_table("table5_nbv_modelnet10")[row][PUBLISHED_COLUMNS[policy]]
 
 
-def published_recognisers(classes: tuple[str, ...], views: int) -> list[tuple[str, int, float]]:
+def published_recognisers(
+    classes: tuple[str, ...],
+    views: int,
+) -> list[tuple[str, int, float]]:
     """Return the published recognisers of table 6.
 
     Args:
@@ -129,7 +143,10 @@ def published_recognisers(classes: tuple[str, ...], views: int) -> list[tuple[st
 
 
 def published_map(
-    name: str, measure: str, classes: tuple[str, ...], label: str | None = None
+    name: str,
+    measure: str,
+    classes: tuple[str, ...],
+    label: str | None = None,
 ) -> float | None:
     """Return the published score of a map network (tables 4 and 7).
 
@@ -151,7 +168,11 @@ def published_map(
 
     if label is None and over_classes == (kind != "mse"):
         for row in read_rows("table4_map_prediction"):
-            if (row["model"].lower(), int(row["classes_train"]), int(row["classes_test"])) == (
+            if (
+                row["model"].lower(),
+                int(row["classes_train"]),
+                int(row["classes_test"]),
+            ) == (
                 name,
                 n,
                 n,

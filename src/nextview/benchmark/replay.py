@@ -77,13 +77,19 @@ def make_specs(predictions: Predictions, runs: int, seed: int) -> EpisodeSpecs:
     objects = np.tile(np.arange(n), runs)
     if scenes is not None:
         starts = np.where(
-            scenes.reachable[objects], rng.random((len(objects), len(predictions.sphere))), -1
+            scenes.reachable[objects],
+            rng.random((len(objects), len(predictions.sphere))),
+            -1,
         ).argmax(1)
     return EpisodeSpecs(predictions, objects, starts, scenes)
 
 
 def replay(
-    name: str, specs: EpisodeSpecs, max_views: int, seed: int, beliefs: bool = False
+    name: str,
+    specs: EpisodeSpecs,
+    max_views: int,
+    seed: int,
+    beliefs: bool = False,
 ) -> Trajectories:
     """Run a benchmark entry through all episodes, to the last view.
 
@@ -103,8 +109,17 @@ def replay(
     rng = np.random.default_rng([seed, *name.encode()])
     views = fixed_views(name, specs, rng)
     if views is None:
-        to_the_end = FixedLength(max_views=max_views) if beliefs else Stopping(1.0, max_views)
-        return replay_policy(name, entry_policy(name, specs), specs, to_the_end, rng, beliefs)
+        to_the_end = (
+            FixedLength(max_views=max_views) if beliefs else Stopping(1.0, max_views)
+        )
+        return replay_policy(
+            name,
+            entry_policy(name, specs),
+            specs,
+            to_the_end,
+            rng,
+            beliefs,
+        )
     # Fixed views draw nothing more and may be long: in parts, whose steps are not all held at once.
     parts = []
     for start in range(0, len(views), EPISODES_TOGETHER):
@@ -112,11 +127,17 @@ def replay(
         here = replace(specs, objects=specs.objects[part], starts=views[part, 0])
         parts.append(
             replay_policy(
-                name, ViewList(views[part]), here, FixedLength(max_views=views.shape[1]), rng
+                name,
+                ViewList(views[part]),
+                here,
+                FixedLength(max_views=views.shape[1]),
+                rng,
             )
         )
     names = [f.name for f in fields(Trajectories) if f.name not in ("fixed", "beliefs")]
-    whole = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    whole = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in names
+    }
     return replace(parts[0], **whole, fixed=True)
 
 
@@ -145,7 +166,8 @@ def replay_policy(
     objects = specs.objects
     needs = maps_among(policy.needs)
     maps = {
-        m: true_map(p, m.removeprefix(TRUE)) if m.startswith(TRUE) else p.maps[m] for m in needs
+        m: true_map(p, m.removeprefix(TRUE)) if m.startswith(TRUE) else p.maps[m]
+        for m in needs
     }
     p = replace(p, maps=maps)
 
@@ -155,10 +177,21 @@ def replay_policy(
     sight = sight_of(specs.scenes, objects)
     try:
         done = run_episodes(
-            observe, p.sphere, policy, specs.starts, stopping, rng, p.calibration, *sight
+            observe,
+            p.sphere,
+            policy,
+            specs.starts,
+            stopping,
+            rng,
+            p.calibration,
+            *sight,
         )
     except PolicyError as error:
-        where = "" if error.episode is None else f" (object {p.names[objects[error.episode]]})"
+        where = (
+            ""
+            if error.episode is None
+            else f" (object {p.names[objects[error.episode]]})"
+        )
         raise EntryError(f"{name}: {error}{where}") from error
     shape = (len(objects), len(done.steps))
     answers = np.zeros(shape, np.int64)
@@ -179,7 +212,16 @@ def replay_policy(
         np.hstack([still, np.cumsum(d[legs] * going, axis=1)])
         for d in (p.sphere.travel, p.sphere.arc)
     )
-    return Trajectories(views, answers, confidences, travel, arc, seen, fixed=False, beliefs=kept)
+    return Trajectories(
+        views,
+        answers,
+        confidences,
+        travel,
+        arc,
+        seen,
+        fixed=False,
+        beliefs=kept,
+    )
 
 
 def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcome:
@@ -223,7 +265,14 @@ def truncate(paths: Trajectories, stopping: Stopping | None) -> Outcome:
 
     moved = paths.travel[e, at], paths.arc[e, at]
     views = np.where(np.arange(paths.views.shape[1]) <= at[:, None], paths.views, -1)
-    return Outcome(paths.answers[e, at], paths.confidences[e, at], at + 1, confident, *moved, views)
+    return Outcome(
+        paths.answers[e, at],
+        paths.confidences[e, at],
+        at + 1,
+        confident,
+        *moved,
+        views,
+    )
 
 
 @dataclass(frozen=True)
@@ -257,7 +306,11 @@ class Grid:
         """The rule of a threshold."""
         if self.rule is not None:
             return own_stopping(self.rule, threshold, self.max_views)
-        rule = Stopping.of(self.specs.predictions.calibration, threshold, max_views=self.max_views)
+        rule = Stopping.of(
+            self.specs.predictions.calibration,
+            threshold,
+            max_views=self.max_views,
+        )
         return (
             rule
             if self.threshold_decay is None
@@ -274,7 +327,10 @@ class Grid:
         Returns:
             How the episodes end.
         """
-        return truncate(self.paths[name], None if threshold is None else self.stopping(threshold))
+        return truncate(
+            self.paths[name],
+            None if threshold is None else self.stopping(threshold),
+        )
 
     def cells(self) -> Iterator[tuple[str, float | None, Outcome]]:
         """Every entry under every threshold; fixed views once, with threshold None."""
@@ -300,7 +356,11 @@ def run_grid(grid: Grid, names: Sequence[str]) -> Iterator[int]:
     for n, name in enumerate(names, 1):
         try:
             grid.paths[name] = replay(
-                name, grid.specs, grid.max_views, grid.seed, beliefs=grid.rule is not None
+                name,
+                grid.specs,
+                grid.max_views,
+                grid.seed,
+                beliefs=grid.rule is not None,
             )
         except NextviewError as error:
             grid.failures[name] = str(error)

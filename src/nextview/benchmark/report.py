@@ -77,9 +77,17 @@ def report(
     if figures is not None:
         at = board.headline_threshold(loaded.settings["thresholds"])
         tables = loaded.tables
-        shown = {"leaderboard": pd.DataFrame(board.leaderboard(tables, at)), "tests": tables.tests}
+        shown = {
+            "leaderboard": pd.DataFrame(board.leaderboard(tables, at)),
+            "tests": tables.tests,
+        }
         shown |= {} if tables.views.empty else {"views": as_rows(tables.views)}
-        write_figures(figures, _figures(loaded, headline_policy(loaded, at), at), shown, overwrite)
+        write_figures(
+            figures,
+            _figures(loaded, headline_policy(loaded, at), at),
+            shown,
+            overwrite,
+        )
     return path
 
 
@@ -96,9 +104,13 @@ def headline_policy(results: Results, threshold: float) -> str:
     found = numbers(results.tables.summary, "policy", "threshold", "measure")
     reference = results.settings["reference"]
     names = [
-        n for n in results.tables.sweep["policy"].unique() if not is_oracle(n) and n != reference
+        n
+        for n in results.tables.sweep["policy"].unique()
+        if not is_oracle(n) and n != reference
     ]
-    return max(names, key=lambda n: found[n, threshold, "accuracy"].value, default=reference)
+    return max(
+        names, key=lambda n: found[n, threshold, "accuracy"].value, default=reference
+    )
 
 
 def page(results: Results, store: ViewStore | None, why_not: str) -> str:
@@ -129,11 +141,17 @@ def page(results: Results, store: ViewStore | None, why_not: str) -> str:
     shown = [name for name in wanted if name in policies]
 
     def spoken(measure: str) -> str:
-        known = [(name, found.get((name, at, measure))) for name in draw.compared(results)]
-        values = [f"{name} {number.value:.3f}" for name, number in known if number is not None]
+        known = [
+            (name, found.get((name, at, measure))) for name in draw.compared(results)
+        ]
+        values = [
+            f"{name} {number.value:.3f}" for name, number in known if number is not None
+        ]
         return f"At threshold {at:g}: {', '.join(values)}."
 
-    thresholds = [(name, value) for name, value, measure in found if measure == "accuracy"]
+    thresholds = [
+        (name, value) for name, value, measure in found if measure == "accuracy"
+    ]
     fixed_at = {name: None for name, value in thresholds if value is None}
     confusions = {
         name: picture(draw.confusion(results.episodes(name, at), p.classes, name))
@@ -154,7 +172,9 @@ def page(results: Results, store: ViewStore | None, why_not: str) -> str:
         labels=sorted(t.per_class["label"].unique()),
         policies=policies,
         shown=shown,
-        one_view=t.sweep.query("policy == @reference or policy == @best").iloc[0]["accuracy"],
+        one_view=t.sweep.query("policy == @reference or policy == @best").iloc[0][
+            "accuracy"
+        ],
         tests=tests,
         nothing=board.nothing_differs(t, at, reference),
         warning=board.too_few(t, at, len(p)),
@@ -164,7 +184,10 @@ def page(results: Results, store: ViewStore | None, why_not: str) -> str:
         by_class_at=_thresholds(results, at),
         fixed_at=fixed_at,
         spoken=spoken,
-        figures={name: picture(figure) for name, figure in _figures(results, best, at).items()},
+        figures={
+            name: picture(figure)
+            for name, figure in _figures(results, best, at).items()
+        },
         confusions=confusions,
         failures=_failures(results, best, at, store),
         made=_made(results, store, why_not),
@@ -186,14 +209,20 @@ def _title(test: Mapping[Any, Any] | None, best: str, reference: str, at: float)
 def _figures(results: Results, best: str, at: float) -> dict[str, Figure]:
     sweep = results.tables.sweep
     reference = results.settings["reference"]
-    figures = {} if results.tables.tests.empty else {"differences": draw.differences(results, at)}
+    figures = (
+        {}
+        if results.tables.tests.empty
+        else {"differences": draw.differences(results, at)}
+    )
     figures |= {
         measure: draw.threshold_curve(results, measure)
         for measure in ("class_accuracy", "accuracy")
     }
 
     varying = [
-        budget for budget in ("n_views", "travel_all") if sweep[budget].max() > sweep[budget].min()
+        budget
+        for budget in ("n_views", "travel_all")
+        if sweep[budget].max() > sweep[budget].min()
     ]
     figures |= {budget: draw.budget_curve(results, budget) for budget in varying}
 
@@ -215,7 +244,9 @@ def _thresholds(results: Results, at: float) -> dict[str, float]:
     ran = set(results.tables.sweep["policy"])
     thresholds = results.settings["thresholds"]
     wanted = {
-        name: published_threshold(name) or 0.99 for name in (LEM, *PUBLISHED_COLUMNS) if name in ran
+        name: published_threshold(name) or 0.99
+        for name in (LEM, *PUBLISHED_COLUMNS)
+        if name in ran
     }
     return {name: t if t in thresholds else at for name, t in wanted.items()}
 
@@ -232,35 +263,58 @@ def worst_failures(episodes: pd.DataFrame, most: int = 8) -> pd.DataFrame:
     """
     wrong = episodes[episodes["answer"].astype(str) != episodes["label"].astype(str)]
     wrong = wrong.assign(object=wrong["object"].astype(str)).sort_values(
-        "confidence", ascending=False, kind="stable"
+        "confidence",
+        ascending=False,
+        kind="stable",
     )
+
     groups = wrong.groupby("object", sort=False)
     table = groups.agg(
-        wrong=("run", "size"), confidence=("confidence", "mean"), run=("run", "first")
+        wrong=("run", "size"),
+        confidence=("confidence", "mean"),
+        run=("run", "first"),
     ).reset_index()
-    return table.sort_values(["wrong", "confidence"], ascending=False, kind="stable").head(most)
+    return table.sort_values(
+        ["wrong", "confidence"],
+        ascending=False,
+        kind="stable",
+    ).head(most)
 
 
 def _failures(
-    results: Results, best: str, at: float, store: ViewStore | None
+    results: Results,
+    best: str,
+    at: float,
+    store: ViewStore | None,
 ) -> list[dict[Any, Any]]:
     """The worst failures of a policy, each with its most confident episode."""
     p = results.predictions
     episodes = results.episodes(best, at)
     names = np.asarray(episodes["object"].astype(str))
     found = []
+
     for failure in worst_failures(episodes).to_dict("records"):
         name = failure["object"]
-        episode = episodes[(names == name) & (episodes["run"] == failure["run"])].iloc[0]
+        episode = episodes[(names == name) & (episodes["run"] == failure["run"])].iloc[
+            0
+        ]
         views = [int(v) for v in episode["views"]]
-        images = _images(store, name, views) if store is not None and name in store.names else {}
+        images = (
+            _images(store, name, views)
+            if store is not None and name in store.names
+            else {}
+        )
         shown = {"answer": episode["answer"], "views": views, "images": images}
-        found.append(failure | shown | {"conflicting": bool(p.conflicting[p.names.index(name)])})
+        found.append(
+            failure | shown | {"conflicting": bool(p.conflicting[p.names.index(name)])}
+        )
+
     return found
 
 
 def pictures_of(
-    predictions: Predictions, store: Path | None = None
+    predictions: Predictions,
+    store: Path | None = None,
 ) -> tuple[ViewStore | None, str]:
     """Open the view store of the objects' pictures.
 
@@ -276,8 +330,12 @@ def pictures_of(
     """
     if store is not None:
         given = ViewStore.open(store)
-        if given.sphere != predictions.sphere or not set(given.names) & set(predictions.names):
-            raise ResultsError(f"{store}: holds no views of these objects from these viewpoints")
+        if given.sphere != predictions.sphere or not set(given.names) & set(
+            predictions.names
+        ):
+            raise ResultsError(
+                f"{store}: holds no views of these objects from these viewpoints"
+            )
         return given, ""
     try:
         # which tells whether it is the same store
@@ -295,17 +353,24 @@ def _images(store: ViewStore, name: str, views: list[int]) -> dict[str, str]:
     if store.attributes.scene:
         scene = scene_views(store, row)
         shade = (
-            np.stack([headlight(depth, scene.intrinsics) for depth in scene.depth])[..., None] / 255
+            np.stack([headlight(depth, scene.intrinsics) for depth in scene.depth])[
+                ...,
+                None,
+            ]
+            / 255
         )
         images = np.where(
-            scene.owner[..., None] > 0, OWNERS[scene.owner] * (0.35 + 0.65 * shade), 255
+            scene.owner[..., None] > 0,
+            OWNERS[scene.owner] * (0.35 + 0.65 * shade),
+            255,
         ).astype(np.uint8)
 
     found = {}
     for view in views:
         file = BytesIO()
         small = Image.fromarray(images[view]).resize(
-            (REPORT_PICTURE, REPORT_PICTURE), Image.Resampling.LANCZOS
+            (REPORT_PICTURE, REPORT_PICTURE),
+            Image.Resampling.LANCZOS,
         )
         small.save(file, "WEBP", quality=70)
         found[f"{name} from view {view}"] = (

@@ -128,7 +128,12 @@ def run_benchmark(
 
     rng = np.random.default_rng([settings.seed, 1])
     tables = summarise(
-        grid, settings.reference, settings.samples, rng, promised, sorted(set(settings.views))
+        grid,
+        settings.reference,
+        settings.samples,
+        rng,
+        promised,
+        sorted(set(settings.views)),
     )
 
     table = grid.specs.predictions
@@ -151,13 +156,19 @@ def run_benchmark(
         for name, frame in vars(tables).items():
             frame.to_csv(part / f"{name}.csv", index=False)
         if settings.views:
-            (part / "views.md").write_text(markdown(as_rows(tables.views)), encoding="utf-8")
+            (part / "views.md").write_text(
+                markdown(as_rows(tables.views)),
+                encoding="utf-8",
+            )
         table.save(part / "predictions.npz")
         (part / "benchmark.json").write_text(json.dumps(made, indent=1) + "\n")
     return load(out)
 
 
-def _prepare(predictions: Path, s: BenchmarkSettings) -> tuple[Grid, list[str], dict[float, float]]:
+def _prepare(
+    predictions: Path,
+    s: BenchmarkSettings,
+) -> tuple[Grid, list[str], dict[float, float]]:
     """What is run, the names of the entries, and the threshold that promises each error rate."""
     if not s.thresholds:
         raise UsageError("at least one threshold is needed")
@@ -179,7 +190,9 @@ def _prepare(predictions: Path, s: BenchmarkSettings) -> tuple[Grid, list[str], 
         )
     if s.stopping:
         own_stopping(s.stopping, s.thresholds[0], s.max_views)  # likewise
-    promised = {risk: table.calibration.threshold(risk, s.max_views) for risk in s.risks}
+    promised = {
+        risk: table.calibration.threshold(risk, s.max_views) for risk in s.risks
+    }
     table = chosen_split(table, predictions, s.split)
     specs = make_specs(table, s.runs, s.seed)
     cards = find_models(s.models).policies
@@ -190,7 +203,11 @@ def _prepare(predictions: Path, s: BenchmarkSettings) -> tuple[Grid, list[str], 
     names = list(dict.fromkeys([*([s.reference] if s.policies else []), *names]))
     thresholds = tuple(sorted({*s.thresholds, *promised.values()}))
 
-    return Grid(specs, s.runs, thresholds, s.max_views, s.seed, decay, s.stopping), names, promised
+    return (
+        Grid(specs, s.runs, thresholds, s.max_views, s.seed, decay, s.stopping),
+        names,
+        promised,
+    )
 
 
 def chosen_split(table: Predictions, path: Path, split: str | None) -> Predictions:
@@ -210,7 +227,9 @@ def chosen_split(table: Predictions, path: Path, split: str | None) -> Predictio
     if split:
         return table.of_split(split)
     if len(set(table.splits)) > 1:
-        raise UsageError(f"{path}: holds training and test objects; choose one with --split")
+        raise UsageError(
+            f"{path}: holds training and test objects; choose one with --split"
+        )
     return table
 
 
@@ -221,7 +240,11 @@ def load(folder: Path) -> Results:
         settings = json.loads((folder / "benchmark.json").read_text())
         files = {name: folder / f"{name}.csv" for name in Tables.__dataclass_fields__}
         # earlier results
-        files = {name: file for name, file in files.items() if name != "views" or file.exists()}
+        files = {
+            name: file
+            for name, file in files.items()
+            if name != "views" or file.exists()
+        }
         tables = Tables(**{name: pd.read_csv(file) for name, file in files.items()})
         pq.read_schema(folder / "episodes.parquet")
     except (FileNotFoundError, NotADirectoryError):
@@ -229,8 +252,15 @@ def load(folder: Path) -> Results:
             f"{folder}: holds no benchmark results; make some with nextview benchmark"
         ) from None
     except (ValueError, RecursionError, pa.ArrowInvalid) as error:
-        raise ResultsError(f"{folder}: these benchmark results are damaged ({error})") from None
-    return Results(folder, settings, Predictions.load(folder / "predictions.npz"), tables)
+        raise ResultsError(
+            f"{folder}: these benchmark results are damaged ({error})"
+        ) from None
+    return Results(
+        folder,
+        settings,
+        Predictions.load(folder / "predictions.npz"),
+        tables,
+    )
 
 
 STOPS = ("views ran out", "confident", "fixed views")
@@ -241,7 +271,10 @@ def _write_episodes(path: Path, grid: Grid) -> None:
     n = len(grid.specs.objects)
 
     def words(codes: Any, names: tuple[str, ...]) -> pa.DictionaryArray:
-        return pa.DictionaryArray.from_arrays(pa.array(codes, pa.int32()), pa.array(names))
+        return pa.DictionaryArray.from_arrays(
+            pa.array(codes, pa.int32()),
+            pa.array(names),
+        )
 
     names = words(grid.specs.objects, p.names)
     labels = words(grid.specs.labels, p.classes)
@@ -257,7 +290,9 @@ def _write_episodes(path: Path, grid: Grid) -> None:
                 "label": labels,
                 "run": run,
                 "policy": words(np.zeros(n), (policy,)),
-                "threshold": pa.array(np.full(n, np.nan if threshold is None else threshold)),
+                "threshold": pa.array(
+                    np.full(n, np.nan if threshold is None else threshold)
+                ),
                 "views": pa.ListArray.from_arrays(pa.array(begins), pa.array(taken)),
                 "stop": words(np.where(paths.fixed, 2, ends.confident), STOPS),
                 "answer": words(ends.answer, p.classes),

@@ -32,7 +32,10 @@ def interval(samples: Float) -> tuple[Float, Float]:
 
 
 def estimate(
-    top: Float, bottom: Float, weights: Float, labels: Index | None = None
+    top: Float,
+    bottom: Float,
+    weights: Float,
+    labels: Index | None = None,
 ) -> tuple[Float, Float]:
     """Return ratios of sums over objects and their bootstrap samples.
 
@@ -49,7 +52,10 @@ def estimate(
     if labels is None:
         return metrics.ratio(top, bottom, once)[0], metrics.ratio(top, bottom, weights)
     return metrics.class_mean(top, bottom, labels, once)[0], metrics.class_mean(
-        top, bottom, labels, weights
+        top,
+        bottom,
+        labels,
+        weights,
     )
 
 
@@ -87,5 +93,8 @@ def holm(p: Float) -> Float:
     adjusted = np.full(len(p), np.nan)
     tested = np.flatnonzero(~np.isnan(p))
     order = tested[np.argsort(p[tested])]
-    adjusted[order] = np.minimum(1, np.maximum.accumulate(p[order] * np.arange(len(order), 0, -1)))
+    adjusted[order] = np.minimum(
+        1,
+        np.maximum.accumulate(p[order] * np.arange(len(order), 0, -1)),
+    )
     return adjusted

@@ -72,7 +72,9 @@ class Tables:
     reliability: pd.DataFrame
     risks: pd.DataFrame
     levels: pd.DataFrame
-    views: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=RESULT_COLUMNS))
+    views: pd.DataFrame = field(
+        default_factory=lambda: pd.DataFrame(columns=RESULT_COLUMNS)
+    )
 
 
 def summarise(
@@ -131,12 +133,17 @@ def _measures(grid: Grid, ends: Outcome) -> dict[str, tuple[Float, Float]]:
         "travel_all": (of(ends.travel).mean(0), one),
         "arc_all": (of(ends.arc).mean(0), one),
         "confident": (confident.mean(0), one),
-        "confident_accuracy": ((right * confident).sum(0), confident.sum(0).astype(np.float64)),
+        "confident_accuracy": (
+            (right * confident).sum(0),
+            confident.sum(0).astype(np.float64),
+        ),
     }
 
 
 def _columns(
-    grid: Grid, cells: list[Cell], names: tuple[str, ...] | None = None
+    grid: Grid,
+    cells: list[Cell],
+    names: tuple[str, ...] | None = None,
 ) -> tuple[list, Float, Float]:
     """Return the measures of all cells: their keys, numerators and denominators, (N, M)."""
     found = {
@@ -150,31 +157,45 @@ def _columns(
 
 
 def _summary(
-    grid: Grid, cells: list[Cell], weights: Float
+    grid: Grid,
+    cells: list[Cell],
+    weights: Float,
 ) -> tuple[pd.DataFrame, dict[tuple, Float]]:
     labels = grid.specs.predictions.labels
     classes = comparable_classes(grid.specs.predictions)
     keys, top, bottom = _columns(grid, cells)
     of_class = [
-        i for i, key in enumerate(keys) if key[2] in ("accuracy", "travel_moved", "n_views")
+        i
+        for i, key in enumerate(keys)
+        if key[2] in ("accuracy", "travel_moved", "n_views")
     ]
     keys += [(keys[i][0], keys[i][1], f"class_{keys[i][2]}") for i in of_class]
 
     over_objects = st.estimate(top, bottom, weights)
     over_classes = st.estimate(top[:, of_class], bottom[:, of_class], weights, labels)
     value, drawn = (
-        np.concatenate(both, -1) for both in zip(over_objects, over_classes, strict=True)
+        np.concatenate(both, -1)
+        for both in zip(over_objects, over_classes, strict=True)
     )
 
     numbers = zip(keys, value, *st.interval(drawn), strict=True)
-    rows = [(*key, *number, published(key[0], key[1], key[2], classes)) for key, *number in numbers]
+    rows = [
+        (*key, *number, published(key[0], key[1], key[2], classes))
+        for key, *number in numbers
+    ]
 
     for policy, threshold, ends in cells:
         right = grid.right(ends.answer)
         error = metrics.calibration_error(ends.confidence, right.ravel())
-        between = np.std([right[:, labels == label].mean() for label in np.unique(labels)])
-        rows.append((policy, threshold, "calibration_error", error, np.nan, np.nan, None))
-        rows.append((policy, threshold, "class_accuracy_std", between, np.nan, np.nan, None))
+        between = np.std(
+            [right[:, labels == label].mean() for label in np.unique(labels)]
+        )
+        rows.append(
+            (policy, threshold, "calibration_error", error, np.nan, np.nan, None)
+        )
+        rows.append(
+            (policy, threshold, "class_accuracy_std", between, np.nan, np.nan, None)
+        )
 
     columns = ["policy", "threshold", "measure", "value", "low", "high", "published"]
     return _frame(rows, columns), {key: drawn[:, i] for i, key in enumerate(keys)}
@@ -191,21 +212,41 @@ def _per_class(grid: Grid, cells: list[Cell], weights: Float) -> pd.DataFrame:
         label = p.classes[index]
         value, drawn = st.estimate(top[here], bottom[here], weights[:, here])
         for (policy, threshold, measure), *number in zip(
-            keys, value, *st.interval(drawn), strict=True
+            keys,
+            value,
+            *st.interval(drawn),
+            strict=True,
         ):
             beside = published(policy, threshold, measure, classes, label)
             rows.append((policy, threshold, label, measure, *number, beside))
 
     return _frame(
-        rows, ["policy", "threshold", "label", "measure", "value", "low", "high", "published"]
+        rows,
+        [
+            "policy",
+            "threshold",
+            "label",
+            "measure",
+            "value",
+            "low",
+            "high",
+            "published",
+        ],
     )
 
 
 def _tests(
-    grid: Grid, cells: list[Cell], summary: pd.DataFrame, drawn: Drawn, reference: str
+    grid: Grid,
+    cells: list[Cell],
+    summary: pd.DataFrame,
+    drawn: Drawn,
+    reference: str,
 ) -> pd.DataFrame:
     value = summary.set_index(["policy", "threshold", "measure"])["value"].to_dict()
-    right = {(policy, threshold): grid.right(ends.answer) for policy, threshold, ends in cells}
+    right = {
+        (policy, threshold): grid.right(ends.answer)
+        for policy, threshold, ends in cells
+    }
     rows = []
     for (policy, threshold), measure in product(right, TESTED):
         if policy == reference or (reference, threshold) not in right:
@@ -215,18 +256,21 @@ def _tests(
         theirs = (reference, threshold, measure)
         difference = np.array([value[ours] - value[theirs]])
         samples = (drawn[ours] - drawn[theirs])[:, None]
-        found = np.stack([difference, *st.interval(samples), st.bootstrap_p(difference, samples)])[
-            :, 0
-        ]
+        found = np.stack(
+            [difference, *st.interval(samples), st.bootstrap_p(difference, samples)]
+        )[:, 0]
 
         tested = measure == "accuracy"
         paired = (
-            st.mcnemar(right[policy, threshold], right[reference, threshold]) if tested else np.nan
+            st.mcnemar(right[policy, threshold], right[reference, threshold])
+            if tested
+            else np.nan
         )
         rows.append((*ours, *found, paired))
 
     table = _frame(
-        rows, ["policy", "threshold", "measure", "difference", "low", "high", "p", "mcnemar"]
+        rows,
+        ["policy", "threshold", "measure", "difference", "low", "high", "p", "mcnemar"],
     )
     for column in ("p", "mcnemar"):
         table[f"{column}_holm"] = table.groupby("measure")[column].transform(
@@ -240,9 +284,15 @@ def _sweep(grid: Grid) -> pd.DataFrame:
     points = []
     for name, paths in grid.paths.items():
         if not paths.fixed:
-            _, top, _ = _columns(grid, [(name, t, grid.ends(name, t)) for t in SWEEP], measures)
+            _, top, _ = _columns(
+                grid,
+                [(name, t, grid.ends(name, t)) for t in SWEEP],
+                measures,
+            )
             curve = top.mean(0).reshape(len(SWEEP), -1)
-            points += [(name, t, *values) for t, values in zip(SWEEP, curve, strict=True)]
+            points += [
+                (name, t, *values) for t, values in zip(SWEEP, curve, strict=True)
+            ]
     return _frame(points, ["policy", "threshold", *measures])
 
 
@@ -250,12 +300,17 @@ def _reliability(grid: Grid, cells: list[Cell]) -> pd.DataFrame:
     rows = []
     for policy, threshold, ends in cells:
         sure, accuracy, count = metrics.reliability(
-            ends.confidence, grid.right(ends.answer).ravel()
+            ends.confidence,
+            grid.right(ends.answer).ravel(),
         )
         rows += [
-            (policy, threshold, i, sure[i], accuracy[i], count[i]) for i in np.flatnonzero(count)
+            (policy, threshold, i, sure[i], accuracy[i], count[i])
+            for i in np.flatnonzero(count)
         ]
-    return _frame(rows, ["policy", "threshold", "bin", "confidence", "accuracy", "episodes"])
+    return _frame(
+        rows,
+        ["policy", "threshold", "bin", "confidence", "accuracy", "episodes"],
+    )
 
 
 def _risks(summary: pd.DataFrame, promised: Mapping[float, float]) -> pd.DataFrame:
@@ -263,22 +318,34 @@ def _risks(summary: pd.DataFrame, promised: Mapping[float, float]) -> pd.DataFra
     for risk, threshold in promised.items():
         at = summary[summary["threshold"] == threshold]
         right, share = (
-            at[at["measure"] == measure] for measure in ("confident_accuracy", "confident")
+            at[at["measure"] == measure]
+            for measure in ("confident_accuracy", "confident")
         )
         # the upper end of accuracy is the lower of error
         measured = right[["value", "high", "low"]].to_numpy(float)
         for policy, (mean, high, low), stopped in zip(
-            right["policy"], measured, share["value"], strict=True
+            right["policy"],
+            measured,
+            share["value"],
+            strict=True,
         ):
             if not is_oracle(policy):
-                rows.append((policy, risk, threshold, 1 - mean, 1 - high, 1 - low, stopped))
-    return _frame(rows, ["policy", "risk", "threshold", "error", "low", "high", "confident"])
+                rows.append(
+                    (policy, risk, threshold, 1 - mean, 1 - high, 1 - low, stopped)
+                )
+    return _frame(
+        rows,
+        ["policy", "risk", "threshold", "error", "low", "high", "confident"],
+    )
 
 
 def _frame(rows: list, columns: list[str]) -> pd.DataFrame:
     table = pd.DataFrame(rows, columns=columns)
     return table.astype(
-        dict.fromkeys([c for c in columns if c in ("threshold", "published")], "float64")
+        dict.fromkeys(
+            [c for c in columns if c in ("threshold", "published")],
+            "float64",
+        )
     )
 
 
@@ -287,7 +354,11 @@ def levels_of(names: Sequence[str]) -> NDArray[np.str_]:
     return np.array([clutter_level(name) for name in names])
 
 
-def target_weights(names: Sequence[str], samples: int, rng: np.random.Generator) -> Float:
+def target_weights(
+    names: Sequence[str],
+    samples: int,
+    rng: np.random.Generator,
+) -> Float:
     """Draw bootstrap weights of objects; scenes around one target are drawn together.
 
     Args:
@@ -298,12 +369,22 @@ def target_weights(names: Sequence[str], samples: int, rng: np.random.Generator)
     Returns:
         Weights, (samples, N) float64.
     """
-    targets = [name.rpartition("@")[0] if clutter_level(name) else name for name in names]
+    targets = [
+        name.rpartition("@")[0] if clutter_level(name) else name for name in names
+    ]
     place = {target: i for i, target in enumerate(dict.fromkeys(targets))}
-    return st.resample(len(place), samples, rng)[:, [place[target] for target in targets]]
+    return st.resample(len(place), samples, rng)[
+        :,
+        [place[target] for target in targets],
+    ]
 
 
-def by_level(grid: Grid, reference: str, samples: int, rng: np.random.Generator) -> pd.DataFrame:
+def by_level(
+    grid: Grid,
+    reference: str,
+    samples: int,
+    rng: np.random.Generator,
+) -> pd.DataFrame:
     """Compute the accuracy in scenes by the level of clutter.
 
     Episodes have 1 view and LEVEL_VIEWS views; no threshold ends them.
@@ -332,17 +413,24 @@ def by_level(grid: Grid, reference: str, samples: int, rng: np.random.Generator)
         for name, path in paths.items():
             answers = _after(path.answers, path.views, counts)
             right[name] = grid_mean(
-                grid, (answers == grid.specs.labels[:, None]).astype(np.float64)
+                grid,
+                (answers == grid.specs.labels[:, None]).astype(np.float64),
             )[mine]
         for name, path in paths.items():
             low, high = st.interval(weights @ right[name])
-            travel = grid_mean(grid, _after(path.travel, path.views, counts))[mine].mean(0)
+            travel = grid_mean(grid, _after(path.travel, path.views, counts))[
+                mine
+            ].mean(0)
             compared = np.full((4, len(counts)), np.nan)
             if reference in right and name != reference:
                 against = right[name] - right[reference]
                 drawn = weights @ against
                 compared = np.stack(
-                    [against.mean(0), *st.interval(drawn), st.bootstrap_p(against.mean(0), drawn)]
+                    [
+                        against.mean(0),
+                        *st.interval(drawn),
+                        st.bootstrap_p(against.mean(0), drawn),
+                    ]
                 )
                 # there the policies have chosen nothing
                 compared[3, np.array(counts) == 1] = np.nan
@@ -368,7 +456,8 @@ def by_level(grid: Grid, reference: str, samples: int, rng: np.random.Generator)
 def _after(values: NDArray, views: Index, counts: list[int]) -> NDArray:
     """Return values after numbers of views, or at the end of shorter episodes, (E, counts)."""
     return values[
-        np.arange(len(values))[:, None], np.minimum((views >= 0).sum(1)[:, None], counts) - 1
+        np.arange(len(values))[:, None],
+        np.minimum((views >= 0).sum(1)[:, None], counts) - 1,
     ]
 
 

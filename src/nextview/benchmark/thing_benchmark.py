@@ -15,7 +15,12 @@ import msgspec
 import numpy as np
 
 from nextview.benchmark.confusable import how_alike
-from nextview.benchmark.thing_episodes import EPISODE_SPHERE, Occlusion, Setting, ThingEpisode
+from nextview.benchmark.thing_episodes import (
+    EPISODE_SPHERE,
+    Occlusion,
+    Setting,
+    ThingEpisode,
+)
 from nextview.benchmark.thing_policies import THING_POLICIES, policies_of
 from nextview.benchmark.thing_replay import EpisodeRuns, ThingRun, policies_in, run
 from nextview.benchmark.thing_results import write_results
@@ -178,7 +183,9 @@ def benchmark_things(
         models = _taught(scans, out, settings, workers, track)
         things = opened(models)
         if not set(things.names) & set(found):
-            raise DatasetError(f"{scans}: holds no scan of anything that {models} knows")
+            raise DatasetError(
+                f"{scans}: holds no scan of anything that {models} knows"
+            )
         policies_of(settings.policies, things)  # says what is wrong with a name
         _check_same(out, settings, things)
 
@@ -188,7 +195,10 @@ def benchmark_things(
         next(steps)
         track((done for done, _ in steps), len(jobs), "episodes")
 
-        runs = [read_record(job.runs_file, EpisodeRuns, "runs", ResultsError) for job in jobs]
+        runs = [
+            read_record(job.runs_file, EpisodeRuns, "runs", ResultsError)
+            for job in jobs
+        ]
         alike = how_alike(things).of({job.scan_name for job in jobs})
         how = Compared(
             policies_in(runs),
@@ -210,11 +220,17 @@ def _check_place(out: Path) -> None:
         return
     strange = [path.name for path in out.iterdir() if not path.name.startswith(".")]
     if strange:
-        raise ResultsError(f"{out}: holds {strange[0]}, and no results of this benchmark")
+        raise ResultsError(
+            f"{out}: holds {strange[0]}, and no results of this benchmark"
+        )
 
 
 def _taught(
-    scans: Path, out: Path, settings: ThingSettings, workers: int | None, track: TrackProgress
+    scans: Path,
+    out: Path,
+    settings: ThingSettings,
+    workers: int | None,
+    track: TrackProgress,
 ) -> str:
     """The memory of the scans, taught if it is not there."""
     if settings.models is not None:
@@ -236,7 +252,9 @@ def opened(models: str) -> TaughtThings:
     recogniser = TaughtRecogniser(find_models(models).recogniser, threads=1)
     things = TaughtThings.of(recogniser)
     if things is None:
-        raise UsageError(f"{models}: knows the geometry of no thing; teach it with --unit")
+        raise UsageError(
+            f"{models}: knows the geometry of no thing; teach it with --unit"
+        )
     return things
 
 
@@ -266,7 +284,11 @@ def _check_same(out: Path, settings: ThingSettings, things: TaughtThings) -> Non
 
 
 def _jobs(
-    models: str, scans: dict[str, Path], out: Path, settings: ThingSettings, things: TaughtThings
+    models: str,
+    scans: dict[str, Path],
+    out: Path,
+    settings: ThingSettings,
+    things: TaughtThings,
 ) -> list[_Job]:
     """All episodes of a run."""
     setting = Setting(settings.sensor, settings.occlusion, settings.seed)
@@ -305,7 +327,12 @@ def work(job: _Job) -> None:
     chosen = policies_of(job.policies, things)
     folder = job.out / "episodes" / job.name
     episode = ThingEpisode(
-        things, partial(_mesh, job.scan, job.unit), job.thing, job.draw, job.setting, folder
+        things,
+        partial(_mesh, job.scan, job.unit),
+        job.thing,
+        job.draw,
+        job.setting,
+        folder,
     )
     runs: dict[str, list[ThingRun]] = {}
     if job.runs_file.exists():
@@ -324,7 +351,10 @@ def _mesh(scan: Path, unit: str) -> Mesh:
 
 
 def replayed(
-    episode: ThingEpisode, name: str, make: Callable[[ThingEpisode], Policy], job: _Job
+    episode: ThingEpisode,
+    name: str,
+    make: Callable[[ThingEpisode], Policy],
+    job: _Job,
 ) -> list[ThingRun]:
     """The runs of one policy in one episode.
 
@@ -334,6 +364,8 @@ def replayed(
         make: the policy for an episode.
         job: starts, views and rules of all episodes.
     """
-    rng = np.random.default_rng((job.setting.seed, job.thing, job.draw, crc32(name.encode())))
+    rng = np.random.default_rng(
+        (job.setting.seed, job.thing, job.draw, crc32(name.encode()))
+    )
     times = job.repeats if name == "random" else 1
     return [run(episode, make(episode), job.views, rng) for _ in range(times)]

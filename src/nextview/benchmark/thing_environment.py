@@ -12,7 +12,12 @@ import numpy as np
 
 from nextview.benchmark.environments import Rules, rows
 from nextview.benchmark.thing_benchmark import opened
-from nextview.benchmark.thing_episodes import EPISODE_SPHERE, Occlusion, Setting, ThingEpisode
+from nextview.benchmark.thing_episodes import (
+    EPISODE_SPHERE,
+    Occlusion,
+    Setting,
+    ThingEpisode,
+)
 from nextview.checks import extras, whole
 from nextview.errors import DatasetError, SessionError
 from nextview.geometry.mesh import load_mesh
@@ -81,7 +86,9 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
         files = {thing.name: thing.path for thing in find_things(Path(scans)).things}
         missing = [name for name in self.things.names if name not in files]
         if missing:
-            raise DatasetError(f"{scans}: holds no scan of {missing[0]}, which {models} knows")
+            raise DatasetError(
+                f"{scans}: holds no scan of {missing[0]}, which {models} knows"
+            )
 
         setting = Setting(sensor, occlusion, seed)
         self._begin = lru_cache(KEPT_EPISODES)(
@@ -114,7 +121,10 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
         )
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Begin an episode; its first view is not the agent's.
 
@@ -141,13 +151,17 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
 
         return self._observed(), self._info()
 
-    def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+    def step(
+        self,
+        action: Any,
+    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Take a view; what is paid is the change of the objective, less the prices."""
         if self._episode is None or self._over:
             raise SessionError("no episode is under way; call reset")
         here = self._views[-1]
         wanted = cells_from(EPISODE_SPHERE)[
-            here, int(rows(action, 1, len(EPISODE_SPHERE), "action")[0])
+            here,
+            int(rows(action, 1, len(EPISODE_SPHERE), "action")[0]),
         ]
         free = np.ones(len(EPISODE_SPHERE), bool)
         free[self._views] = False
@@ -162,7 +176,13 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
         price = rules.view_price + rules.travel_price * way
         sure = rules.threshold is not None and self._belief.max() >= rules.threshold
         self._over = bool(sure or len(self._views) >= rules.max_views)
-        return self._observed(), self._value - before - price, self._over, False, self._info()
+        return (
+            self._observed(),
+            self._value - before - price,
+            self._over,
+            False,
+            self._info(),
+        )
 
     def _judged(self) -> float:
         """The objective now."""
@@ -179,7 +199,9 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
         count = len(leading.things)
         order = np.argsort(-leading.belief, kind="stable")
         reached = cells_from(EPISODE_SPHERE)[self._views[-1]]
-        cameras = outlook.cameras(EPISODE_SPHERE.directions[[*reached, self._views[-1]]])
+        cameras = outlook.cameras(
+            EPISODE_SPHERE.directions[[*reached, self._views[-1]]]
+        )
 
         belief = np.zeros(MOST_LEADING, np.float32)
         belief[:count] = leading.belief[order]

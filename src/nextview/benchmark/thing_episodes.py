@@ -45,7 +45,10 @@ EPISODE_SPHERE = ViewSphere.named("40")
 NEAREST_SURFACE = 0.25  # metres between the camera and the surface, at least
 USUAL_DISTANCE = 0.45  # metres between the camera and the centre, at most
 RADII_AWAY = 5.0  # of the camera from the centre, between these
-VISIBLE_SHARES = {"half": (0.45, 0.65), "heavy": (0.25, 0.45)}  # means over the viewpoints
+VISIBLE_SHARES = {
+    "half": (0.45, 0.65),
+    "heavy": (0.25, 0.45),
+}  # means over the viewpoints
 FEWEST_BOXES = 3  # around a thing that is partly hidden
 MOST_BOXES = 40
 BOX_LAYOUTS_TRIED = 60  # of boxes; then the one that comes nearest is taken
@@ -165,7 +168,10 @@ class ThingEpisode:
             if f"{name}.seconds" not in self._kept:
                 self._verify(name, sorted(used))
             parts = {f.name: self._kept[f"{name}.{f.name}"] for f in fields(Verified)}
-            self._verified[used] = Verified(**parts), float(self._kept[f"{name}.seconds"])
+            self._verified[used] = (
+                Verified(**parts),
+                float(self._kept[f"{name}.seconds"]),
+            )
         return self._verified[used]
 
     def _verify(self, name: str, views: list[int]) -> None:
@@ -207,7 +213,8 @@ class ThingEpisode:
         points = surface.sample(POSE_ERROR_POINTS, np.random.default_rng(0))
         true = self._kept[f"{seen[-1]}.in_camera"]
         there, here = (
-            points @ each[:3, :3].T + each[:3, 3] for each in (true, np.linalg.inv(camera) @ pose)
+            points @ each[:3, :3].T + each[:3, 3]
+            for each in (true, np.linalg.inv(camera) @ pose)
         )
         return float(1000 * np.mean(cKDTree(there).query(here)[0]))
 
@@ -215,13 +222,17 @@ class ThingEpisode:
         """The true pose, aligned with some views as the hypotheses are, (4, 4)."""
         verifier = self.things.verifier
         true_pose = self._kept["true_pose"]
-        found = [depth_view(self.observation(view), FINE_SIDE) for view in self.seen(views)]
+        found = [
+            depth_view(self.observation(view), FINE_SIDE) for view in self.seen(views)
+        ]
         shown = [view for view in found if view is not None]
         truth = start(np.array([self.thing]), true_pose[None, :3, :3], len(shown))
         centre = verifier.caster.centres[self.thing].astype(np.float64)
         place = true_pose[:3, :3] @ centre + true_pose[:3, 3]
         truth = replace(truth, centres=place[None])
-        return align(verifier.caster, truth, shown, FINE, verifier.prior).poses(verifier.caster)[0]
+        return align(verifier.caster, truth, shown, FINE, verifier.prior).poses(
+            verifier.caster
+        )[0]
 
     def state(self, views: Sequence[int], needs: Sequence[str]) -> EpisodeState:
         """Where the episode stands, as a policy sees it.
@@ -298,7 +309,11 @@ class _Stage:
         in_truth[:3, 3] = -(turn @ mesh.centre + standing.centre)
         around = None
         if setting.occlusion != "none":
-            around = hiding_boxes(standing, VISIBLE_SHARES[setting.occlusion], (*seed, 2))
+            around = hiding_boxes(
+                standing,
+                VISIBLE_SHARES[setting.occlusion],
+                (*seed, 2),
+            )
 
         return cls(standing, around, sensor, (*seed, 7), in_truth)
 
@@ -319,7 +334,11 @@ class _Stage:
         return np.asarray(to_object @ self.in_truth, np.float64)
 
 
-def hiding_boxes(standing: Mesh, wanted: tuple[float, float], seed: tuple[int, ...]) -> Mesh:
+def hiding_boxes(
+    standing: Mesh,
+    wanted: tuple[float, float],
+    seed: tuple[int, ...],
+) -> Mesh:
     """Boxes around a thing that leave a wanted share of it visible.
 
     Args:
@@ -338,7 +357,9 @@ def hiding_boxes(standing: Mesh, wanted: tuple[float, float], seed: tuple[int, .
 
     for _ in range(BOX_LAYOUTS_TRIED):
         boxes = boxes_around(
-            standing.vertices, int(rng.integers(FEWEST_BOXES, MOST_BOXES + 1)), rng
+            standing.vertices,
+            int(rng.integers(FEWEST_BOXES, MOST_BOXES + 1)),
+            rng,
         )
         before = SimulatedCamera(boxes, SHARE_SIDE)
         shares = []
@@ -359,7 +380,11 @@ def _arrays_of(observation: Observation) -> dict[str, NDArray[Any]]:
     """An observation as arrays; "scene" holds nothing where it has none."""
     scene = observation.scene
     radius = np.nan if observation.radius is None else observation.radius
-    numbers = [observation.pose.ravel(), observation.intrinsics.ravel(), np.array([radius])]
+    numbers = [
+        observation.pose.ravel(),
+        observation.intrinsics.ravel(),
+        np.array([radius]),
+    ]
     arrays: dict[str, NDArray[Any]] = {"depth": observation.depth}
     if scene is not None:
         free = np.array([float(scene.background_free)])
@@ -411,7 +436,11 @@ class KeptArrays:
         self._known: dict[str, NDArray[Any]] = {}
         self._new: set[str] = set()
         self._packed: dict[str, Any] = {}
-        files = [] if folder is None or not folder.is_dir() else sorted(folder.glob("*.npz"))
+        files = (
+            []
+            if folder is None or not folder.is_dir()
+            else sorted(folder.glob("*.npz"))
+        )
         for file in files:
             with _unpacked(file):
                 archive = np.load(BytesIO(file.read_bytes()), allow_pickle=False)
@@ -443,12 +472,18 @@ class KeptArrays:
             return
         self._folder.mkdir(parents=True, exist_ok=True)
         number = len(list(self._folder.glob("*.npz")))
+
         with new_file(self._folder / f"{number:06d}.npz") as part:
             archive = zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
             with archive:
                 for name in sorted(self._new):
                     with archive.open(f"{name}.npy", "w") as member:
-                        np.lib.format.write_array(member, self._known[name], allow_pickle=False)
+                        np.lib.format.write_array(
+                            member,
+                            self._known[name],
+                            allow_pickle=False,
+                        )
+
         self._new.clear()
 
 

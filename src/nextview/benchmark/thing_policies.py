@@ -29,7 +29,9 @@ THING_POLICIES = (
     "ceiling",
 )
 CEILINGS = ("foresight", "ceiling")  # they know what no robot does
-TURN_AHEAD = 3  # azimuth steps of the fixed sequence, of 8 a turn: it comes to all of them
+TURN_AHEAD = (
+    3  # azimuth steps of the fixed sequence, of 8 a turn: it comes to all of them
+)
 TRUTH_BELIEF = 0.01  # in the true pose, beside the hypotheses, for the ceiling
 SETTLED_BELIEF = 0.97  # in the truth, after which foresight looks for nothing better
 
@@ -89,11 +91,16 @@ class FairCeiling:
         assert outlook is not None
         others = outlook.hypotheses
         rivals = others.things != self.episode.thing
-        belief = np.append(TRUTH_BELIEF + others.belief[~rivals].sum(), others.belief[rivals])
+        belief = np.append(
+            TRUTH_BELIEF + others.belief[~rivals].sum(),
+            others.belief[rivals],
+        )
         views = np.flatnonzero(state.visited[0]).tolist()
         hypotheses = Hypotheses(
             np.append(self.episode.thing, others.things[rivals]),
-            np.concatenate([self.episode.aligned_truth(views)[None], others.poses[rivals]]),
+            np.concatenate(
+                [self.episode.aligned_truth(views)[None], others.poses[rivals]]
+            ),
             belief / belief.sum(),
         )
         cameras = outlook.cameras(EPISODE_SPHERE.directions)
@@ -101,7 +108,9 @@ class FairCeiling:
         value = expected.found * expected.gain(0)
 
         return best_view(
-            EPISODE_SPHERE, state, value[None] + 1e-9 * rng.random((1, len(EPISODE_SPHERE)))
+            EPISODE_SPHERE,
+            state,
+            value[None] + 1e-9 * rng.random((1, len(EPISODE_SPHERE))),
         )
 
 
@@ -136,7 +145,8 @@ class Foresight:
 
 
 def policies_of(
-    names: tuple[str, ...], things: TaughtThings
+    names: tuple[str, ...],
+    things: TaughtThings,
 ) -> dict[str, Callable[[ThingEpisode], Policy]]:
     """Policies by name, each made for an episode.
 
@@ -161,13 +171,18 @@ def policies_of(
         "ceiling": FairCeiling,
     }
     if "picture" in names:
-        picture = Discriminate.from_card(things.recogniser.card.card_path, EPISODE_SPHERE)
+        picture = Discriminate.from_card(
+            things.recogniser.card.card_path,
+            EPISODE_SPHERE,
+        )
         known["picture"] = lambda _: picture
     for name in names:
         if name in known:
             continue
         if ":" not in name:
-            raise UsageError(f"no policy is called {name}; there are {', '.join(THING_POLICIES)}")
+            raise UsageError(
+                f"no policy is called {name}; there are {', '.join(THING_POLICIES)}"
+            )
         known[name] = _always(make_policy(name, EPISODE_SPHERE))
 
     return {name: known[name] for name in names}

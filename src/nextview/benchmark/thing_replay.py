@@ -48,7 +48,12 @@ class EpisodeRuns(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     runs: dict[str, list[ThingRun]]
 
 
-def run(episode: ThingEpisode, policy: Policy, count: int, rng: np.random.Generator) -> ThingRun:
+def run(
+    episode: ThingEpisode,
+    policy: Policy,
+    count: int,
+    rng: np.random.Generator,
+) -> ThingRun:
     """Take some views as a policy says.
 
     Args:
@@ -62,7 +67,8 @@ def run(episode: ThingEpisode, policy: Policy, count: int, rng: np.random.Genera
     """
     views = [episode.start]
     made: dict[str, list[Any]] = {
-        name: [] for name in ("right", "confidence", "decision", "verification", "pose_error")
+        name: []
+        for name in ("right", "confidence", "decision", "verification", "pose_error")
     }
 
     while True:
@@ -75,7 +81,10 @@ def run(episode: ThingEpisode, policy: Policy, count: int, rng: np.random.Genera
             return ThingRun(views=views, **made)
 
         begun = time.process_time()
-        state = episode.state(views, policy.needs)  # what is foreseen counts as its time
+        state = episode.state(
+            views,
+            policy.needs,
+        )  # what is foreseen counts as its time
         view = int(policy.next_views(state, rng)[0])
         made["decision"].append(time.process_time() - begun)
         if not state.free[0, view]:

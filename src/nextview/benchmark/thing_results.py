@@ -74,7 +74,10 @@ def views_of(tables: ThingTables) -> list[int]:
     return [int(k) for k in tables.measures["views"].unique() if k]
 
 
-def values_of(tables: ThingTables, things: str) -> dict[tuple[str, str, int], tuple[float, ...]]:
+def values_of(
+    tables: ThingTables,
+    things: str,
+) -> dict[tuple[str, str, int], tuple[float, ...]]:
     """Value and interval by policy, measure and views.
 
     Args:
@@ -91,9 +94,21 @@ def markdown(tables: ThingTables) -> str:
     """The tables as Markdown: a table for each group of things, then all tests."""
     parts = []
     for things in groups_of(tables):
-        count = len(tables.alike) if things == ALL else int(tables.alike["confusable"].sum())
+        count = (
+            len(tables.alike)
+            if things == ALL
+            else int(tables.alike["confusable"].sum())
+        )
         title = f"{things.capitalize()} things" if things == ALL else f"The {things}"
-        parts += [f"### {title}", "", f"{count} things", "", *_table(tables, things), ""]
+        parts += [
+            f"### {title}",
+            "",
+            f"{count} things",
+            "",
+            *_table(tables, things),
+            "",
+        ]
+
     parts += ["### Differences to random", "", *_tests(tables), ""]
     return "\n".join(parts)
 
@@ -102,22 +117,40 @@ def _table(tables: ThingTables, things: str) -> list[str]:
     values = values_of(tables, things)
     views = views_of(tables)
     head = ["policy", *(f"right after {k}" for k in views), "views until sure", "sure"]
-    head += ["wrong, of the sure", f"travel to view {views[-1]}, rad", "travel until sure, rad"]
+    head += [
+        "wrong, of the sure",
+        f"travel to view {views[-1]}, rad",
+        "travel until sure, rad",
+    ]
     later = [k for k in views if k > 1]
     head += [f"pose error after {k}, mm: median, 95 %" for k in later]
     head += ["choice, ms of CPU: median, 95 %"]
     lines = [_row(head), "|---" * len(head) + "|"]
     for policy in policies_of_tables(tables):
 
-        def shown(measure: str, k: int = 0, digits: int = 3, policy: str = policy) -> str:
+        def shown(
+            measure: str,
+            k: int = 0,
+            digits: int = 3,
+            policy: str = policy,
+        ) -> str:
             value = values[policy, measure, k][0]
             return "-" if np.isnan(value) else f"{value:.{digits}f}"
 
-        cells = [policy, *(shown("accuracy", k) for k in views), shown("views until sure", 0, 2)]
-        cells += [shown("sure"), shown("wrong, of the sure"), shown("travel, rad", views[-1], 2)]
+        cells = [
+            policy,
+            *(shown("accuracy", k) for k in views),
+            shown("views until sure", 0, 2),
+        ]
+        cells += [
+            shown("sure"),
+            shown("wrong, of the sure"),
+            shown("travel, rad", views[-1], 2),
+        ]
         cells += [shown("travel until sure, rad", 0, 2)]
         cells += [
-            f"{shown('pose error, median', k, 1)}, {shown('pose error, 95 %', k, 1)}" for k in later
+            f"{shown('pose error, median', k, 1)}, {shown('pose error, 95 %', k, 1)}"
+            for k in later
         ]
         spent = (shown("decision, ms, median", 0, 0), shown("decision, ms, 95 %", 0, 0))
         lines.append(_row([*cells, ", ".join(spent)]))
@@ -125,7 +158,14 @@ def _table(tables: ThingTables, things: str) -> list[str]:
 
 
 def _tests(tables: ThingTables) -> list[str]:
-    head = ["things", "policy", "measure", "difference to random", "95 % interval", "p (Holm)"]
+    head = [
+        "things",
+        "policy",
+        "measure",
+        "difference to random",
+        "95 % interval",
+        "p (Holm)",
+    ]
     lines = [_row(head), "|---" * len(head) + "|"]
     row: Any  # a named tuple
     for row in tables.tests.itertuples():
@@ -148,7 +188,9 @@ def latex(tables: ThingTables) -> str:
         "% \\usepackage{booktabs}",
         "\\begin{table}[t]",
         "\\centering\\footnotesize\\setlength{\\tabcolsep}{3.5pt}",
-        "\\caption{Things named right after " + ", ".join(map(str, views)) + " views, \\%, and"
+        "\\caption{Things named right after "
+        + ", ".join(map(str, views))
+        + " views, \\%, and"
         " views until the belief reaches the threshold.}",
         "\\begin{tabular}{@{}l" + "r" * len(views) + "rr@{}}",
         "\\toprule",
@@ -183,7 +225,9 @@ def look_of_policy(policy: str, tables: ThingTables) -> dict[str, Any]:
         policy: its name.
         tables: that name all policies.
     """
-    own = [name for name in policies_of_tables(tables) if name not in THING_POLICY_COLOURS]
+    own = [
+        name for name in policies_of_tables(tables) if name not in THING_POLICY_COLOURS
+    ]
     colour = THING_POLICY_COLOURS.get(policy) or OWN[own.index(policy) % len(OWN)]
     return {"color": colour, "linestyle": ":" if policy in CEILINGS else "-"}
 
@@ -201,7 +245,12 @@ def accuracy_figure(tables: ThingTables) -> Figure:
         x = np.array(views) + (row - len(policies) / 2) * 0.05
         axes.plot(x, numbers[:, 0], marker="o", markersize=3.5, label=policy, **look)
         axes.vlines(
-            x[1:], numbers[1:, 1], numbers[1:, 2], color=look["color"], linewidth=0.8, alpha=0.55
+            x[1:],
+            numbers[1:, 1],
+            numbers[1:, 2],
+            color=look["color"],
+            linewidth=0.8,
+            alpha=0.55,
         )
     axes.set_xticks(views)
     axes.set(xlabel="views", ylabel="named right")
@@ -245,7 +294,9 @@ def difference_figure(tables: ThingTables) -> Figure:
     axes.set_yticks(np.arange(len(policies)), policies)
     axes.grid(axis="y", visible=False)
     axes.tick_params(axis="y", length=0)
-    axes.set_xlabel(f"named right after {at} views, percentage points: difference to random")
+    axes.set_xlabel(
+        f"named right after {at} views, percentage points: difference to random"
+    )
     legend(axes)
 
     return figure

@@ -148,7 +148,10 @@ class _Runs:
         return np.asarray(values[order][first], np.float64)
 
 
-Sampled = dict[tuple[str, int], Float]  # by measure and number of views, a value a sample
+Sampled = dict[
+    tuple[str, int],
+    Float,
+]  # by measure and number of views, a value a sample
 
 
 def _sampled(runs: _Runs, views: tuple[int, ...], drawn: Float) -> Sampled:
@@ -161,18 +164,31 @@ def _sampled(runs: _Runs, views: tuple[int, ...], drawn: Float) -> Sampled:
         found["accuracy", k] = runs.mean(runs.right[:, k - 1], drawn)
         found["travel, rad", k] = runs.mean(runs.travel[:, k - 1], drawn)
         for share, name in ((0.5, "median"), (FAR_END, "95 %")):
-            found[f"pose error, {name}", k] = runs.quantile(runs.pose[:, k - 1], drawn, share)
+            found[f"pose error, {name}", k] = runs.quantile(
+                runs.pose[:, k - 1],
+                drawn,
+                share,
+            )
+
     rows = np.arange(len(runs.things))
     way = runs.travel[rows, runs.until.astype(np.int64) - 1]
     sure = runs.mean(runs.sure, drawn)
     found["views until sure", 0] = runs.mean(runs.until, drawn)
     found["travel until sure, rad", 0] = runs.mean(way, drawn)
     found["sure", 0] = sure
-    found["wrong, of the sure", 0] = runs.mean(runs.wrong, drawn) / np.where(sure > 0, sure, np.nan)
+    found["wrong, of the sure", 0] = runs.mean(runs.wrong, drawn) / np.where(
+        sure > 0,
+        sure,
+        np.nan,
+    )
     return found
 
 
-def summarise_things(runs: Sequence[EpisodeRuns], alike: Alikeness, how: Compared) -> ThingTables:
+def summarise_things(
+    runs: Sequence[EpisodeRuns],
+    alike: Alikeness,
+    how: Compared,
+) -> ThingTables:
     """Compare policies over all things, and over the confusable half of them.
 
     Args:
@@ -205,7 +221,8 @@ def summarise_things(runs: Sequence[EpisodeRuns], alike: Alikeness, how: Compare
 
     return ThingTables(
         pd.DataFrame(
-            rows, columns=["things", "policy", "measure", "views", "value", "low", "high"]
+            rows,
+            columns=["things", "policy", "measure", "views", "value", "low", "high"],
         ),
         _corrected(tests),
         _as_table(alike),
@@ -213,7 +230,12 @@ def summarise_things(runs: Sequence[EpisodeRuns], alike: Alikeness, how: Compare
     )
 
 
-def _drawn(chosen: Mask, names: Sequence[str], how: Compared, rng: np.random.Generator) -> Float:
+def _drawn(
+    chosen: Mask,
+    names: Sequence[str],
+    how: Compared,
+    rng: np.random.Generator,
+) -> Float:
     """How often each thing is drawn in each sample, (1 + S, T); in the first each once."""
     bodies = [name.partition("_")[0] if how.families else name for name in names]
     family = np.unique(np.array(bodies)[chosen], return_inverse=True)[1]
@@ -239,7 +261,10 @@ def _times(runs: _Runs) -> list[tuple]:
     ]
     return [
         (f"{what}, ms, {name}", 0, 1000 * of(times), np.nan, np.nan)
-        for what, times in (("decision", runs.decision), ("verification", runs.verification))
+        for what, times in (
+            ("decision", runs.decision),
+            ("verification", runs.verification),
+        )
         for name, of in quantiles
     ]
 

@@ -13,7 +13,10 @@ from nextview.recognition.map_names import CONFIDENCE, map_name, measure_of
 from nextview.types import Float32
 
 TRUE = "true-"  # how the names of true maps begin
-IN_PREDICTIONS: dict[str, Callable[[Predictions], NDArray]] = {  # (N, V); others: in the store
+IN_PREDICTIONS: dict[
+    str,
+    Callable[[Predictions], NDArray],
+] = {  # (N, V); others: in the store
     "depth_entropy": lambda p: normalise_per_object(p.depth_entropy),
     # 0 where the recogniser is wrong (section 4.1.3)
     CONFIDENCE: lambda p: confidence_maps(p.logits, p.labels),
@@ -33,7 +36,9 @@ def true_map(p: Predictions, name: str) -> Float32:
     measure = measure_of(name)
     known = IN_PREDICTIONS.get(measure)
     values = (
-        normalise_per_object(stored_rows(p, f"measures/{measure}")) if known is None else known(p)
+        normalise_per_object(stored_rows(p, f"measures/{measure}"))
+        if known is None
+        else known(p)
     )
     return values[:, p.sphere.windows]
 
@@ -60,7 +65,11 @@ def true_measure(p: Predictions, measure: str) -> Float32:
     Raises:
         EntryError: the view store is missing, or is another one.
     """
-    return p.depth_entropy if measure == "depth_entropy" else stored_rows(p, f"measures/{measure}")
+    return (
+        p.depth_entropy
+        if measure == "depth_entropy"
+        else stored_rows(p, f"measures/{measure}")
+    )
 
 
 def stored_rows(p: Predictions, name: str) -> NDArray:
@@ -92,7 +101,8 @@ def stored_rows(p: Predictions, name: str) -> NDArray:
                 " needed"
             )
         if not np.array_equal(
-            np.array([store.read("measures/depth_entropy", i) for i in objects]), p.depth_entropy
+            np.array([store.read("measures/depth_entropy", i) for i in objects]),
+            p.depth_entropy,
         ):
             raise EntryError(
                 f"{p.store}: holds other views than those that these predictions were made from"

@@ -38,12 +38,16 @@ def after(paths: Trajectories, n_views: int) -> Outcome:
     """
     fields = ("views", "answers", "confidences", "travel", "arc")
     return truncate(
-        replace(paths, **{name: getattr(paths, name)[:, :n_views] for name in fields}), None
+        replace(paths, **{name: getattr(paths, name)[:, :n_views] for name in fields}),
+        None,
     )
 
 
 def measured(
-    grid: Grid, n_views: Sequence[int], samples: int, references: Sequence[str]
+    grid: Grid,
+    n_views: Sequence[int],
+    samples: int,
+    references: Sequence[str],
 ) -> pd.DataFrame:
     """Compare policies after fixed numbers of views.
 
@@ -68,7 +72,11 @@ def measured(
         if not paths.fixed or paths.views.shape[1] >= max(n_views)
     ]
     references = [name for name in references if name in names]
-    weights = resample(len(grid.specs.predictions), samples, np.random.default_rng([grid.seed, 1]))
+    weights = resample(
+        len(grid.specs.predictions),
+        samples,
+        np.random.default_rng([grid.seed, 1]),
+    )
     rows: list[tuple] = []
 
     for k in n_views:
@@ -76,7 +84,9 @@ def measured(
         right = dict(zip(names, (grid.right(e.answer) for e in ends), strict=True))
         columns = {(name, "accuracy"): r.mean(0) for name, r in right.items()}
         travel = (e.travel.reshape(grid.runs, -1).mean(0) for e in ends)
-        columns |= {(name, "travel"): mean for name, mean in zip(names, travel, strict=True)}
+        columns |= {
+            (name, "travel"): mean for name, mean in zip(names, travel, strict=True)
+        }
 
         for name, reference in product(names, references):
             columns[name, f"to_{reference}"] = (
@@ -95,7 +105,11 @@ def measured(
             )
             rows.append((name, k, measure, value[name, measure], low[i], high[i], p))
 
-        gap = value[CEILING, f"to_{references[0]}"] if CEILING in names and references else 0.0
+        gap = (
+            value[CEILING, f"to_{references[0]}"]
+            if CEILING in names and references
+            else 0.0
+        )
         for name in names:
             share = value[name, f"to_{references[0]}"] / gap if gap > 0 else np.nan
             rows.append((name, k, "share_of_gap", share, np.nan, np.nan, np.nan))
@@ -119,7 +133,9 @@ def as_rows(table: pd.DataFrame) -> pd.DataFrame:
     """The table as it is read: a row a policy, its numbers as text."""
     found = by_key(table)
     n_views = table["n_views"].unique().tolist()
-    references = [m.removeprefix("to_") for m in table["measure"].unique() if m.startswith("to_")]
+    references = [
+        m.removeprefix("to_") for m in table["measure"].unique() if m.startswith("to_")
+    ]
     at = " at " + ", ".join(map(str, n_views))
 
     def difference(name: str, k: int, reference: str) -> str:
@@ -137,7 +153,9 @@ def as_rows(table: pd.DataFrame) -> pd.DataFrame:
             row[f"{k} view{'s' * (k > 1)}"] = "{:.3f} ({:.3f}-{:.3f})".format(
                 *found[name, k, "accuracy"][:3]
             )
-        row[f"travel{at}"] = ", ".join(f"{found[name, k, 'travel'][0]:.2f}" for k in n_views)
+        row[f"travel{at}"] = ", ".join(
+            f"{found[name, k, 'travel'][0]:.2f}" for k in n_views
+        )
         for reference in references:
             over = (
                 ""
@@ -164,5 +182,10 @@ def markdown(rows: pd.DataFrame, left_out: Sequence[str] = ()) -> str:
         The table, and the sentences below it.
     """
     lines = ["| " + " | ".join(rows.columns) + " |", "|---" * len(rows.columns) + "|"]
-    lines += ["| " + " | ".join(map(str, row)) + " |" for row in rows.itertuples(index=False)]
-    return "\n".join([*lines, *(f"\nLeft out: {sentence}" for sentence in left_out)]) + "\n"
+    lines += [
+        "| " + " | ".join(map(str, row)) + " |" for row in rows.itertuples(index=False)
+    ]
+    return (
+        "\n".join([*lines, *(f"\nLeft out: {sentence}" for sentence in left_out)])
+        + "\n"
+    )

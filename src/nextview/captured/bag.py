@@ -44,7 +44,9 @@ RAW = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TF = "tf2_msgs/msg/TFMessage"
-STATIC_TRANSFORMS = "tf_static"  # the end of the name of the topic of transforms that never change
+STATIC_TRANSFORMS = (
+    "tf_static"  # the end of the name of the topic of transforms that never change
+)
 NANOSECONDS = 1e-9
 
 
@@ -81,14 +83,20 @@ def read_bag(
     tree = _transforms(bag)
     camera = first.frame
     if camera not in tree.frames:
-        what = "there is no tf in it" if not tree.frames else f"tf knows {_listed(tree.frames)}"
+        what = (
+            "there is no tf in it"
+            if not tree.frames
+            else f"tf knows {_listed(tree.frames)}"
+        )
         raise DatasetError(
             f"{path}: nothing says where the camera was: tf has no frame {camera!r}, which the"
             f" images are in ({what}); record /tf and /tf_static too"
         )
     world = tree.root(camera) if world_frame is None else world_frame.lstrip("/")
     if world not in tree.frames:
-        raise DatasetError(f"{path}: tf has no frame {world!r}; there are {_listed(tree.frames)}")
+        raise DatasetError(
+            f"{path}: tf has no frame {world!r}; there are {_listed(tree.frames)}"
+        )
 
     notes = [f"depth of {topic.topic}", f"poses of {camera} in {world} by tf"]
     if topic.msgcount > len(images):
@@ -101,7 +109,11 @@ def read_bag(
         notes.append(f"intrinsics of {source}")
 
     # a frame that only carries the camera tells nothing of the vertical
-    views = LayoutViews([], notes, z_is_up=world_frame is not None or tree.moves(camera, world))
+    views = LayoutViews(
+        [],
+        notes,
+        z_is_up=world_frame is not None or tree.moves(camera, world),
+    )
     lost = _add_frames(views, images, tree, world, intrinsics)
     if lost:
         notes.append(f"{lost} images have no pose in tf and are left out")
@@ -142,7 +154,9 @@ class Bag:
         # rows that are still being read: the file cannot be closed before they are
         self._unread: set[Generator[Any, None, None]] = set()
         weakref.finalize(self, _close, self._reader, self._unread)
-        self.connections = [each for each in self._reader.connections if each.msgcount > 0]
+        self.connections = [
+            each for each in self._reader.connections if each.msgcount > 0
+        ]
         self.start = self._reader.start_time
         self.end = self._reader.end_time
 
@@ -152,7 +166,10 @@ class Bag:
         return sorted(found, key=lambda each: each.topic)
 
     def messages(
-        self, connections: Sequence["Connection"], start: int | None = None, stop: int | None = None
+        self,
+        connections: Sequence["Connection"],
+        start: int | None = None,
+        stop: int | None = None,
     ) -> Iterator[tuple["Connection", int, Any]]:
         """Read messages one by one.
 
@@ -262,7 +279,14 @@ def _damage() -> tuple[type[Exception], ...]:
         from rosbags.rosbag2.storage_mcap import zstd
         from rosbags.rosbag2.storage_sqlite3 import apsw
         from rosbags.serde import SerdeError
-    return (*DAMAGED, AssertionError, ReaderError, SerdeError, zstd.ZstdError, apsw.Error)
+    return (
+        *DAMAGED,
+        AssertionError,
+        ReaderError,
+        SerdeError,
+        zstd.ZstdError,
+        apsw.Error,
+    )
 
 
 @contextmanager
@@ -286,8 +310,12 @@ def _depth_topic(bag: Bag, asked: str | None) -> "Connection":
     if asked is not None:
         found = [each for each in topics if each.topic.strip("/") == asked.strip("/")]
         if not found:
-            there = _listed([f"{each.topic} ({encodings[each.topic]})" for each in topics])
-            raise DatasetError(f"{bag.path}: has no images on {asked}; there are {there}")
+            there = _listed(
+                [f"{each.topic} ({encodings[each.topic]})" for each in topics]
+            )
+            raise DatasetError(
+                f"{bag.path}: has no images on {asked}; there are {there}"
+            )
         if encodings[found[0].topic] not in ENCODINGS:
             raise DatasetError(
                 f"{bag.path}: {asked} holds no depth but {encodings[found[0].topic]!r}; depth is"
@@ -298,11 +326,15 @@ def _depth_topic(bag: Bag, asked: str | None) -> "Connection":
     deep = [each for each in topics if encodings[each.topic] in ENCODINGS]
     raw = {each.topic for each in deep if each.msgtype == RAW}
     # the same images as those of another topic
-    deep = [each for each in deep if each.msgtype == RAW or _base(each.topic) not in raw]
+    deep = [
+        each for each in deep if each.msgtype == RAW or _base(each.topic) not in raw
+    ]
     if not deep:
         images = [f"{topic} ({encoding})" for topic, encoding in encodings.items()]
         others = f"; its images are {_listed(images)}" if images else " and no others"
-        raise DatasetError(f"{bag.path}: holds no depth images ({', '.join(ENCODINGS)}){others}")
+        raise DatasetError(
+            f"{bag.path}: holds no depth images ({', '.join(ENCODINGS)}){others}"
+        )
     if len(deep) > 1:
         names = _listed([each.topic for each in deep])
         raise DatasetError(
@@ -315,7 +347,11 @@ def _depth_topic(bag: Bag, asked: str | None) -> "Connection":
 def _encoding(bag: Bag, connection: "Connection") -> str:
     """That of the first image of a topic."""
     message = next(bag.messages([connection]))[2]
-    return compressed_encoding(message) if connection.msgtype == COMPRESSED else message.encoding
+    return (
+        compressed_encoding(message)
+        if connection.msgtype == COMPRESSED
+        else message.encoding
+    )
 
 
 def _base(topic: str) -> str:
@@ -326,12 +362,17 @@ def _base(topic: str) -> str:
 def _sample(bag: Bag, topic: "Connection") -> list[RecordedImage]:
     """Images of a topic, evenly spread in time, at most ``MOST_FRAMES``, in the order of stamps."""
     if topic.msgcount <= MOST_FRAMES:
-        found = [_recorded(bag, topic, time, image) for _, time, image in bag.messages([topic])]
+        found = [
+            _recorded(bag, topic, time, image)
+            for _, time, image in bag.messages([topic])
+        ]
     else:
         # the first image of each of so many parts of the recording
         found = []
         length = bag.end - bag.start
-        edges = [bag.start + length * part // MOST_FRAMES for part in range(MOST_FRAMES + 1)]
+        edges = [
+            bag.start + length * part // MOST_FRAMES for part in range(MOST_FRAMES + 1)
+        ]
         for start, stop in pairwise(edges):
             first = next(bag.messages([topic], start, stop), None)
             if first is not None:
@@ -376,7 +417,14 @@ def _transforms(bag: Bag) -> TransformTree:
             child = each.child_frame_id.lstrip("/")
             parent = each.header.frame_id.lstrip("/")
             position, quaternion = parts_of(each.transform)
-            tree.add(child, parent, seconds(each.header.stamp), position, quaternion, fixed)
+            tree.add(
+                child,
+                parent,
+                seconds(each.header.stamp),
+                position,
+                quaternion,
+                fixed,
+            )
         tree.sort()
     except TransformError as error:
         raise DatasetError(f"{bag.path}: {error}") from None
@@ -407,7 +455,9 @@ def _intrinsics(bag: Bag, topic: str, image: RecordedImage) -> tuple[Float, str]
 
     distorts = bool(np.any(np.asarray(info.d)))
     try:
-        return intrinsics_of(info, rectified=distorts and "rect" in topic), found[0].topic
+        return intrinsics_of(info, rectified=distorts and "rect" in topic), found[
+            0
+        ].topic
     except ObservationError as error:
         raise DatasetError(f"{bag.path}: {found[0].topic}: {error}") from None
 
@@ -419,7 +469,11 @@ def _fits(info: Any, image: RecordedImage) -> bool:
 
 
 def _add_frames(
-    views: LayoutViews, images: list[RecordedImage], tree: TransformTree, world: str, k: Float
+    views: LayoutViews,
+    images: list[RecordedImage],
+    tree: TransformTree,
+    world: str,
+    k: Float,
 ) -> int:
     """Add frames with the poses of some images; returns how many have none."""
     lost = 0

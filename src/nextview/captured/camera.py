@@ -20,8 +20,12 @@ from nextview.types import Float
 
 # the axes of a world that may be called up by name
 UP = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-PIXELS_AROUND_CENTRE = 3  # pixels around the object's centre that tell whether it is hidden
-HIDING_DISTANCE = 1.5  # object radii before its centre from which something else hides it
+PIXELS_AROUND_CENTRE = (
+    3  # pixels around the object's centre that tell whether it is hidden
+)
+HIDING_DISTANCE = (
+    1.5  # object radii before its centre from which something else hides it
+)
 
 
 @dataclass(frozen=True)
@@ -93,7 +97,9 @@ class CapturedCamera:
             self._about = box.object_frame
             return
         self._about = self._find(up, point)
-        masked = self._masked and any(frame.mask is not None for frame in self.capture.frames)
+        masked = self._masked and any(
+            frame.mask is not None for frame in self.capture.frames
+        )
         known_place = None if masked else self._about.centre
         self.object = ObservedObject(self._about.axes[2], known_place, **same)
 
@@ -126,11 +132,15 @@ class CapturedCamera:
                 self.left_out[captured.name] = self.misses[captured.name] = str(error)
                 refuse_many(self.capture, self.misses, self._total)
             else:
-                self.taken.append(TakenView(captured, _degrees_off(captured, asked, found)))
+                self.taken.append(
+                    TakenView(captured, _degrees_off(captured, asked, found))
+                )
                 return frame
 
         why = f" ({min(self.left_out.values())})" if self.left_out else ""
-        raise NoViewLeftError(f"{self.capture.folder}: no view is left that shows the object{why}")
+        raise NoViewLeftError(
+            f"{self.capture.folder}: no view is left that shows the object{why}"
+        )
 
     def refused(self, error: ObservationError) -> None:
         """Say that the last view that answered does not show the object."""
@@ -191,7 +201,9 @@ class CapturedCamera:
             if point is None:
                 return found
             return ObjectFrame(
-                np.asarray(point, np.float64), found.radius, upright_axes(found.axes[2])
+                np.asarray(point, np.float64),
+                found.radius,
+                upright_axes(found.axes[2]),
             )
 
         raise ObservationError(
@@ -201,7 +213,11 @@ class CapturedCamera:
 
 def _degrees_off(frame: CapturedFrame, asked: Float, found: ObjectFrame) -> float:
     """Between the direction asked for and the camera's, from the object."""
-    return float(np.degrees(angle_between(asked, found.axes @ (frame.pose[:3, 3] - found.centre))))
+    return float(
+        np.degrees(
+            angle_between(asked, found.axes @ (frame.pose[:3, 3] - found.centre))
+        )
+    )
 
 
 def _projected(captured: CapturedFrame, point: Float) -> tuple[float, float, float]:
@@ -214,7 +230,8 @@ def _projected(captured: CapturedFrame, point: Float) -> tuple[float, float, flo
 def _near(at: float, size: int) -> slice:
     """Rows or columns around one of them."""
     return slice(
-        max(0, int(at) - PIXELS_AROUND_CENTRE), min(size, int(at) + PIXELS_AROUND_CENTRE + 1)
+        max(0, int(at) - PIXELS_AROUND_CENTRE),
+        min(size, int(at) + PIXELS_AROUND_CENTRE + 1),
     )
 
 

@@ -57,7 +57,9 @@ def read_camera_file(path: Path) -> CameraFile:
         DatasetError: it cannot be read, holds no intrinsics, or those of images that are distorted.
     """
     content = _content(path)
-    inside = [content[name] for name in INSIDE if isinstance(content.get(name), Mapping)]
+    inside = [
+        content[name] for name in INSIDE if isinstance(content.get(name), Mapping)
+    ]
     cameras = [each for each in (content, *inside) if _has_intrinsics(each)]
     if not cameras:
         raise DatasetError(
@@ -73,7 +75,9 @@ def read_camera_file(path: Path) -> CameraFile:
         height = _first(camera, HEIGHTS)
         size = None if not width or not height else (int(width), int(height))
     except (TypeError, ValueError, OverflowError) as error:
-        raise DatasetError(f"{path}: not the intrinsics of a camera ({error})") from None
+        raise DatasetError(
+            f"{path}: not the intrinsics of a camera ({error})"
+        ) from None
 
     if np.any(distortion):
         raise DatasetError(
@@ -95,9 +99,15 @@ def _content(path: Path) -> Mapping[str, Any]:
             content = msgspec.yaml.decode(first)
     except (OSError, UnicodeDecodeError, msgspec.DecodeError, RecursionError) as error:
         phrase = " ".join(str(error).split())
-        raise DatasetError(f"{path}: not the intrinsics of a camera ({phrase})") from None
+        raise DatasetError(
+            f"{path}: not the intrinsics of a camera ({phrase})"
+        ) from None
+
     if not isinstance(content, Mapping):
-        raise DatasetError(f"{path}: holds no fields, so not the intrinsics of a camera")
+        raise DatasetError(
+            f"{path}: holds no fields, so not the intrinsics of a camera"
+        )
+
     return content
 
 

@@ -34,7 +34,11 @@ FEWEST_STANDING = 10  # points of a frame whose middle tells where its object is
 NOT_OBSERVED = 1e-2
 
 
-def find_camera_mistake(views: Sequence[SurfaceView], poses: Float, intrinsics: Float) -> str:
+def find_camera_mistake(
+    views: Sequence[SurfaceView],
+    poses: Float,
+    intrinsics: Float,
+) -> str:
     """Return what is wrong with the camera of some frames, in words; "" if nothing.
 
     Args:
@@ -46,7 +50,10 @@ def find_camera_mistake(views: Sequence[SurfaceView], poses: Float, intrinsics: 
     if 1 - as_read.share < LEAST_CAMERA_CONTRADICTION:
         return ""
     return _flip(views, poses, as_read) or _focal_length(
-        views, poses, as_read, float(intrinsics[0, 0])
+        views,
+        poses,
+        as_read,
+        float(intrinsics[0, 0]),
     )
 
 
@@ -64,7 +71,8 @@ def find_offset(views: Sequence[SurfaceView], poses: Float) -> str:
     offset = _fitted_offset(views, poses)
     distance = float(np.linalg.norm(offset))
     if distance < LEAST_OFFSET or not _explains(
-        compare(views, _moved(poses, offset), sharpness=SHARP), as_read
+        compare(views, _moved(poses, offset), sharpness=SHARP),
+        as_read,
     ):
         return ""
     where = ", ".join(f"{value:+.2f}" for value in offset)
@@ -94,7 +102,10 @@ def _flip(views: Sequence[SurfaceView], poses: Float, as_read: Agreement) -> str
 
 
 def _focal_length(
-    views: Sequence[SurfaceView], poses: Float, as_read: Agreement, given: float
+    views: Sequence[SurfaceView],
+    poses: Float,
+    as_read: Agreement,
+    given: float,
 ) -> str:
     """By how much the focal length, pixels, is wrong, in words; "" if it is not."""
     times = 1.0
@@ -105,7 +116,8 @@ def _focal_length(
 
     wrong = 1 / times - 1
     if abs(wrong) < LEAST_FOCAL_CHANGE or not _explains(
-        _with_focal_length(views, poses, times), as_read
+        _with_focal_length(views, poses, times),
+        as_read,
     ):
         return ""
     what = "long" if wrong > 0 else "short"
@@ -114,7 +126,11 @@ def _focal_length(
     return f"{percent} ({pixels}): are these the intrinsics of another camera or picture size?"
 
 
-def _with_focal_length(views: Sequence[SurfaceView], poses: Float, times: float) -> Agreement:
+def _with_focal_length(
+    views: Sequence[SurfaceView],
+    poses: Float,
+    times: float,
+) -> Agreement:
     changed = [view.with_focal_length(times) for view in views]
     return compare(changed, poses, sharpness=SHARP)
 
@@ -128,12 +144,16 @@ def _moved(poses: Float, offset: Float) -> Float:
 
 def _fitted_offset(views: Sequence[SurfaceView], poses: Float) -> Float:
     """Return the offset along the cameras' axes, (3,), metres, with fewest contradictions."""
-    few = np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_FITTED)).astype(int))
+    few = np.unique(
+        np.linspace(0, len(views) - 1, min(len(views), MOST_FITTED)).astype(int)
+    )
     some = [views[i] for i in few]
 
     def contradicted(offset: Float) -> float:
         moved = _moved(poses[few], offset)
-        return 2 - compare(some, moved).share - compare(some, moved, sharpness=SHARP).share
+        return (
+            2 - compare(some, moved).share - compare(some, moved, sharpness=SHARP).share
+        )
 
     start = min((_offset_of_middles(views, poses), np.zeros(3)), key=contradicted)
     simplex = start + np.vstack([np.zeros(3), FIRST_STEP * np.eye(3)])
@@ -161,7 +181,12 @@ def _offset_of_middles(views: Sequence[SurfaceView], poses: Float) -> Float:
             rotation = pose[:3, :3]
             matrix.append(np.hstack([np.eye(3), -rotation]))
             middles.append(rotation @ np.median(points, axis=0) + pose[:3, 3])
+
     if len(matrix) < 2:
         return np.zeros(3)
-    solution = np.linalg.lstsq(np.vstack(matrix), np.concatenate(middles), rcond=NOT_OBSERVED)[0]
+    solution = np.linalg.lstsq(
+        np.vstack(matrix),
+        np.concatenate(middles),
+        rcond=NOT_OBSERVED,
+    )[0]
     return solution[3:]

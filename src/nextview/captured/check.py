@@ -16,19 +16,34 @@ from nextview.captured.pose_mistakes import (
 )
 from nextview.captured.shifted_poses import Shift, find_shifts
 from nextview.errors import DatasetError, ObservationError
-from nextview.sensing.agreement import SHARP, Agreement, SurfaceView, compare, surface_view
+from nextview.sensing.agreement import (
+    SHARP,
+    Agreement,
+    SurfaceView,
+    compare,
+    surface_view,
+)
 from nextview.sensing.frame import Frame
 
-MOST_COMPARED_FRAMES = 60  # frames of a capture that are compared with each other, evenly spread
+MOST_COMPARED_FRAMES = (
+    60  # frames of a capture that are compared with each other, evenly spread
+)
 MOST_REFUSED = 0.1  # share of the frames that may be left out; a single one always may
 CONTRADICTED_SHARE = 0.5  # a frame of which less is confirmed contradicts the others
-CONTRADICTED_SHARPLY = 0.3  # the same, looked at sharply, if it is also so many times what is usual
+CONTRADICTED_SHARPLY = (
+    0.3  # the same, looked at sharply, if it is also so many times what is usual
+)
 TIMES_USUAL = 4.0
 # share of what stands on the plane that is contradicted where frames disagree altogether
 CONTRADICTED_IN_ALL = 0.3
 FEWEST_TO_BLAME = 5  # frames of which one may be blamed if they disagree
-PLAUSIBLE_DEPTH = (0.05, 15.0)  # metres that a capture of an object may have as its median depth
-NEVER_A_DEPTH = 25  # times by which a depth scale is hardly ever wrong, and a unit of length often
+PLAUSIBLE_DEPTH = (
+    0.05,
+    15.0,
+)  # metres that a capture of an object may have as its median depth
+NEVER_A_DEPTH = (
+    25  # times by which a depth scale is hardly ever wrong, and a unit of length often
+)
 NAMED_FRAMES = 3  # frames that are named in a sentence; of others the number is told
 DEPTH_SOURCES = {
     "BOP": "depth_scale in scene_camera.json",
@@ -38,7 +53,10 @@ DEPTH_SOURCES = {
 }
 
 
-def check_capture(capture: Capture, masked: bool = True) -> tuple[Capture, dict[str, str]]:
+def check_capture(
+    capture: Capture,
+    masked: bool = True,
+) -> tuple[Capture, dict[str, str]]:
     """Find out which frames of a capture can be used, and whether their poses fit together.
 
     Args:
@@ -93,15 +111,21 @@ def summary(refused: Mapping[str, str]) -> str:
     if len(names) > NAMED_FRAMES:
         listed += f" and {len(names) - NAMED_FRAMES} more"
     others = len(refused) - len(names)
-    return f"{listed}: {commonest}" + (f"; {others} for other reasons" if others else "")
+    return f"{listed}: {commonest}" + (
+        f"; {others} for other reasons" if others else ""
+    )
 
 
 def _read_some(
-    capture: Capture, masked: bool, refused: dict[str, str]
+    capture: Capture,
+    masked: bool,
+    refused: dict[str, str],
 ) -> tuple[np.ndarray, list[Frame]]:
     """Read frames that are spread evenly; those that cannot be read are added to ``refused``."""
     count = len(capture.frames)
-    spread = np.unique(np.linspace(0, count - 1, min(count, MOST_COMPARED_FRAMES)).astype(int))
+    spread = np.unique(
+        np.linspace(0, count - 1, min(count, MOST_COMPARED_FRAMES)).astype(int)
+    )
     indices = []
     frames = []
 
@@ -130,7 +154,11 @@ def _read(captured: CapturedFrame, masked: bool) -> Frame | None:
         return None
 
 
-def _contradicting(capture: Capture, compared: np.ndarray, frames: list[Frame]) -> dict[str, str]:
+def _contradicting(
+    capture: Capture,
+    compared: np.ndarray,
+    frames: list[Frame],
+) -> dict[str, str]:
     """Frames that contradict the others and why; DatasetError if it is not only a few."""
     rng = np.random.default_rng(0)
     views = [surface_view(frame, rng) for frame in frames]
@@ -140,7 +168,9 @@ def _contradicting(capture: Capture, compared: np.ndarray, frames: list[Frame]) 
 
     mistake = find_mistake(posed, compare(views, posed.as_read()))
     if mistake is not None:
-        depth = float(np.median([np.median(v.points[:, 2]) for v in views if len(v.points)]))
+        depth = float(
+            np.median([np.median(v.points[:, 2]) for v in views if len(v.points)])
+        )
         raise _disagree(capture, _in_words(capture, mistake, depth, unit))
     looks = find_camera_mistake(views, posed.as_read(), capture.frames[0].intrinsics)
     if looks:
@@ -153,7 +183,8 @@ def _contradicting(capture: Capture, compared: np.ndarray, frames: list[Frame]) 
         late[shift.first : shift.end] = True
     if late.sum() > most:
         raise _disagree(
-            capture, " and ".join(_shift_in_words(capture, compared, shift) for shift in shifts)
+            capture,
+            " and ".join(_shift_in_words(capture, compared, shift) for shift in shifts),
         )
     refused = _late_frames(capture, compared, shifts)
 
@@ -166,7 +197,9 @@ def _contradicting(capture: Capture, compared: np.ndarray, frames: list[Frame]) 
     if too_many or (len(left) > 1 and _disagreeing(evidence, left)):
         looks = find_offset(views, posed.as_read())
         raise (
-            _disagree(capture, looks) if looks else _unexplained(capture, compared[kept], evidence)
+            _disagree(capture, looks)
+            if looks
+            else _unexplained(capture, compared[kept], evidence)
         )
 
     for i, share in blamed.items():
@@ -229,7 +262,10 @@ def _to_blame(evidence: PoseEvidence) -> dict[int, float]:
         pairs = kept[:, None] & kept
         share = np.ones(len(kept))
         for rough in (evidence.all, evidence.standing):
-            share = np.minimum(share, np.where(kept, _enough_judged(rough.among(pairs)), 1.0))
+            share = np.minimum(
+                share,
+                np.where(kept, _enough_judged(rough.among(pairs)), 1.0),
+            )
         sharp = np.where(kept, _enough_judged(evidence.sharp.among(pairs)), 1.0)
         usual = float(np.median(1 - sharp[kept]))
         outlier = 1 - sharp > max(CONTRADICTED_SHARPLY, TIMES_USUAL * usual)
@@ -261,7 +297,11 @@ def _disagreeing(evidence: PoseEvidence, left: np.ndarray) -> bool:
     return first > 0 and 1 - _across(standing, first).share > CONTRADICTED_IN_ALL
 
 
-def _unexplained(capture: Capture, compared: np.ndarray, evidence: PoseEvidence) -> DatasetError:
+def _unexplained(
+    capture: Capture,
+    compared: np.ndarray,
+    evidence: PoseEvidence,
+) -> DatasetError:
     """The error where the frames contradict each other, and no usual mistake explains it."""
     contradicted = 1 - min(evidence.all.share, evidence.standing.share)
     problem = f"its frames do not agree about one rigid object ({contradicted:.0%} of what they "
@@ -291,7 +331,10 @@ def _break(agreement: Agreement) -> int:
 
         wrong_across = 1 - across.share
         wrong_within = 1 - within.share
-        if wrong_across > TIMES_USUAL * wrong_within and wrong_across - wrong_within > largest:
+        if (
+            wrong_across > TIMES_USUAL * wrong_within
+            and wrong_across - wrong_within > largest
+        ):
             largest = wrong_across - wrong_within
             best = first
     return best
@@ -303,7 +346,11 @@ def _across(agreement: Agreement, first: int) -> Agreement:
     return agreement.among(later[:, None] != later)
 
 
-def _late_frames(capture: Capture, compared: np.ndarray, shifts: Sequence[Shift]) -> dict[str, str]:
+def _late_frames(
+    capture: Capture,
+    compared: np.ndarray,
+    shifts: Sequence[Shift],
+) -> dict[str, str]:
     """Return frames with the poses of others, and why they are left out."""
     refused = {}
     for shift in shifts:
@@ -353,7 +400,8 @@ def _scale_in_words(capture: Capture, scale: float, depth: float, unit: float) -
     times = scale if scale > 1 else 1 / scale
     step = 1000 * capture.frames[0].scale
     depths = (
-        f"the depth is {times:g} times too {'large' if scale > 1 else 'small'}: its steps are of "
+        f"the depth is {times:g} times too {'large' if scale > 1 else 'small'}: "
+        "its steps are of "
     )
     source = DEPTH_SOURCES.get(capture.layout, "in its files")
     if capture.scale_given:

@@ -59,7 +59,11 @@ def is_depth_folder(folder: Path) -> bool:
     return next(folder.glob("depth/*.png"), None) is not None
 
 
-def read_depth_folder(folder: Path, intrinsics: Float | None, scale: float | None) -> LayoutViews:
+def read_depth_folder(
+    folder: Path,
+    intrinsics: Float | None,
+    scale: float | None,
+) -> LayoutViews:
     """Read the poses and the intrinsics of a folder of depth images.
 
     Args:
@@ -94,13 +98,24 @@ def read_depth_folder(folder: Path, intrinsics: Float | None, scale: float | Non
             colour = None  # not registered to the depth
         pose = poses[path.stem]
         views.frames.append(
-            CapturedFrame(path.stem, depth, scale, camera.intrinsics, pose, mask, colour)
+            CapturedFrame(
+                path.stem,
+                depth,
+                scale,
+                camera.intrinsics,
+                pose,
+                mask,
+                colour,
+            )
         )
     return views
 
 
 def read_depth_image(
-    path: Path, intrinsics: Float | None, scale: float | None, camera_file: Any = None
+    path: Path,
+    intrinsics: Float | None,
+    scale: float | None,
+    camera_file: Any = None,
 ) -> LayoutViews:
     """A single depth image: its camera is the world.
 
@@ -118,8 +133,14 @@ def read_depth_image(
             f"{path}: the intrinsics of its camera are missing: give --intrinsics FX FY CX CY, or a"
             " file with them"
         )
-    if scale is None and isinstance(camera_file, str | Path) and Path(camera_file).suffix != ".txt":
+
+    if (
+        scale is None
+        and isinstance(camera_file, str | Path)
+        and Path(camera_file).suffix != ".txt"
+    ):
         scale = read_camera_file(Path(camera_file)).scale
+
     if scale is None:
         raise DatasetError(f"{path}: {ASK_FOR_SCALE}")
     frame = CapturedFrame(path.stem, DepthFile(path), scale, intrinsics, np.eye(4))
@@ -141,8 +162,15 @@ def _camera(folder: Path, intrinsics: Float | None) -> tuple[CameraFile, list[st
         matrix = read_table(tables[0], "the pinhole matrix", 3)
         return CameraFile(matrix, None, None), [f"intrinsics of {tables[0].name}"]
 
-    others = [path.name for path in folder.iterdir() if path.suffix in (".json", ".yaml", ".yml")]
-    near = next((did_you_mean(name, CAMERA_FILES) for name in others), "").replace("?", "")
+    others = [
+        path.name
+        for path in folder.iterdir()
+        if path.suffix in (".json", ".yaml", ".yml")
+    ]
+    near = next((did_you_mean(name, CAMERA_FILES) for name in others), "").replace(
+        "?",
+        "",
+    )
     raise DatasetError(
         f"{folder}: the intrinsics of the depth camera are missing: give --intrinsics FX FY CX CY"
         f" or a file, or put {CAMERA_FILES[0]} or {CAMERA_FILES[3]} into the folder{near}"
@@ -160,7 +188,10 @@ def _check_size(depth: DepthFile, camera: CameraFile, folder: Path) -> None:
         )
 
 
-def _poses(folder: Path, names: list[str]) -> tuple[dict[str, Float], dict[str, str], str]:
+def _poses(
+    folder: Path,
+    names: list[str],
+) -> tuple[dict[str, Float], dict[str, str], str]:
     """Poses of images by their names, why others cannot be read, and a note of where they are."""
     for inside in POSES:
         if next(folder.glob(f"{inside}/*.txt"), None):
@@ -182,7 +213,10 @@ def _poses(folder: Path, names: list[str]) -> tuple[dict[str, Float], dict[str, 
     )
 
 
-def _pose_files(folder: Path, names: list[str]) -> tuple[dict[str, Float], dict[str, str]]:
+def _pose_files(
+    folder: Path,
+    names: list[str],
+) -> tuple[dict[str, Float], dict[str, str]]:
     """Poses of a file for each image."""
     poses = {}
     unreadable = {}
@@ -227,7 +261,8 @@ def _log(path: Path) -> list[Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"{path}: cannot be read as text ({error})") from None
     if len(lines) % LINES_OF_A_POSE or any(
-        len(line) != (3 if n % LINES_OF_A_POSE == 0 else 4) for n, line in enumerate(lines)
+        len(line) != (3 if n % LINES_OF_A_POSE == 0 else 4)
+        for n, line in enumerate(lines)
     ):
         raise DatasetError(f"{path}: not a log of poses, five lines each (Open3D)")
     return [
@@ -237,11 +272,15 @@ def _log(path: Path) -> list[Any]:
 
 
 def _in_order(
-    path: Path, matrices: list[Any], names: list[str]
+    path: Path,
+    matrices: list[Any],
+    names: list[str],
 ) -> tuple[dict[str, Float], dict[str, str]]:
     """Poses that stand in the order of the images."""
     if len(matrices) != len(names):
-        raise DatasetError(f"{path}: holds {len(matrices)} poses for {len(names)} depth images")
+        raise DatasetError(
+            f"{path}: holds {len(matrices)} poses for {len(names)} depth images"
+        )
     poses = {}
     unreadable = {}
     for name, matrix in zip(names, matrices, strict=True):
@@ -254,7 +293,9 @@ def _in_order(
 
 def _beside(folder: Path, inside: tuple[str, ...], name: str) -> Path | None:
     """The picture of an image's name in one of some folders, if there is one."""
-    paths = (folder / each / f"{name}{ending}" for each in inside for ending in IMAGE_ENDINGS)
+    paths = (
+        folder / each / f"{name}{ending}" for each in inside for ending in IMAGE_ENDINGS
+    )
     return next((path for path in paths if path.exists()), None)
 
 
@@ -263,4 +304,6 @@ def _same_size(picture: Path, depth: DepthFile) -> bool:
         with Image.open(picture, formats=("PNG", "JPEG")) as image:
             return image.size == depth.size
     except (*DAMAGED, Image.DecompressionBombError) as error:
-        raise DatasetError(f"{picture}: the image is damaged or cannot be read ({error})") from None
+        raise DatasetError(
+            f"{picture}: the image is damaged or cannot be read ({error})"
+        ) from None

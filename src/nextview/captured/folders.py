@@ -17,7 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from nextview.captured.bag import is_bag, read_bag
 from nextview.captured.camera_file import read_camera_file
-from nextview.captured.depth_folder import is_depth_folder, read_depth_folder, read_depth_image
+from nextview.captured.depth_folder import (
+    is_depth_folder,
+    read_depth_folder,
+    read_depth_image,
+)
 from nextview.captured.frames import (
     MILLIMETRES,
     Capture,
@@ -40,11 +44,15 @@ from nextview.types import Float
 # the pinhole matrix in a folder of TUM or 7-Scenes, as in 3DMatch
 INTRINSICS = "camera-intrinsics.txt"
 TUM_STEP = 1 / 5000  # metres that one step of TUM's depth images stands for
-STAMP_DIFFERENCE = 0.02  # seconds that an image and its pose, or depth and colour, may be apart
+STAMP_DIFFERENCE = (
+    0.02  # seconds that an image and its pose, or depth and colour, may be apart
+)
 MOST_LOST = 0.1  # share of the lines of a trajectory that may hold no pose
 # fx, fy, cx, cy of the depth camera of 7-Scenes, for all of its scenes
 KINECT = (585.0, 585.0, 320.0, 240.0)
-LARGEST_SCALE = 0.05  # metres that a step of a depth image may stand for; a float image has 1
+LARGEST_SCALE = (
+    0.05  # metres that a step of a depth image may stand for; a float image has 1
+)
 ThreeNumbers = Annotated[list[float], Meta(min_length=3, max_length=3)]
 Nine = Annotated[list[float], Meta(min_length=9, max_length=9)]
 # as given by hand, see ``read_capture``
@@ -164,7 +172,11 @@ def _layout_of(path: Path) -> str:
 
 def _layouts_in(folder: Path) -> list[str]:
     """The layouts whose marks a folder has."""
-    return [layout for layout, files in LAYOUT_MARKS.items() if next(folder.glob(files), None)]
+    return [
+        layout
+        for layout, files in LAYOUT_MARKS.items()
+        if next(folder.glob(files), None)
+    ]
 
 
 def _check_scale(scale: float) -> None:
@@ -175,7 +187,11 @@ def _check_scale(scale: float) -> None:
     """
     number(scale, "the depth scale, in metres,", above=0)
     if scale > LARGEST_SCALE and scale != 1:
-        steps = f"{scale:g} steps a metre are {1 / scale:g}" if scale > 50 else "0.001: millimetres"
+        steps = (
+            f"{scale:g} steps a metre are {1 / scale:g}"
+            if scale > 50
+            else "0.001: millimetres"
+        )
         raise UsageError(
             f"the depth scale is what one step of the image stands for in metres ({steps}), not"
             f" {scale:g}"
@@ -197,7 +213,9 @@ def _check_links(folder: Path) -> None:
     inside = os.path.realpath(folder)
     for path in folder.rglob("*"):
         # Not Path.resolve, which raises where links go round in a circle.
-        if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(inside):
+        if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(
+            inside
+        ):
             raise DatasetError(
                 f"{path}: is a link out of this folder; put what it points to in its place"
             )
@@ -218,7 +236,8 @@ def _given_intrinsics(path: Path, given: Intrinsics) -> tuple[Float | None, list
 def _no_capture(folder: Path) -> str:
     """Why a folder is no capture: it may be one of meshes."""
     if mesh := next(
-        (f for f in islice(folder.rglob("*"), 1000) if f.suffix.lower() in FORMATS), None
+        (f for f in islice(folder.rglob("*"), 1000) if f.suffix.lower() in FORMATS),
+        None,
     ):
         look = f"recognise one of them ({mesh}), or teach it them: nextview learn {folder} OUT"
         return f"{folder}: is a folder of meshes, not of captured views; {look}"
@@ -282,11 +301,19 @@ def _read_bop(folder: Path, intrinsics: Float | None, how: Reading) -> LayoutVie
     object_id = how.object_id
     path = folder / "scene_camera.json"
     truth = folder / "scene_gt.json"
-    cameras = read_record(path, dict[int, _Camera], "the cameras of a BOP scene", DatasetError)
+    cameras = read_record(
+        path,
+        dict[int, _Camera],
+        "the cameras of a BOP scene",
+        DatasetError,
+    )
     all_objects: dict[int, list[_Object]] = {}
     if truth.exists():
         all_objects = read_record(
-            truth, dict[int, list[_Object]], "the objects of a BOP scene", DatasetError
+            truth,
+            dict[int, list[_Object]],
+            "the objects of a BOP scene",
+            DatasetError,
         )
     numbers = sorted({one.obj_id for many in all_objects.values() for one in many})
     named = ", ".join(map(str, numbers))
@@ -297,7 +324,9 @@ def _read_bop(folder: Path, intrinsics: Float | None, how: Reading) -> LayoutVie
 
     notes = ["intrinsics of scene_camera.json"] if intrinsics is None else []
     if single is None and numbers:
-        notes.append(f"objects {named}: name one with --object-id, and its masks are used")
+        notes.append(
+            f"objects {named}: name one with --object-id, and its masks are used"
+        )
 
     views = LayoutViews([], notes)
     from_model = False
@@ -326,19 +355,28 @@ def _read_bop(folder: Path, intrinsics: Float | None, how: Reading) -> LayoutVie
         k = np.reshape(camera.cam_K, (3, 3)) if intrinsics is None else intrinsics
         mask = _bop_mask(folder, name, here) if len(here) == 1 or not numbers else None
         files = (f"rgb/{name}.png", f"rgb/{name}.jpg", f"gray/{name}.png")
-        image = next((folder / file for file in files if (folder / file).exists()), None)
+        image = next(
+            (folder / file for file in files if (folder / file).exists()),
+            None,
+        )
         depth = DepthFile(folder / f"depth/{name}.png")
         step = camera.depth_scale * MILLIMETRES
         views.frames.append(CapturedFrame(name, depth, step, k, pose, mask, image))
     if from_model:
-        notes.append("there are no camera poses: the world is the object's model in scene_gt.json")
+        notes.append(
+            "there are no camera poses: the world is the object's model in scene_gt.json"
+        )
         views.object_is_world = True
     if any(frame.mask for frame in views.frames):
         notes.append("masks of mask_visib")
     return views
 
 
-def _from_world_to_camera(rotation: list[float], translation: list[float], where: str) -> Float:
+def _from_world_to_camera(
+    rotation: list[float],
+    translation: list[float],
+    where: str,
+) -> Float:
     """Convert BOP's world-to-camera transform to a camera-to-world pose."""
     pose = np.eye(4)
     pose[:3, :3] = np.reshape(rotation, (3, 3)).T
@@ -358,7 +396,9 @@ def _read_tum(folder: Path, intrinsics: Float | None, _: Reading) -> LayoutViews
     times, depths = _images(folder / "depth.txt")
     moments, poses, bad_lines = _trajectory(folder / "groundtruth.txt")
     colour_times, colours = (
-        _images(folder / "rgb.txt") if (folder / "rgb.txt").exists() else (np.zeros(0), [])
+        _images(folder / "rgb.txt")
+        if (folder / "rgb.txt").exists()
+        else (np.zeros(0), [])
     )
 
     frames = []
@@ -367,10 +407,18 @@ def _read_tum(folder: Path, intrinsics: Float | None, _: Reading) -> LayoutViews
         colour = _nearest(time, colour_times)
         mask = folder / "mask" / depth.name
         if at is not None:
-            beside = mask if mask.exists() else None, None if colour is None else colours[colour]
+            beside = (
+                mask if mask.exists() else None,
+                None if colour is None else colours[colour],
+            )
             frames.append(
                 CapturedFrame(
-                    depth.stem, DepthFile(depth), TUM_STEP, intrinsics, poses[at], *beside
+                    depth.stem,
+                    DepthFile(depth),
+                    TUM_STEP,
+                    intrinsics,
+                    poses[at],
+                    *beside,
                 )
             )
 
@@ -383,7 +431,9 @@ def _read_tum(folder: Path, intrinsics: Float | None, _: Reading) -> LayoutViews
 
     notes = []
     if bad_lines:
-        notes.append(f"{bad_lines} lines of groundtruth.txt hold no pose and are left out")
+        notes.append(
+            f"{bad_lines} lines of groundtruth.txt hold no pose and are left out"
+        )
     if lost := len(times) - len(frames):
         notes.append(
             f"{lost} depth images have no pose within {STAMP_DIFFERENCE} s and are left out"
@@ -391,7 +441,11 @@ def _read_tum(folder: Path, intrinsics: Float | None, _: Reading) -> LayoutViews
     return LayoutViews(frames, notes)
 
 
-def _read_seven_scenes(folder: Path, intrinsics: Float | None, _: Reading) -> LayoutViews:
+def _read_seven_scenes(
+    folder: Path,
+    intrinsics: Float | None,
+    _: Reading,
+) -> LayoutViews:
     """Views by frame-*.depth.png and .pose.txt, and masks in .mask.png.
 
     The colour images are not registered.
@@ -434,14 +488,20 @@ BAG = "ROS 2 bag"
 def _nearest(time: float, others: Float) -> int | None:
     """Return which of other times, (N,) seconds, is nearest, if it is near enough."""
     gaps = np.abs(others - time)
-    return int(gaps.argmin()) if len(gaps) and gaps.min() <= STAMP_DIFFERENCE + 1e-6 else None
+    return (
+        int(gaps.argmin())
+        if len(gaps) and gaps.min() <= STAMP_DIFFERENCE + 1e-6
+        else None
+    )
 
 
 def _images(path: Path) -> tuple[Float, list[Path]]:
     """Times, (N,) seconds, and the images beside the list."""
     lines = lines_of(path, 2, "times and names of images")
     for outside in (
-        word for _, word in lines if Path(word).is_absolute() or ".." in Path(word).parts
+        word
+        for _, word in lines
+        if Path(word).is_absolute() or ".." in Path(word).parts
     ):
         raise DatasetError(f"{path}: {outside} is no file of this folder")
     return numbers_of(path, [line[:1] for line in lines])[:, 0], [
@@ -472,7 +532,12 @@ FOLDER_LAYOUTS: dict[str, Callable[[Path, Float | None, Reading], LayoutViews]] 
     "TUM RGB-D": _read_tum,
     "7-Scenes": _read_seven_scenes,
     DEPTH_FOLDER: lambda path, k, how: read_depth_folder(path, k, how.depth_scale),
-    ONE_IMAGE: lambda path, k, how: read_depth_image(path, k, how.depth_scale, how.intrinsics),
+    ONE_IMAGE: lambda path, k, how: read_depth_image(
+        path,
+        k,
+        how.depth_scale,
+        how.intrinsics,
+    ),
     BAG: lambda path, k, how: read_bag(path, k, how.depth_topic, how.world_frame),
 }
 """What reads the views of each layout."""

@@ -125,7 +125,8 @@ class CapturedFrame:
         middle = float(np.median(measured)) if len(measured) else NEAREST_MEDIAN
         if not NEAREST_MEDIAN <= middle <= LARGEST_MEDIAN:
             what = (
-                f"the depth has a median of {middle:.3g} m with steps of {1000 * self.scale:.3g} mm"
+                f"the depth has a median of {middle:.3g} m with "
+                f"steps of {1000 * self.scale:.3g} mm"
             )
             raise ObservationError(f"{self.depth}: {what}: the depth scale is wrong")
 
@@ -213,14 +214,19 @@ def lines_of(path: Path, columns: int, what: str) -> list[list[str]]:
     """
     regular_file(path, f"a list of {what}", DatasetError, LARGEST_TEXT)
     try:
-        lines = [(n, line.split()) for n, line in enumerate(path.read_text().splitlines(), 1)]
+        lines = [
+            (n, line.split()) for n, line in enumerate(path.read_text().splitlines(), 1)
+        ]
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"{path}: cannot be read as text ({error})") from None
+
     lines = [(n, words) for n, words in lines if words and not words[0].startswith("#")]
+
     for n, words in ((n, words) for n, words in lines if len(words) != columns):
         raise DatasetError(
             f"{path}: line {n} has {len(words)} words; it lists {what}, {columns} words a line"
         )
+
     if not lines:
         raise DatasetError(f"{path}: lists nothing; it should list {what}")
     return [words for _, words in lines]
@@ -291,7 +297,9 @@ def _opened_as(path: Path, shape: tuple[int, ...]) -> Image.Image:
             f" {shape[0]}"
         )
     if image.mode in DEEP:
-        raise DatasetError(f"{path}: has 16 bits where 8 are expected; is it a depth image?")
+        raise DatasetError(
+            f"{path}: has 16 bits where 8 are expected; is it a depth image?"
+        )
     return image
 
 
@@ -303,4 +311,6 @@ def _open(path: Path, formats: tuple[str, ...], load: bool = True) -> Image.Imag
                 image.load()
             return image  # its file is closed, its pixels stay
     except (*DAMAGED, Image.DecompressionBombError) as error:
-        raise DatasetError(f"{path}: the image is damaged or cannot be read ({error})") from None
+        raise DatasetError(
+            f"{path}: the image is damaged or cannot be read ({error})"
+        ) from None

@@ -95,18 +95,26 @@ def depth_of_compressed(message: Any) -> NDArray[Any]:
             mode = png.mode
             steps = np.asarray(png).astype(np.uint16)
     except (*DAMAGED, Image.DecompressionBombError) as error:
-        raise ObservationError(f"the compressed depth image is damaged ({error})") from None
+        raise ObservationError(
+            f"the compressed depth image is damaged ({error})"
+        ) from None
     if mode not in DEEP:
-        raise ObservationError(f"a compressed depth image has 16 bits, this one has mode {mode}")
+        raise ObservationError(
+            f"a compressed depth image has 16 bits, this one has mode {mode}"
+        )
     if ENCODINGS[encoding] == np.uint16:
         return steps
 
     if start != DEPTH_HEADER.size:
-        raise ObservationError("a compressed image of floats has a header, this one has none")
+        raise ObservationError(
+            "a compressed image of floats has a header, this one has none"
+        )
     _, scale, offset = DEPTH_HEADER.unpack_from(data)
     inverse = steps.astype(np.float32) - np.float32(offset)
     near = (steps > 0) & (inverse > 0)
-    return np.where(near, np.float32(scale) / np.where(near, inverse, 1), 0).astype(np.float32)
+    return np.where(near, np.float32(scale) / np.where(near, inverse, 1), 0).astype(
+        np.float32
+    )
 
 
 def intrinsics_of(info: Any, rectified: bool = False) -> Float:

@@ -6,12 +6,18 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nextview.captured.shifted_poses import FEWER_CONTRADICTIONS, LEAST_OVERLAP, relative_change
+from nextview.captured.shifted_poses import (
+    FEWER_CONTRADICTIONS,
+    LEAST_OVERLAP,
+    relative_change,
+)
 from nextview.sensing.agreement import Agreement, SurfaceView, compare
 from nextview.sensing.frame import CAMERA_AXES
 from nextview.types import Float, Index
 
-FEWEST_JUDGED = 100  # points that two frames or more have to share before anything is said
+FEWEST_JUDGED = (
+    100  # points that two frames or more have to share before anything is said
+)
 CERTAIN_SHARE = 0.99  # share of confirmed points from which no mistake is searched for
 # a mistake is named if FEWER_CONTRADICTIONS are left without it, of at least this share of the
 # points that it concerns
@@ -95,7 +101,11 @@ def find_mistake(posed: Posed, as_read: Agreement) -> PoseMistake | None:
     return _best(posed, as_read, single) or _best(posed, as_read, _pairs(single))
 
 
-def _best(posed: Posed, as_read: Agreement, mistakes: Sequence[PoseMistake]) -> PoseMistake | None:
+def _best(
+    posed: Posed,
+    as_read: Agreement,
+    mistakes: Sequence[PoseMistake],
+) -> PoseMistake | None:
     """Return the mistake with the most confirmed points, if it explains much more."""
     best = None
     most_confirmed = 0.0
@@ -124,7 +134,9 @@ def _explained(posed: Posed, as_read: Agreement, mistake: PoseMistake) -> float:
         return 0.0
 
     possible = _judgeable(views) * changed.sum() / max(changed.size - len(changed), 1)
-    looks_past = with_it.judged < NO_OVERLAP * without.judged and without.judged > possible / 2
+    looks_past = (
+        with_it.judged < NO_OVERLAP * without.judged and without.judged > possible / 2
+    )
     wrong = 1 - with_it.share
     contradicted = (
         with_it.judged >= FEWEST_JUDGED
@@ -178,13 +190,21 @@ def _single_mistakes(to_world: bool, unit: float) -> list[PoseMistake]:
         ),
     ]
 
-    for name, axes in (("OpenGL", CAMERA_AXES["opengl"]), ("a ROS body", CAMERA_AXES["ros"])):
+    for name, axes in (
+        ("OpenGL", CAMERA_AXES["opengl"]),
+        ("a ROS body", CAMERA_AXES["ros"]),
+    ):
         sentence = f"the camera's axes are those of {name}, and OpenCV's are expected (x right, "
         sentence += "y down, z forward)"
         found.append(PoseMistake("axes", sentence, _turned_by(axes)))
 
-    for steps, wrong, right in ((1, "w, x, y, z", "x, y, z, w"), (-1, "x, y, z, w", "w, x, y, z")):
-        sentence = f"the quaternions are in the order {wrong}, and were taken for {right}"
+    for steps, wrong, right in (
+        (1, "w, x, y, z", "x, y, z, w"),
+        (-1, "x, y, z, w", "w, x, y, z"),
+    ):
+        sentence = (
+            f"the quaternions are in the order {wrong}, and were taken for {right}"
+        )
         for in_world in (True, False):
             corrected = _in_stored(_quaternion_rolled(steps), in_world)
             found.append(PoseMistake("quaternion", sentence, corrected))
@@ -199,7 +219,10 @@ def _pairs(single: Sequence[PoseMistake]) -> list[PoseMistake]:
     found = []
     for i, first in enumerate(single):
         for second in single[i + 1 :]:
-            if first.kind == second.kind or {first.kind, second.kind} == {"mixed", "inverse"}:
+            if first.kind == second.kind or {first.kind, second.kind} == {
+                "mixed",
+                "inverse",
+            }:
                 continue
 
             found.append(
@@ -214,7 +237,8 @@ def _pairs(single: Sequence[PoseMistake]) -> list[PoseMistake]:
 
 
 def _one_after_the_other(
-    first: Callable[[Float], Float], second: Callable[[Float], Float]
+    first: Callable[[Float], Float],
+    second: Callable[[Float], Float],
 ) -> Callable[[Float], Float]:
     return lambda poses: second(first(poses))
 
@@ -237,7 +261,10 @@ def _turned_by(axes: Float) -> Callable[[Float], Float]:
     return corrected
 
 
-def _in_stored(change: Callable[[Float], Float], to_world: bool) -> Callable[[Float], Float]:
+def _in_stored(
+    change: Callable[[Float], Float],
+    to_world: bool,
+) -> Callable[[Float], Float]:
     """A change of camera-to-world poses by one of the poses as they are stored."""
     if to_world:
         return change

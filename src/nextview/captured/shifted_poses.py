@@ -17,7 +17,9 @@ from nextview.types import Float, Index, Mask
 
 FRAME_SHIFTS = (1, -1, 2, -2)  # frames by which the poses of a part may be late
 MOST_SHIFTED = 4  # frames by which poses may be late after several parts
-MOST_PARTS = 3  # parts that are searched for, one inside the other or one after the other
+MOST_PARTS = (
+    3  # parts that are searched for, one inside the other or one after the other
+)
 # the shift is named if at most this part of the contradictions is left without it
 FEWER_CONTRADICTIONS = 0.5
 LEAST_EXPLAINED = 100  # contradictions that a shift has to explain
@@ -98,14 +100,21 @@ class Shifted:
             late_there = np.full(len(self.views), there)
             looked_up_with = self.poses_of(late_there)
             found = compare(
-                self.views, self.poses_of(late), sharpness=SHARP, looked_up_with=looked_up_with
+                self.views,
+                self.poses_of(late),
+                sharpness=SHARP,
+                looked_up_with=looked_up_with,
             )
             usable = self.has_pose(late)[:, None] & self.has_pose(late_there)
             self._known[here, there] = found.among(usable)
         return self._known[here, there]
 
 
-def find_shifts(views: Sequence[SurfaceView], indices: Index, poses: Float) -> list[Shift]:
+def find_shifts(
+    views: Sequence[SurfaceView],
+    indices: Index,
+    poses: Float,
+) -> list[Shift]:
     """Find parts of a capture whose poses are late or early.
 
     Parts are added one by one, each where it explains most contradictions.
@@ -138,7 +147,11 @@ def find_shifts(views: Sequence[SurfaceView], indices: Index, poses: Float) -> l
     # taken to be right.
     others = late - late[1]
     others[0] = min(others[0], 0, key=abs)
-    if _explained(shifted, as_read, others) >= AS_GOOD * _explained(shifted, as_read, late):
+    if _explained(shifted, as_read, others) >= AS_GOOD * _explained(
+        shifted,
+        as_read,
+        late,
+    ):
         late = others
     return _parts(late) if _is_explained(shifted, as_read, late) else []
 
@@ -156,8 +169,13 @@ def _best_part(shifted: Shifted, late: Index, least: float) -> Shift | None:
         if explained[first, last] >= most_explained:
             most_explained = float(explained[first, last])
             without_pose = np.flatnonzero(shifted.has_pose(later)[last + 1 :])
-            end = len(late) if not len(without_pose) else int(last) + 1 + int(without_pose[0])
+            end = (
+                len(late)
+                if not len(without_pose)
+                else int(last) + 1 + int(without_pose[0])
+            )
             best = Shift(int(first), end, frames)
+
     return best
 
 
@@ -211,7 +229,9 @@ def _sum(sums: Float, rows: slice, columns: slice) -> float:
     high = rows.stop
     left = columns.start
     right = columns.stop
-    return float(sums[high, right] - sums[low, right] - sums[high, left] + sums[low, left])
+    return float(
+        sums[high, right] - sums[low, right] - sums[high, left] + sums[low, left]
+    )
 
 
 def _explained(shifted: Shifted, late: Index, later: Index) -> float:

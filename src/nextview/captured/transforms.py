@@ -12,7 +12,9 @@ from nextview.captured.messages import matrix_of
 from nextview.errors import DatasetError
 from nextview.types import Float
 
-LONGEST_GAP = 0.5  # seconds between two transforms from which a pose between them is interpolated
+LONGEST_GAP = (
+    0.5  # seconds between two transforms from which a pose between them is interpolated
+)
 BEYOND = 0.02  # seconds before the first or after the last transform that it still counts for
 
 
@@ -69,7 +71,9 @@ class _Link:
 
         gap = self.stamps[after] - self.stamps[before]
         share = (time - self.stamps[before]) / gap
-        ends = [matrix_of(self.positions[i], self.quaternions[i]) for i in (before, after)]
+        ends = [
+            matrix_of(self.positions[i], self.quaternions[i]) for i in (before, after)
+        ]
         pose = np.eye(4)
         turn = Rotation.from_matrix(ends[1][:3, :3] @ ends[0][:3, :3].T).as_rotvec()
         pose[:3, :3] = Rotation.from_rotvec(share * turn).as_matrix() @ ends[0][:3, :3]
@@ -190,7 +194,9 @@ class TransformTree:
         while chain[-1] in self._links:
             parent = self._links[chain[-1]].parent
             if parent in chain:
-                raise TransformError(f"tf goes round in a circle: {' in '.join([*chain, parent])}")
+                raise TransformError(
+                    f"tf goes round in a circle: {' in '.join([*chain, parent])}"
+                )
             chain.append(parent)
         return chain
 

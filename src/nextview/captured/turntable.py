@@ -10,7 +10,13 @@ from nextview.captured.folders import (
     INTRINSICS,
     is_capture,
 )
-from nextview.captured.frames import MILLIMETRES, Capture, CapturedFrame, DepthFile, read_table
+from nextview.captured.frames import (
+    MILLIMETRES,
+    Capture,
+    CapturedFrame,
+    DepthFile,
+    read_table,
+)
 from nextview.errors import DatasetError, ObservationError
 from nextview.geometry.viewsphere import rotation_z
 from nextview.sensing import Frame, ObservedObject
@@ -21,7 +27,9 @@ from nextview.types import Float
 ROUNDS = 40
 TURN_POINTS = 800
 CLOSEST_TURN = 0.7
-TURN_PARTS = 6  # a sixth of a circle, or one step, lies between two frames that are compared
+TURN_PARTS = (
+    6  # a sixth of a circle, or one step, lies between two frames that are compared
+)
 # how far apart this share of the frames may lie, parts of the thing's radius, beyond noise
 AGREE = 0.008
 AGREEING_SHARE = 0.8
@@ -66,9 +74,14 @@ def read_turntable(folder: Path, turn: str) -> Capture:
         except ObservationError as error:
             raise DatasetError(f"{frame.depth}: {error}") from None
         shown.append(thing.sightings[0])
-    plane = np.median([[*s.plane.normal, s.plane.offset] for s in shown if s.plane is not None], 0)
+    plane = np.median(
+        [[*s.plane.normal, s.plane.offset] for s in shown if s.plane is not None],
+        0,
+    )
     axes = upright_axes(plane[:3], np.array([0, 0, -1.0]))
-    few = [np.linspace(0, len(s.facets.planes) - 1, TURN_POINTS).astype(int) for s in shown]
+    few = [
+        np.linspace(0, len(s.facets.planes) - 1, TURN_POINTS).astype(int) for s in shown
+    ]
     clouds = [
         (s.facets.points[f] @ axes.T, s.facets.planes[f] @ axes.T)
         for s, f in zip(shown, few, strict=True)
@@ -79,7 +92,10 @@ def read_turntable(folder: Path, turn: str) -> Capture:
         raise DatasetError(
             f"{folder}: its frames agree if the thing turned the other way, not {turn}"
         )
-    radius = np.ptp(np.concatenate([points[:, :2] for points, _ in clouds]), axis=0).max() / 2
+    radius = (
+        np.ptp(np.concatenate([points[:, :2] for points, _ in clouds]), axis=0).max()
+        / 2
+    )
     z = float(np.median([np.median(s.facets.points[:, 2]) for s in shown]))
     noise = float(np.median([s.noise.at(z) for s in shown])) * z**2
     # the last and the first, too: a full circle
@@ -97,7 +113,14 @@ def read_turntable(folder: Path, turn: str) -> Capture:
         pose[:3, 3] = back @ [*-axis, plane[3]]
         posed.append(replace(frame, pose=pose))
     notes = (f"{len(posed)} even steps {turn}",)
-    return Capture(folder, "turntable", tuple(posed), (0.0, 0.0, 1.0), notes, object_is_world=True)
+    return Capture(
+        folder,
+        "turntable",
+        tuple(posed),
+        (0.0, 0.0, 1.0),
+        notes,
+        object_is_world=True,
+    )
 
 
 def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
@@ -115,7 +138,11 @@ def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
         (p @ r.T, q @ r.T / np.linalg.norm(q, axis=1)[:, None])
         for (p, q), r in zip(clouds, turns, strict=True)
     ]
-    pairs = [(i, (i + gap) % n) for gap in sorted({max(1, n // TURN_PARTS), 1}) for i in range(n)]
+    pairs = [
+        (i, (i + gap) % n)
+        for gap in sorted({max(1, n // TURN_PARTS), 1})
+        for i in range(n)
+    ]
     for _ in range(ROUNDS):
         rows = list[Float]()
         wanted = list[Float]()
@@ -133,7 +160,11 @@ def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
                 apart[i] = np.median(np.abs(wanted[-1] - rows[-1] @ axis))
 
         before = axis
-        axis = np.linalg.lstsq(np.concatenate(rows), np.concatenate(wanted), rcond=None)[0]
+        axis = np.linalg.lstsq(
+            np.concatenate(rows),
+            np.concatenate(wanted),
+            rcond=None,
+        )[0]
         if np.linalg.norm(axis - before) < 1e-6:
             break
     return axis, apart

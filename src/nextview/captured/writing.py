@@ -65,7 +65,10 @@ def write_capture(
     vertices = radius * mesh.vertices + np.array([0, 0, height])
     things = [(vertices, mesh.faces)] + [square(TABLE_HALF_SIDE * radius, 0.0)] * table
     caster = RayCaster(things)
-    rays = PinholeCamera.of(pinhole_matrix(525.0, 525.0, 320.0, 240.0), SHAPE).rays.reshape(-1, 3)
+    rays = PinholeCamera.of(
+        pinhole_matrix(525.0, 525.0, 320.0, 240.0),
+        SHAPE,
+    ).rays.reshape(-1, 3)
     # The box has an inside, even that of a flat mesh.
     low = vertices.min(0) - 1e-6 * radius
     high = vertices.max(0) + 1e-6 * radius
@@ -73,7 +76,11 @@ def write_capture(
     model = [0, 0, height] - radius / mesh.radius * mesh.centre
     x, y, z = sphere.directions.T
     # not below the table
-    elevation = np.clip(np.arcsin(np.clip(z, -1, 1)), 0.0 if table else -np.pi / 2, np.pi / 2)
+    elevation = np.clip(
+        np.arcsin(np.clip(z, -1, 1)),
+        0.0 if table else -np.pi / 2,
+        np.pi / 2,
+    )
     poses = look_at_origin(elevation, np.arctan2(y, x), CAMERA_DISTANCE * radius)
     poses[:, 2, 3] += height
     cameras = {}
@@ -97,8 +104,13 @@ def write_capture(
                 **there,
             }
             placed = 1000 * (rotation @ model + translation)
-            objects[str(i)] = [{"obj_id": 1, "cam_R_m2c": flat, "cam_t_m2c": placed.tolist()}]
-            seen = caster.cast(pose[:3, 3], rays @ np.ascontiguousarray(rotation, np.float32))
+            objects[str(i)] = [
+                {"obj_id": 1, "cam_R_m2c": flat, "cam_t_m2c": placed.tolist()}
+            ]
+            seen = caster.cast(
+                pose[:3, 3],
+                rays @ np.ascontiguousarray(rotation, np.float32),
+            )
             _write_images(new, i, *seen, masks)
             yield i + 1
         for name, values in (("scene_camera", cameras), ("scene_gt", objects)):
@@ -106,10 +118,16 @@ def write_capture(
 
 
 def _write_images(
-    folder: Path, index: int, depth: Float32, which: NDArray[np.integer], masks: bool
+    folder: Path,
+    index: int,
+    depth: Float32,
+    which: NDArray[np.integer],
+    masks: bool,
 ) -> None:
     """Write the depth of each ray, and the mask of the object, by which thing it meets."""
-    steps = np.rint(np.where(which < 0, np.float32(0), depth) / DEPTH_STEP).astype(np.uint16)
+    steps = np.rint(np.where(which < 0, np.float32(0), depth) / DEPTH_STEP).astype(
+        np.uint16
+    )
     Image.fromarray(steps.reshape(SHAPE)).save(folder / f"depth/{index:06d}.png")
     if masks:
         mask = np.where(which == 0, 255, 0).astype(np.uint8).reshape(SHAPE)

@@ -27,7 +27,10 @@ def find(path: str) -> Any:
 
 
 def call(
-    name: str, command: Command, arguments: Sequence[str], track: Callable[..., None]
+    name: str,
+    command: Command,
+    arguments: Sequence[str],
+    track: Callable[..., None],
 ) -> tuple[Any, dict]:
     """Call the function of a command with the arguments of a command line.
 
@@ -46,7 +49,9 @@ def call(
 
 
 def entry(
-    command: Command, arguments: Sequence[str] = (), track: Callable[..., None] | None = None
+    command: Command,
+    arguments: Sequence[str] = (),
+    track: Callable[..., None] | None = None,
 ) -> tuple[Callable[..., Any], dict[str, Any]]:
     """Create a function that tyro can read from a command line.
 
@@ -80,7 +85,9 @@ def entry(
             ]
         kind = Annotated[Literal["default", "thesis"], tyro.conf.arg(help=PRESET)]
         keyword = inspect.Parameter.KEYWORD_ONLY
-        parameters.append(inspect.Parameter("preset", keyword, default="default", annotation=kind))
+        parameters.append(
+            inspect.Parameter("preset", keyword, default="default", annotation=kind)
+        )
     given = {"track": track} if "track" in hints else {}
     called: dict[str, Any] = {}
 
@@ -89,7 +96,9 @@ def entry(
         return function(*positional, **options, **given)
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    run.__annotations__ = {
+        parameter.name: parameter.annotation for parameter in parameters
+    }
     run.__doc__ = about
     return run, called
 
@@ -104,7 +113,10 @@ def _described(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
         What it does, a paragraph a line, as tyro would keep where lines end; and the help of each
         parameter in its ``Args`` section.
     """
-    parsed = docstring_parser.parse(function.__doc__ or "", docstring_parser.DocstringStyle.GOOGLE)
+    parsed = docstring_parser.parse(
+        function.__doc__ or "",
+        docstring_parser.DocstringStyle.GOOGLE,
+    )
     text = (parsed.description or "").replace("``", "")
     about = re.sub(r"(?<=\S)\n *(?=\S)", " ", text)
 

@@ -50,4 +50,6 @@ def capture(
     sphere = ViewSphere.named(viewpoints)
     frames = write_capture(loaded, out, sphere, metres, table, not table, overwrite)
     track(frames, len(sphere), f"capturing {mesh.name}")
-    console.print(f"{out}: {len(sphere)} views; look at them with: nextview recognise {out}")
+    console.print(
+        f"{out}: {len(sphere)} views; look at them with: nextview recognise {out}"
+    )

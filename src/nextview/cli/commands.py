@@ -29,14 +29,22 @@ TRAINING = "nextview.training"
 THESIS = f"{TRAINING}.recipes:THESIS"
 EXPORT = f"{TRAINING}.export:export"
 EXPORTED = (
-    "{found.card}: largest difference between torch and ONNX on real views {found.difference:.2g}"
+    "{found.card}: largest difference between torch and ONNX "
+    "on real views {found.difference:.2g}"
 )
 COMMANDS = {  # by name, in the order in which they are listed
     "recognise": Command(
-        f"{CLI}.recognise:recognise", "recognise the object of a mesh or of captured frames"
+        f"{CLI}.recognise:recognise",
+        "recognise the object of a mesh or of captured frames",
     ),
-    "look": Command(f"{CLI}.look:look", "say which known things stand where on a table"),
-    "demo": Command(f"{CLI}.demo:demo", "recognise a sample object, and draw the episode"),
+    "look": Command(
+        f"{CLI}.look:look",
+        "say which known things stand where on a table",
+    ),
+    "demo": Command(
+        f"{CLI}.demo:demo",
+        "recognise a sample object, and draw the episode",
+    ),
     "learn": Command(
         f"{TEACHING}.learn:learn_things",
         "teach it your objects from scans or depth frames",
@@ -44,20 +52,32 @@ COMMANDS = {  # by name, in the order in which they are listed
         " {out}/learned.png",
     ),
     "explore": Command(
-        f"{CLI}.explore:explore", "choose views in the browser, and watch the belief"
+        f"{CLI}.explore:explore",
+        "choose views in the browser, and watch the belief",
     ),
     "capture": Command(
-        f"{CLI}.capture:capture", "write depth images of a mesh, in the layout of BOP"
+        f"{CLI}.capture:capture",
+        "write depth images of a mesh, in the layout of BOP",
     ),
     "completion": Command(
-        f"{CLI}.completion:completion", "print completions for bash, zsh or fish"
+        f"{CLI}.completion:completion",
+        "print completions for bash, zsh or fish",
     ),
-    "list": Command(f"{CLI}.listing:show", "list the bundled models, or the view measures"),
+    "list": Command(
+        f"{CLI}.listing:show",
+        "list the bundled models, or the view measures",
+    ),
     "download": Command(f"{CLI}.listing:download", "download ModelNet10 or ModelNet40"),
     "scenes": Command(f"{CLI}.scenes:scenes", "draw cluttered scenes, or rooms"),
-    "render": Command(f"{CLI}.stores:render", "render every view of a dataset into a view store"),
+    "render": Command(
+        f"{CLI}.stores:render",
+        "render every view of a dataset into a view store",
+    ),
     "check": Command(f"{CLI}.stores:check", "check a view store for damage"),
-    "measure": Command(f"{CLI}.stores:measure", "compute measures of the views in a store"),
+    "measure": Command(
+        f"{CLI}.stores:measure",
+        "compute measures of the views in a store",
+    ),
     "train recogniser": Command(
         f"{TRAINING}.recogniser_training:train_recogniser",
         "train a recogniser",
@@ -79,10 +99,19 @@ COMMANDS = {  # by name, in the order in which they are listed
         " the networks' by {found.difference:.1g} at most",
     ),
     "export recogniser": Command(
-        f"{EXPORT}_recogniser", "export a trained recogniser as a model", EXPORTED
+        f"{EXPORT}_recogniser",
+        "export a trained recogniser as a model",
+        EXPORTED,
     ),
-    "export map": Command(f"{EXPORT}_map", "export a trained map network as a model", EXPORTED),
-    "predict": Command(f"{CLI}.predict:predict", "run the models over every view of a store, once"),
+    "export map": Command(
+        f"{EXPORT}_map",
+        "export a trained map network as a model",
+        EXPORTED,
+    ),
+    "predict": Command(
+        f"{CLI}.predict:predict",
+        "run the models over every view of a store, once",
+    ),
     "fit calibration": Command(
         f"{TRAINING}.card_fits:fit_calibration",
         "calibrate a recogniser's belief",

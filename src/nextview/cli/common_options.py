@@ -126,7 +126,10 @@ class ObjectOptions:
         folder = is_frames(path)
         of_meshes = ("unit", "sensor", "max_faces", "largest_part")
         for field in fields(self)[1:]:
-            if (field.name in of_meshes) == folder and getattr(self, field.name) != field.default:
+            if (field.name in of_meshes) == folder and getattr(
+                self,
+                field.name,
+            ) != field.default:
                 option = field.name.replace("_", "-")
                 kind = "mesh files" if folder else "captured views"
                 raise UsageError(f"{path}: --{option} is for {kind}, and this is none")
@@ -134,7 +137,9 @@ class ObjectOptions:
         if folder:
             return self._captured(path)
         if isinstance(self.up, tuple):
-            raise UsageError(f"{path}: the up axis of a mesh file is y or z, not {self.up}")
+            raise UsageError(
+                f"{path}: the up axis of a mesh file is y or z, not {self.up}"
+            )
 
         mesh = load_mesh(path, self.up, self.unit, self.max_faces, self.largest_part)
         for sentence in mesh_warnings(mesh):
@@ -154,10 +159,21 @@ class ObjectOptions:
             self.world_frame,
         )
         console.print(f"{capture!r}")
-        return camera_of(capture, self.up, self.point, self.box, not self.raw, not self.by_shape)
+        return camera_of(
+            capture,
+            self.up,
+            self.point,
+            self.box,
+            not self.raw,
+            not self.by_shape,
+        )
 
 
-def check_file(path: Path | None, overwrite: bool, kinds: tuple[str, ...] = FIGURE_ENDINGS) -> None:
+def check_file(
+    path: Path | None,
+    overwrite: bool,
+    kinds: tuple[str, ...] = FIGURE_ENDINGS,
+) -> None:
     """Check a file that is to be written, before any work is done.
 
     Args:

@@ -27,7 +27,15 @@ def completion(
             group, _, word = name.rpartition(" ")
             if group not in groups:
                 groups[group] = SubcommandApp()
-                groups[""].command(groups[group], name=group, help=f"the commands of {group}")
+                groups[""].command(
+                    groups[group],
+                    name=group,
+                    help=f"the commands of {group}",
+                )
             function, _ = entry(command)
             groups[group].command(name=word, help=command.line)(function)
-        groups[""].cli(prog="nextview", args=["--tyro-print-completion", shell], config=CONFIG)
+        groups[""].cli(
+            prog="nextview",
+            args=["--tyro-print-completion", shell],
+            config=CONFIG,
+        )

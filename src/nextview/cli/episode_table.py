@@ -20,7 +20,12 @@ def _angles(view: int, angles: tuple[float, float]) -> str:
     return f"{view}\n{angles[0]:.0f}°, {round(angles[1]) % 360}°"
 
 
-def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[str] = ()) -> None:
+def print_episode(
+    result: Recognition,
+    name: str,
+    policy: str,
+    frames: Sequence[str] = (),
+) -> None:
     """Print each view and the answer.
 
     Args:
@@ -29,11 +34,18 @@ def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[
         policy: that chose the views.
         frames: of captured views, which frame answered each.
     """
-    stops = [float(result.stopping.threshold_at(step)) for step in range(1, len(result.views) + 1)]
-    has_threshold = bool(np.isfinite(stops).any())  # a rule of your own need not stop at a belief
+    stops = [
+        float(result.stopping.threshold_at(step))
+        for step in range(1, len(result.views) + 1)
+    ]
+    has_threshold = bool(
+        np.isfinite(stops).any()
+    )  # a rule of your own need not stop at a belief
 
     console = Terminal()
-    console.print(_table_of_views(result, name, policy, frames, stops if has_threshold else []))
+    console.print(
+        _table_of_views(result, name, policy, frames, stops if has_threshold else [])
+    )
     for step, view in enumerate(result.views, 1):
         for warning in view.warnings:
             console.print(f"Step {step}: warning ({warning.name}): {warning.message}.")
@@ -48,13 +60,18 @@ def print_episode(result: Recognition, name: str, policy: str, frames: Sequence[
 
 
 def _table_of_views(
-    result: Recognition, name: str, policy: str, frames: Sequence[str], stops: Sequence[float]
+    result: Recognition,
+    name: str,
+    policy: str,
+    frames: Sequence[str],
+    stops: Sequence[float],
 ) -> Table:
     """A row for each view; ``stops`` are the thresholds at which each stops, if there are any."""
     table = Table(box=box.SIMPLE, show_lines=True, pad_edge=False, padding=(0, 1, 0, 0))
     table.title = f"Looking at {name}, next views by {policy}"
     table.caption = (
-        f"view: number, elevation, azimuth; travel: grid cells; stops by {result.stopping}"
+        "view: number, elevation, azimuth; travel: grid cells; "
+        f"stops by {result.stopping}"
     )
 
     columns = ["step", "view", "this view alone", "belief, top 3", "next", "travel"]
@@ -85,7 +102,15 @@ def _table_of_views(
         after = "stop"
         if view.next_view is not None:
             after = _angles(view.next_view, result.sphere.angles(view.next_view))
-        table.add_row(str(row + 1), looked, alone, belief, *stop, after, f"{view.travel:.2f}")
+        table.add_row(
+            str(row + 1),
+            looked,
+            alone,
+            belief,
+            *stop,
+            after,
+            f"{view.travel:.2f}",
+        )
     return table
 
 
@@ -101,7 +126,12 @@ def _answer_in_words(result: Recognition, has_threshold: bool) -> Text:
     if result.confident:
         reason = "threshold reached" if has_threshold else f"{result.stopping}"
     rest = f"{result.views[-1].belief.max():.3f}, {effort} ({reason})."
-    return Text.assemble("It is a ", (printable(f"{result.answer}"), "bold"), ", belief ", rest)
+    return Text.assemble(
+        "It is a ",
+        (printable(f"{result.answer}"), "bold"),
+        ", belief ",
+        rest,
+    )
 
 
 def _pose_in_words(result: Recognition) -> list[str]:
@@ -113,7 +143,11 @@ def _pose_in_words(result: Recognition) -> list[str]:
             else []
         )
 
-    others = [each for each in result.pose_candidates if not np.array_equal(each.pose, result.pose)]
+    others = [
+        each
+        for each in result.pose_candidates
+        if not np.array_equal(each.pose, result.pose)
+    ]
     rows = [" ".join(f"{value:9.4f}" for value in row) for row in result.pose]
     lines = [
         f"From the frame of its scan into {result.poses_in}, metres ({result.pose_uncertainty}):",
@@ -122,8 +156,11 @@ def _pose_in_words(result: Recognition) -> list[str]:
 
     if others:
         alike = ", ".join(
-            f"{printable(each.thing)} {each.probability:.2f}" for each in others[:SHOWN_POSES]
+            f"{printable(each.thing)} {each.probability:.2f}"
+            for each in others[:SHOWN_POSES]
         )
         more = ", ..." if len(others) > SHOWN_POSES else ""
-        lines.append(f"Other poses that it may have, by their probability: {alike}{more}.")
+        lines.append(
+            f"Other poses that it may have, by their probability: {alike}{more}."
+        )
     return lines

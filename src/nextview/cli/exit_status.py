@@ -21,7 +21,8 @@ def printable(text: str) -> str:
     a\x1b[31mb
     """
     return "".join(
-        c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text
+        c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode()
+        for c in text
     )
 
 
@@ -40,7 +41,9 @@ def orderly_end(after_stop: str) -> Iterator[None]:
         yield
         sys.stdout.flush()
     except (NextviewError, ModuleNotFoundError) as error:
-        sentence = str(error) if isinstance(error, NextviewError) else missing_extra(error)
+        sentence = (
+            str(error) if isinstance(error, NextviewError) else missing_extra(error)
+        )
         if sentence is None:
             raise
         _end(sentence, 2)
@@ -90,7 +93,9 @@ def _discard(stream: TextIO) -> None:
 
 
 def require(
-    extra: str, packages: Mapping[str, tuple[str, ...]] = EXTRAS, project: str = "nextview"
+    extra: str,
+    packages: Mapping[str, tuple[str, ...]] = EXTRAS,
+    project: str = "nextview",
 ) -> None:
     """End a script, before its imports fail, with the sentence that says what to install.
 

@@ -53,13 +53,25 @@ def explore(
     options = dict(vars(looking))
     policies = [options.pop("policy"), *([] if compare is None else [compare])]
     page = Page(
-        Exploration(shown_objects(path, up, unit), policies, sensor, start, seed, **options),
+        Exploration(
+            shown_objects(path, up, unit),
+            policies,
+            sensor,
+            start,
+            seed,
+            **options,
+        ),
         host,
         port,
     )
-    console.print(f"{page.address} shows {len(page.exploration.objects)} objects; Ctrl-C ends it")
+    console.print(
+        f"{page.address} shows {len(page.exploration.objects)} objects; Ctrl-C ends it"
+    )
     if host not in ("127.0.0.1", "localhost", "::1"):
-        console.print("Everybody who reaches this address may drive the page.", style="yellow")
+        console.print(
+            "Everybody who reaches this address may drive the page.",
+            style="yellow",
+        )
     screen = (
         sys.platform in ("darwin", "win32")
         or os.environ.get("DISPLAY")

@@ -53,16 +53,33 @@ def print_leaderboard(results: Results) -> None:
                 f"of the episodes that stopped at {r.threshold:.4g}, {100 * r.error:.1f} % are"
                 " wrong"
             )
-            console.print(f"{r.policy}: {wrong}; at most {100 * r.risk:g} % was promised.")
+            console.print(
+                f"{r.policy}: {wrong}; at most {100 * r.risk:g} % was promised."
+            )
 
 
 def _policies(rows: list[Any], threshold: float, reference: str) -> Table:
     """In 80 columns; only a long name of a policy is folded."""
-    title = f"threshold {threshold:g}; in brackets 95 % intervals; points over {reference}"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
+    title = (
+        f"threshold {threshold:g}; in brackets 95 % intervals; points over {reference}"
+    )
+    table = Table(
+        title=title,
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        padding=0,
+        pad_edge=False,
+    )
     table.add_column("policy", overflow="fold", min_width=20)
 
-    for column in ("accuracy", "class\nmean", "views", "travel\ncells", f"over\n{reference}", "p"):
+    for column in (
+        "accuracy",
+        "class\nmean",
+        "views",
+        "travel\ncells",
+        f"over\n{reference}",
+        "p",
+    ):
         table.add_column(column, justify="right", no_wrap=True)
     for i, s in enumerate(rows):
         oracle = is_oracle(s.policy)
@@ -76,12 +93,21 @@ def _policies(rows: list[Any], threshold: float, reference: str) -> Table:
             p = ("< 0.001" if s.p_holm < 0.001 else f"{s.p_holm:.3f}") + (
                 " *" if s.differs else "  "
             )
-        accuracy = f"{s.accuracy:.3f} ({s.low:.3f}-{s.high:.3f})", f"{s.class_accuracy:.3f}"
+        accuracy = (
+            f"{s.accuracy:.3f} ({s.low:.3f}-{s.high:.3f})",
+            f"{s.class_accuracy:.3f}",
+        )
         style = "bold" if s.differs else None
         if oracle:
             style = "dim"
         table.add_row(
-            s.policy, *accuracy, f"{s.n_views:.2f}", f"{s.travel:.2f}", over, p, style=style
+            s.policy,
+            *accuracy,
+            f"{s.n_views:.2f}",
+            f"{s.travel:.2f}",
+            over,
+            p,
+            style=style,
         )
 
     return table
@@ -102,7 +128,8 @@ def print_evaluation(found: Evaluation) -> None:
     for heading, measure in (lines | {"mean of classes": "class_accuracy"}).items():
         if (1, "", measure) in right:
             shown.add_row(
-                heading, *(_cell(right[n_views, "", measure], 3) for n_views in (1, views))
+                heading,
+                *(_cell(right[n_views, "", measure], 3) for n_views in (1, views)),
             )
     console.print(shown)
 
@@ -120,7 +147,11 @@ def print_evaluation(found: Evaluation) -> None:
     shown = Table("mean of objects", *(name.upper() for name in names))
     for measure, heading in headings.items():
         shown.add_row(
-            heading, *(_cell(scores[name, measure], 4 if measure == "mse" else 3) for name in names)
+            heading,
+            *(
+                _cell(scores[name, measure], 4 if measure == "mse" else 3)
+                for name in names
+            ),
         )
     if len(names):
         console.print(shown)
@@ -133,6 +164,8 @@ def _cell(number: Number, digits: int) -> Text:
     if not isfinite(number.value):
         return Text("-")
     interval = (
-        f" {number.low:.{digits}f}-{number.high:.{digits}f}" if number.high > number.low else ""
+        f" {number.low:.{digits}f}-{number.high:.{digits}f}"
+        if number.high > number.low
+        else ""
     )
     return Text.assemble(f"{number.value:.{digits}f}", (interval, "dim"))

@@ -32,7 +32,10 @@ def show(
         table = Table("measure", "needs", "better views", "source")
         for key, measure in all_measures().items():
             table.add_row(
-                key, measure.needs, "high" if measure.good == "peak" else "low", measure.source
+                key,
+                measure.needs,
+                "high" if measure.good == "peak" else "low",
+                measure.source,
             )
         return Terminal().print(table)
     if name:
@@ -53,7 +56,11 @@ def show(
                     tested.append(f"  {score.replace('_', ' ')} {mean}")
         intact = "intact" if sha256_of(card.path) == card.sha256 else "DAMAGED"
         table.add_row(
-            card.name, card.kind, f"{card.path.stat().st_size / 1e6:.1f}", "\n".join(tested), intact
+            card.name,
+            card.kind,
+            f"{card.path.stat().st_size / 1e6:.1f}",
+            "\n".join(tested),
+            intact,
         )
     return Terminal().print(table)
 
@@ -82,12 +89,24 @@ def download(
     from nextview.data.downloading import download as fetch
 
     archive = ARCHIVES[name]
-    columns = BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()
-    with Progress(TextColumn("{task.description}"), *columns, console=console) as progress:
+    columns = (
+        BarColumn(),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(
+        TextColumn("{task.description}"),
+        *columns,
+        console=console,
+    ) as progress:
         move = partial(
-            progress.update, progress.add_task(f"downloading {archive.folder}", total=None)
+            progress.update,
+            progress.add_task(f"downloading {archive.folder}", total=None),
         )
         # as pooch wants it
-        bar = SimpleNamespace(total=0, reset=partial(move, completed=0), close=lambda: None)
+        bar = SimpleNamespace(
+            total=0, reset=partial(move, completed=0), close=lambda: None
+        )
         bar.update = lambda advance: move(advance=advance, total=bar.total)
         console.print(f"{fetch(archive, out, bar=bar)}")

@@ -125,7 +125,9 @@ def look(
             recorded.callback(recorder.close)
         looks = _look_at_frames(scene, capture, looking.frames, left_out, recorder)
         if not scene.frames:
-            raise ObservationError(f"{path}: no frame can be used: {next(iter(left_out.values()))}")
+            raise ObservationError(
+                f"{path}: no frame can be used: {next(iter(left_out.values()))}"
+            )
 
     if output.json:
         print(json.dumps(plain(scene_as_json(scene, looks, left_out)), indent=1))
@@ -135,7 +137,10 @@ def look(
         for ended, whole in one.joined:
             console.print(f"{name}: {ended} turned out to be a part of {whole}")
         for warning in one.warnings:
-            console.print(f"{name}: warning ({warning.name}): {warning.message}", soft_wrap=True)
+            console.print(
+                f"{name}: warning ({warning.name}): {warning.message}",
+                soft_wrap=True,
+            )
     for name, reason in left_out.items():
         console.print(f"left out: {name}: {reason}", style="yellow", soft_wrap=True)
     if output.figure is not None:
@@ -189,7 +194,9 @@ def _where(capture: Capture, looking: LookOptions) -> tuple[Float | None, Box | 
     given = looking.up if looking.up is not None else capture.up
     if isinstance(given, str):
         if given not in UP:
-            raise UsageError(f"up is {', '.join(UP)} or a direction, three numbers, not {given!r}")
+            raise UsageError(
+                f"up is {', '.join(UP)} or a direction, three numbers, not {given!r}"
+            )
         given = UP[given]
     up = None if given is None else np.array(given, np.float64)
     if looking.region is None:
@@ -221,7 +228,10 @@ def print_scene(scene: Scene, name: str) -> None:
     frames = len(scene.frames)
     table.title = f"On the table in {name}, {frames} frame{'s' * (frames > 1)}"
     for column in REPORT_COLUMNS:
-        table.add_column(column, justify="right" if column in ("", "frames") else "left")
+        table.add_column(
+            column,
+            justify="right" if column in ("", "frames") else "left",
+        )
     for thing in objects:
         table.add_row(*row_of(thing))
 

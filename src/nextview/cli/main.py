@@ -45,7 +45,9 @@ def _run(arguments: list[str]) -> None:
     if len(words) == 2 or not listed:
         name = " ".join(words) if listed else group
         near = did_you_mean(name, [*COMMANDS, *(name.split()[0] for name in COMMANDS)])
-        raise UsageError(f"there is no command {name!r}{near or '; nextview --help lists all'}")
+        raise UsageError(
+            f"there is no command {name!r}{near or '; nextview --help lists all'}"
+        )
 
     usage = f"nextview {group} COMMAND".replace("  ", " ")
     print(f"usage: {usage} [ARGUMENTS]\n\n{ABOUT}\n")

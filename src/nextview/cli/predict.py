@@ -57,7 +57,13 @@ def predict(
             )
         cards[name] = find_card(card or found.maps[name])
 
-    what = find_card(recogniser or found.recogniser), cards, split, held_out, not by_shape
+    what = (
+        find_card(recogniser or found.recogniser),
+        cards,
+        split,
+        held_out,
+        not by_shape,
+    )
     follow(
         predicting.predict(store, out, *what, **vars(workers), overwrite=overwrite),
         f"predicting {store.name}",
@@ -79,7 +85,11 @@ def summed_up(p: Predictions) -> list[str]:
     if p.calibration.hypotheses:  # taught things: what is said of azimuths tells
         classes = len(p.classes)
         answers = p.calibration.log_belief(p.log_evidence, 1, classes).argmax(2)
-        of_all = p.calibration.log_belief(p.log_evidence.sum(1), len(p.sphere), classes).argmax(1)
+        of_all = p.calibration.log_belief(
+            p.log_evidence.sum(1),
+            len(p.sphere),
+            classes,
+        ).argmax(1)
     right = answers == p.labels[:, None]
     fused = of_all == p.labels
 

@@ -55,7 +55,10 @@ def follow(steps: Iterator[tuple[int, int]], what: str) -> tuple[int, int]:
 
 
 def track_all(
-    done: Iterable[tuple[str, str | None]], total: int, what: str, before: int = 0
+    done: Iterable[tuple[str, str | None]],
+    total: int,
+    what: str,
+    before: int = 0,
 ) -> list[str]:
     """Follow a job that yields what is done and why it failed, and print the reasons.
 
@@ -98,7 +101,8 @@ def say_done(where: Path, done: str, before: int, total: int) -> None:
         return
     earlier = f", {before} were before" if before else ""
     console.print(
-        f"{where}: {total - before} of {total} objects {done} now{earlier}", soft_wrap=True
+        f"{where}: {total - before} of {total} objects {done} now{earlier}",
+        soft_wrap=True,
     )
 
 
@@ -122,5 +126,8 @@ def _print_lines(done: Iterable[int], total: int, what: str) -> None:
     for n in done:
         now = time.monotonic()
         if now - last > EVERY:
-            console.print(f"{what}: {n} of {total} after {now - begun:.0f} s", soft_wrap=True)
+            console.print(
+                f"{what}: {n} of {total} after {now - begun:.0f} s",
+                soft_wrap=True,
+            )
             last = now

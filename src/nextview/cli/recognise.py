@@ -71,7 +71,9 @@ def recognise(
 
     failed = []
     for one in (path, *more):
-        name = one.name if source.sensor is None else f"{one.name} through {source.sensor}"
+        name = (
+            one.name if source.sensor is None else f"{one.name} through {source.sensor}"
+        )
         try:
             camera = source.camera(one, seed)
             session = system.session_with(camera, start, seed, any_orientation)
@@ -111,14 +113,17 @@ def show(
         if output.record is not None:
             from nextview.viewers.recording import Recorder
 
-            recorder = Recorder(recorded.enter_context(new_file(output.record, output.overwrite)))
+            recorder = Recorder(
+                recorded.enter_context(new_file(output.record, output.overwrite))
+            )
             recorded.callback(recorder.close)
             session.observers.append(recorder)
         result = session.run(camera)
     if not result.seen:
         why = "is it made of a few small parts far apart, or are a sensor's errors too strong?"
         nothing = (
-            f"there is no answer, for nothing of it is seen from any of {len(result.views)} views"
+            "there is no answer, for nothing of it is seen from "
+            f"any of {len(result.views)} views"
         )
         raise ObservationError(f"{name}: {nothing}; {why}")
     frames = [taken.frame.name for taken in getattr(camera, "taken", ())]

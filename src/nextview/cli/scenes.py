@@ -51,20 +51,33 @@ def scenes(
     """
     if room:
         if held_out is not None or levels != ("light", "medium", "heavy"):
-            raise UsageError("--levels and --held-out are for cluttered tables, not for --room")
+            raise UsageError(
+                "--levels and --held-out are for cluttered tables, not for --room"
+            )
         _draw_rooms(meshes, out, scenes, split, unit, seed, workers)
         return
 
     if unit is not None:
-        raise UsageError("--unit is for --room: on cluttered tables lengths are in object radii")
+        raise UsageError(
+            "--unit is for --room: on cluttered tables lengths are in object radii"
+        )
     total = len(scene_drawing.tasks(meshes, out, levels, scenes, seed, split, held_out))
     drawn = scene_drawing.draw_scenes(
-        meshes, out, levels, scenes, seed, split, **vars(workers), held_out=held_out
+        meshes,
+        out,
+        levels,
+        scenes,
+        seed,
+        split,
+        **vars(workers),
+        held_out=held_out,
     )
 
     failed = track_all(drawn, total, f"drawing {out.name}")
     if len(failed) == total:
-        raise DatasetError(f"{out}: none of the {total} scenes can be drawn; see the reasons above")
+        raise DatasetError(
+            f"{out}: none of the {total} scenes can be drawn; see the reasons above"
+        )
     console.print(
         f"{out}: {total - len(failed)} scenes; next: nextview render {out} STORE --meshes {meshes}"
     )
@@ -80,8 +93,22 @@ def _draw_rooms(
     workers: Workers,
 ) -> None:
     total = len(room_drawing.room_tasks(meshes, out, rooms, seed, split))
-    drawn = room_drawing.draw_rooms(meshes, out, rooms, seed, split, unit, **vars(workers))
+    drawn = room_drawing.draw_rooms(
+        meshes,
+        out,
+        rooms,
+        seed,
+        split,
+        unit,
+        **vars(workers),
+    )
     failed = track_all(drawn, total, f"drawing {out.name}")
+
     if len(failed) == total:
-        raise DatasetError(f"{out}: none of the {total} rooms can be drawn; see the reasons above")
-    console.print(f"{out}: {total - len(failed)} rooms; next: frames of them, docs/scenes.md#rooms")
+        raise DatasetError(
+            f"{out}: none of the {total} rooms can be drawn; see the reasons above"
+        )
+
+    console.print(
+        f"{out}: {total - len(failed)} rooms; next: frames of them, docs/scenes.md#rooms"
+    )

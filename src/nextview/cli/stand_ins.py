@@ -53,7 +53,12 @@ class _Finder(MetaPathFinder, Loader):
     def __init__(self, missing: Iterable[str]) -> None:
         self.missing = frozenset(missing)
 
-    def find_spec(self, fullname: str, path: Any, target: Any = None) -> ModuleSpec | None:
+    def find_spec(
+        self,
+        fullname: str,
+        path: Any,
+        target: Any = None,
+    ) -> ModuleSpec | None:
         """Return a spec for a missing package and everything below it.
 
         Args:
@@ -65,7 +70,11 @@ class _Finder(MetaPathFinder, Loader):
             The spec; None for packages that are installed.
         """
         package = fullname.partition(".")[0]
-        return ModuleSpec(fullname, self, is_package=True) if package in self.missing else None
+        return (
+            ModuleSpec(fullname, self, is_package=True)
+            if package in self.missing
+            else None
+        )
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         """A module from which anything can be taken."""
@@ -81,7 +90,9 @@ class _Finder(MetaPathFinder, Loader):
 def stand_ins() -> Iterator[None]:
     """Import with stand-ins for missing extras; only for a process that ends afterwards."""
     named = {package for packages in EXTRAS.values() for package in packages}
-    finder = import_stand_ins(package for package in named if find_spec(package) is None)
+    finder = import_stand_ins(
+        package for package in named if find_spec(package) is None
+    )
     try:
         yield
     finally:

@@ -49,7 +49,10 @@ def render(
             f"the bundled networks take images whose side is a multiple of {side} pixels, such as"
             f" {2 * side}"
         )
-        console.print(f"{takes}; those of {size} are for models of your own", style="yellow")
+        console.print(
+            f"{takes}; those of {size} are for models of your own",
+            style="yellow",
+        )
     found = rendering.listing(dataset, how)
     console.print(found.summary())
 
@@ -57,7 +60,15 @@ def render(
         before = int(ViewStore.open(store).done.sum())
     except DatasetError:
         before = 0  # there is none yet, or rendering says what is wrong
-    jobs = rendering.render(dataset, store, sphere, size, how, **vars(workers), overwrite=overwrite)
+    jobs = rendering.render(
+        dataset,
+        store,
+        sphere,
+        size,
+        how,
+        **vars(workers),
+        overwrite=overwrite,
+    )
     track_all(jobs, len(found.entries), f"rendering {store.name}", before)
     made = ViewStore.open(store)
     done = int(made.done.sum())
@@ -68,7 +79,9 @@ def render(
         )
     for group in copies:
         if len(set(made.labels[group])) > 1:
-            same = " = ".join(f"{made.names[i]} ({made.classes[made.labels[i]]})" for i in group)
+            same = " = ".join(
+                f"{made.names[i]} ({made.classes[made.labels[i]]})" for i in group
+            )
             console.print(f"one mesh, several labels: {same}", style="yellow")
     if not done:
         raise DatasetError(
@@ -76,7 +89,8 @@ def render(
         )
 
     console.print(
-        f"{store}: {done} of {len(made)} objects, {len(sphere)} views each", soft_wrap=True
+        f"{store}: {done} of {len(made)} objects, {len(sphere)} views each",
+        soft_wrap=True,
     )
 
 
@@ -95,7 +109,11 @@ def check(
     views = ViewStore.open(store)
     done = int(views.done.sum())
 
-    damaged = track_all(view_store.check(store, **vars(workers)), done, f"checking {store.name}")
+    damaged = track_all(
+        view_store.check(store, **vars(workers)),
+        done,
+        f"checking {store.name}",
+    )
     for reason in views.attributes.failures.values():
         console.print(f"left out: {reason}", style="yellow")
 
@@ -138,7 +156,11 @@ def measure(
     """
     select = some_objects(ViewStore.open(store), split, held_out, objects)
     steps = view_measures.measure(
-        store, measures, **vars(workers), objects=select, overwrite=overwrite
+        store,
+        measures,
+        **vars(workers),
+        objects=select,
+        overwrite=overwrite,
     )
     before, total = follow(steps, f"measuring {store.name}")
     say_done(store, "measured", before, total)

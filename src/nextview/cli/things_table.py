@@ -6,7 +6,12 @@ from rich import box
 from rich.table import Table
 
 from nextview.benchmark.leaderboard import SIGNIFICANT
-from nextview.benchmark.thing_results import groups_of, policies_of_tables, values_of, views_of
+from nextview.benchmark.thing_results import (
+    groups_of,
+    policies_of_tables,
+    values_of,
+    views_of,
+)
 from nextview.benchmark.thing_tables import REFERENCE, ThingTables
 from nextview.cli.progress import Terminal
 
@@ -26,7 +31,9 @@ def _table(found: ThingTables, things: str) -> Table:
     """One group of things, in 80 columns."""
     values = values_of(found, things)
     views = views_of(found)
-    tests = found.tests[(found.tests["things"] == things) & (found.tests["p_holm"] < SIGNIFICANT)]
+    tests = found.tests[
+        (found.tests["things"] == things) & (found.tests["p_holm"] < SIGNIFICANT)
+    ]
     differs = set(zip(tests["policy"], tests["measure"], tests["views"], strict=True))
 
     table = Table(title=f"{things}: share named right after views", box=box.SIMPLE_HEAD)

@@ -42,7 +42,12 @@ ARCHIVES = {
 }
 
 
-def download(archive: Archive, destination: Path, timeout: float = 60, bar: Any = False) -> Path:
+def download(
+    archive: Archive,
+    destination: Path,
+    timeout: float = 60,
+    bar: Any = False,
+) -> Path:
     """Fetch and verify an archive and unpack it below a folder.
 
     Nothing is done if the unpacked folder is already there.
@@ -75,11 +80,17 @@ def download(archive: Archive, destination: Path, timeout: float = 60, bar: Any 
             pooch.get_logger().setLevel("ERROR")
             try:
                 file = pooch.retrieve(
-                    archive.url, f"sha256:{archive.sha256}", "archive.zip", place, downloader=fetch
+                    archive.url,
+                    f"sha256:{archive.sha256}",
+                    "archive.zip",
+                    place,
+                    downloader=fetch,
                 )
                 with zipfile.ZipFile(file) as content:
                     inside = [
-                        m for m in content.infolist() if m.filename.startswith(f"{archive.folder}/")
+                        m
+                        for m in content.infolist()
+                        if m.filename.startswith(f"{archive.folder}/")
                     ]
                     content.extractall(place, inside)
             except (

@@ -129,7 +129,9 @@ class Listing:
 
     def summary(self) -> str:
         """How many objects lie in which layout, and what was left out, for people to read."""
-        objects = "1 object" if len(self.entries) == 1 else f"{len(self.entries)} objects"
+        objects = (
+            "1 object" if len(self.entries) == 1 else f"{len(self.entries)} objects"
+        )
         text = "; ".join([f"{objects}: {self.layout()}", *self.notes])
         phrases = left_out_phrases(self.left_out)
         return f"{text}; left out: {'; '.join(phrases)}" if phrases else text
@@ -182,7 +184,9 @@ def list_dataset(root: str | Path, loose: bool = False) -> list[Entry]:
 
 
 def scan_dataset(
-    root: str | Path, suffixes: tuple[str, ...] = FORMATS, loose: bool = False
+    root: str | Path,
+    suffixes: tuple[str, ...] = FORMATS,
+    loose: bool = False,
 ) -> Listing:
     """List the objects of a dataset folder and what was left out; see ``read_folder``.
 
@@ -264,7 +268,10 @@ def read_folder(
 
 
 def select(
-    entries: list[Entry], dataset: Path, split: str | None, held_out: str | Path | None
+    entries: list[Entry],
+    dataset: Path,
+    split: str | None,
+    held_out: str | Path | None,
 ) -> list[Entry]:
     """Select objects by their split and by a card's list of held-out objects.
 
@@ -288,7 +295,9 @@ def select(
         kept = set(find_card(held_out).held_out)
         entries = [entry for entry in entries if entry.name.partition("@")[0] in kept]
         if not entries:
-            raise DatasetError(f"{dataset}: holds no object that {held_out} calls held out")
+            raise DatasetError(
+                f"{dataset}: holds no object that {held_out} calls held out"
+            )
     return entries
 
 
@@ -311,13 +320,24 @@ class _Content:
     def without_objects(self, kind: str) -> list[tuple[Path, str]]:
         """Return files that are no objects, and folders without any object as a whole."""
         told = [*self.files, *(place for place, _ in self.left_out)]
-        worth_entering = {Path(), *(folder for place in told for folder in place.parents)}
+        worth_entering = {
+            Path(),
+            *(folder for place in told for folder in place.parents),
+        }
         found: dict[Path, str] = {}
+
         for place in [*self.other_files, *self.folders]:
-            empty = [folder for folder in reversed(place.parents) if folder not in worth_entering]
+            empty = [
+                folder
+                for folder in reversed(place.parents)
+                if folder not in worth_entering
+            ]
             top = empty[0] if empty else place
             if top not in worth_entering:
-                found[top] = f"no {kind}" if top in self.other_files else f"holds no {kind}"
+                found[top] = (
+                    f"no {kind}" if top in self.other_files else f"holds no {kind}"
+                )
+
         return list(found.items())
 
 
@@ -329,7 +349,11 @@ def _walk(root: Path, suffixes: tuple[str, ...], skip: Mapping[Path, str]) -> _C
     skipped = {_real(folder): reason for folder, reason in skip.items()}
     seen = set[Path]()
 
-    for folder, below, names in os.walk(root, onerror=unreadable.append, followlinks=True):
+    for folder, below, names in os.walk(
+        root,
+        onerror=unreadable.append,
+        followlinks=True,
+    ):
         here = Path(folder).relative_to(root)
         for name in sorted(names):
             _note_file(content, root, here / name, suffixes)
@@ -349,12 +373,16 @@ def _walk(root: Path, suffixes: tuple[str, ...], skip: Mapping[Path, str]) -> _C
         below[:] = entered
 
     for error in unreadable:
-        content.left_out.append((Path(error.filename).relative_to(root), f"{error.strerror}"))
+        content.left_out.append(
+            (Path(error.filename).relative_to(root), f"{error.strerror}")
+        )
     return content
 
 
 def _real(path: Path) -> Path:
-    return Path(os.path.realpath(path))  # Path.resolve raises where links lead in a circle
+    return Path(
+        os.path.realpath(path)
+    )  # Path.resolve raises where links lead in a circle
 
 
 def _not_entered(folder: Path) -> str | None:
@@ -366,7 +394,12 @@ def _not_entered(folder: Path) -> str | None:
     return VIEW_STORE if (folder / "zarr.json").exists() else None
 
 
-def _note_file(content: _Content, root: Path, place: Path, suffixes: tuple[str, ...]) -> None:
+def _note_file(
+    content: _Content,
+    root: Path,
+    place: Path,
+    suffixes: tuple[str, ...],
+) -> None:
     """Put a file, by its place in a folder, where it belongs."""
     suffix = place.suffix.lower()
     wanted = suffix in suffixes
@@ -378,7 +411,9 @@ def _note_file(content: _Content, root: Path, place: Path, suffixes: tuple[str, 
     elif not place.name.isprintable():
         content.left_out.append((place, UNPRINTABLE))
     elif not (root / place).is_file():
-        content.left_out.append((place, BROKEN_LINK if (root / place).is_symlink() else "no file"))
+        content.left_out.append(
+            (place, BROKEN_LINK if (root / place).is_symlink() else "no file")
+        )
     elif wanted:
         content.files.append(place)
     elif shape and suffixes == FORMATS:
@@ -399,7 +434,11 @@ def _best_files(files: list[Path]) -> tuple[dict[Path, Path], list[tuple[Path, s
         best[model], *rest = sorted(places, key=_preference)
         taken = best[model].suffix.lower()
         for place in rest:
-            which = "another" if place.suffix.lower() == taken else f"the {taken[1:].upper()}"
+            which = (
+                "another"
+                if place.suffix.lower() == taken
+                else f"the {taken[1:].upper()}"
+            )
             others.append((place, f"{which} file of the same model is taken"))
     return best, others
 
@@ -409,7 +448,9 @@ def _model_of(place: Path) -> Path:
 
     It is the path without suffix; in a YCB download, the folder of the object.
     """
-    return place.parent.parent if place.parent.name in YCB_SCANS else place.with_suffix("")
+    return (
+        place.parent.parent if place.parent.name in YCB_SCANS else place.with_suffix("")
+    )
 
 
 def _preference(place: Path) -> tuple[int, bool, int, str]:
@@ -437,7 +478,13 @@ def _split_of(folder: str) -> str:
     return SPLIT_NAMES.get(folder.lower(), "")
 
 
-def _entry(root: Path, model: Path, path: Path, split_first: bool, own_class: bool) -> Entry | None:
+def _entry(
+    root: Path,
+    model: Path,
+    path: Path,
+    split_first: bool,
+    own_class: bool,
+) -> Entry | None:
     """What the place of a model says of it; None if it names no class."""
     # the folder may be that of one object of a YCB download
     *folders, stem = model.parts or (_real(root).name,)
@@ -465,21 +512,29 @@ def _uniquely_named(found: Mapping[Path, Entry]) -> list[Entry]:
         return model.parts[1 + bool(entry.split) :]
 
     def whole(model: Path, entry: Entry) -> str:
-        return "_".join([entry.label, *filter(None, [entry.split]), *below(model, entry)])
+        return "_".join(
+            [entry.label, *filter(None, [entry.split]), *below(model, entry)]
+        )
 
     rules: list[Callable[[Path, Entry], str]] = [
         lambda model, entry: entry.name,
         lambda model, entry: next(iter(below(model, entry)), entry.name),
-        lambda model, entry: f"{entry.label}_{entry.name}" if below(model, entry) else entry.name,
+        lambda model, entry: (
+            f"{entry.label}_{entry.name}" if below(model, entry) else entry.name
+        ),
         whole,
     ]
     for rule in rules:
-        named = [replace(entry, name=rule(model, entry)) for model, entry in found.items()]
+        named = [
+            replace(entry, name=rule(model, entry)) for model, entry in found.items()
+        ]
         if len({entry.name for entry in named}) == len(named):
             return named
 
     first: dict[str, Entry] = {}
-    twice = next(entry for entry in named if first.setdefault(entry.name, entry) is not entry)
+    twice = next(
+        entry for entry in named if first.setdefault(entry.name, entry) is not entry
+    )
     both = f"{first[twice.name].path} and {twice.path}"
     raise DatasetError(f"{both} would both be called {twice.name}; rename one of them")
 
@@ -502,4 +557,6 @@ def _notes(root: Path, entries: list[Entry]) -> list[str]:
 
 def _deep_folders(entries: list[Entry]) -> Counter[Path]:
     """How many objects lie directly in each of the folders below those of the classes."""
-    return Counter(entry.path.parent for entry in entries if entry.layout.endswith(".../MESH"))
+    return Counter(
+        entry.path.parent for entry in entries if entry.layout.endswith(".../MESH")
+    )

@@ -91,7 +91,8 @@ class Measure:
 
 
 MEASURES: dict[
-    str, Measure
+    str,
+    Measure,
 ] = {  # the thesis's own; packages add theirs by entry points of MEASURE_ENTRY_POINTS
     "depth_entropy": Measure(
         lambda view: depth_entropy(view.depth), "depth", "Parisotto et al.; eq. 3"
@@ -102,7 +103,9 @@ MEASURE_ENTRY_POINTS = "nextview.measures"
 
 def all_measures() -> dict[str, Measure]:
     """Every measure that has a name: MEASURES, and those that installed packages add."""
-    return MEASURES | {name: find_measure(name) for name in plugins(MEASURE_ENTRY_POINTS)}
+    return MEASURES | {
+        name: find_measure(name) for name in plugins(MEASURE_ENTRY_POINTS)
+    }
 
 
 def find_measure(name: str) -> Measure:
@@ -115,9 +118,15 @@ def find_measure(name: str) -> Measure:
     path = plugins(MEASURE_ENTRY_POINTS).get(name, name)
     if ":" not in path:
         known = ", ".join([*MEASURES, *plugins(MEASURE_ENTRY_POINTS)])
-        raise MeasureError(f"no measure is called {name!r}; there are {known}, or MODULE:FUNCTION")
-    with plugin_errors(lambda said: MeasureError(f"measure {name} cannot be imported ({said})")):
+        raise MeasureError(
+            f"no measure is called {name!r}; there are {known}, or MODULE:FUNCTION"
+        )
+
+    with plugin_errors(
+        lambda said: MeasureError(f"measure {name} cannot be imported ({said})")
+    ):
         found = plugin(path)
+
     if not callable(found):
         raise MeasureError(f"measure {name} is not a function of a view")
     return found if isinstance(found, Measure) else Measure(found)
@@ -138,12 +147,16 @@ def names_of(names: Sequence[str], meshes: bool) -> tuple[str, ...]:
     """
     if not names:
         return tuple(
-            name for name, measure in all_measures().items() if meshes or measure.needs == "depth"
+            name
+            for name, measure in all_measures().items()
+            if meshes or measure.needs == "depth"
         )
 
     names = tuple(
         dict.fromkeys(
-            each for name in names for each in (all_measures() if name == "all" else (name,))
+            each
+            for name in names
+            for each in (all_measures() if name == "all" else (name,))
         )
     )
 
@@ -176,7 +189,9 @@ def normalise_per_object(values: Floats) -> Float32:
     values = np.asarray(values)
     low = values.min(-1, keepdims=True)
     span = values.max(-1, keepdims=True) - low
-    return np.where(span > 0, (values - low) / np.where(span > 0, span, 1), 0).astype(np.float32)
+    return np.where(span > 0, (values - low) / np.where(span > 0, span, 1), 0).astype(
+        np.float32
+    )
 
 
 def confidence_maps(logits: Floats, labels: NDArray[np.integer]) -> Float32:
@@ -240,7 +255,9 @@ def measure(
         Number of objects done so far, and the number of all.
     """
     names = names_of(names, views is not depth_views)
-    ViewStore.open(path).array("depth")  # says if it is missing, before anything is begun
+    ViewStore.open(path).array(
+        "depth"
+    )  # says if it is missing, before anything is begun
     function = partial(_measure, names, views)
     yield from keep(
         path,
@@ -253,7 +270,12 @@ def measure(
     )
 
 
-def _measure(names: tuple[str, ...], views: MeasuredViews, store: ViewStore, i: int) -> Made:
+def _measure(
+    names: tuple[str, ...],
+    views: MeasuredViews,
+    store: ViewStore,
+    i: int,
+) -> Made:
     object_name = store.names[i]
     functions = {name: find_measure(name) for name in names}
     values = {name: np.empty(len(store.sphere), np.float32) for name in names}
@@ -263,8 +285,15 @@ def _measure(names: tuple[str, ...], views: MeasuredViews, store: ViewStore, i: 
 
     for k, view in enumerate(views(store, i)):
         for name, function in functions.items():
-            guard = nullcontext() if name in MEASURES else plugin_errors(partial(failed, name))
-            with guard, np.errstate(over="ignore"):  # what is too large for float32 is told below
+            guard = (
+                nullcontext()
+                if name in MEASURES
+                else plugin_errors(partial(failed, name))
+            )
+            with (
+                guard,
+                np.errstate(over="ignore"),
+            ):  # what is too large for float32 is told below
                 values[name][k] = function(view)
     for name, found in values.items():
         if not np.isfinite(found).all():
@@ -300,7 +329,9 @@ def keep(
     """
     with writing(path):
         store = ViewStore.open(Path(path).absolute())
-        wanted = store.done & (True if objects is None else np.isin(np.arange(len(store)), objects))
+        wanted = store.done & (
+            True if objects is None else np.isin(np.arange(len(store)), objects)
+        )
         for name in names:
             if overwrite:
                 store.remove(name)
@@ -313,7 +344,12 @@ def keep(
 
         try:
             yield from counted(
-                work, items, total, lambda i: f"{path}: {store.names[i]}", workers, scheduler
+                work,
+                items,
+                total,
+                lambda i: f"{path}: {store.names[i]}",
+                workers,
+                scheduler,
             )
         finally:  # nothing is left of what failed at once
             for name in names:
@@ -321,6 +357,10 @@ def keep(
                     store.remove(name)
 
 
-def _keep_object(path: Path, function: Callable[[ViewStore, int], Made], i: int) -> None:
+def _keep_object(
+    path: Path,
+    function: Callable[[ViewStore, int], Made],
+    i: int,
+) -> None:
     store = opened(path)
     store.write(i, function(store, i))

@@ -55,7 +55,9 @@ def mean_over_classes(values: NDArray, labels: Index) -> float:
         The mean over the classes that occur.
     """
     top = np.asarray(values, np.float64).reshape(-1, 1)
-    return float(class_mean(top, np.ones_like(top), labels.ravel(), np.ones((1, len(top))))[0, 0])
+    return float(
+        class_mean(top, np.ones_like(top), labels.ravel(), np.ones((1, len(top))))[0, 0]
+    )
 
 
 def accuracy(answers: Index, labels: Index) -> dict[str, float]:
@@ -90,7 +92,11 @@ def recogniser_scores(logits: Floats, labels: Index) -> dict[str, dict[str, floa
     return {"single_view": accuracy(logits.argmax(2), spread), "all_views_fused": fused}
 
 
-def reliability(confidence: Float, right: Mask, bins: int = 15) -> tuple[Float, Float, Index]:
+def reliability(
+    confidence: Float,
+    right: Mask,
+    bins: int = 15,
+) -> tuple[Float, Float, Index]:
     """Return the confidence and the accuracy in bins of equal width.
 
     Guo et al., On calibration of modern neural networks (2017), section 2. Empty bins are 0.
@@ -106,7 +112,11 @@ def reliability(confidence: Float, right: Mask, bins: int = 15) -> tuple[Float, 
     at = np.clip((confidence * bins).astype(np.int64), 0, bins - 1)
     count = np.bincount(at, minlength=bins)
     some = np.maximum(count, 1)
-    return np.bincount(at, confidence, bins) / some, np.bincount(at, right, bins) / some, count
+    return (
+        np.bincount(at, confidence, bins) / some,
+        np.bincount(at, right, bins) / some,
+        count,
+    )
 
 
 def calibration_error(confidence: Float, right: Mask) -> float:

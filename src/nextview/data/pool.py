@@ -125,7 +125,8 @@ def counted(
     before = total - len(items)
     yield before, total
     for finished, (item, result) in enumerate(
-        each(function, items, workers, scheduler), before + 1
+        each(function, items, workers, scheduler),
+        before + 1,
     ):
         if isinstance(result, WorkerDied):
             raise DatasetError(f"{name(item)} cannot be computed: {result}")
@@ -133,10 +134,14 @@ def counted(
 
 
 def _in_pool(
-    function: Callable[[GivenItem], Result], items: Sequence[GivenItem], workers: int
+    function: Callable[[GivenItem], Result],
+    items: Sequence[GivenItem],
+    workers: int,
 ) -> Iterator[tuple[GivenItem, Result]]:
     start = (
-        multiprocessing.get_context("spawn") if _of_script(function, items) else _OwnMainContext()
+        multiprocessing.get_context("spawn")
+        if _of_script(function, items)
+        else _OwnMainContext()
     )
     pool = ProcessPoolExecutor(min(workers, len(items)), start, _begin_worker)
     try:
@@ -182,10 +187,14 @@ class _OwnMain(SpawnProcess):
     def _Popen(process_obj: Any) -> Any:
         def without_script(name: str) -> dict[str, Any]:
             told = usual(name)
-            if name != process_obj.name:  # another thread starts a process of its own meanwhile
+            if (
+                name != process_obj.name
+            ):  # another thread starts a process of its own meanwhile
                 return told
             return {
-                key: value for key, value in told.items() if not key.startswith("init_main_from")
+                key: value
+                for key, value in told.items()
+                if not key.startswith("init_main_from")
             }
 
         with _starting:
@@ -218,14 +227,18 @@ def _begin_worker() -> None:
 
 
 def _on_cluster(
-    function: Callable, items: Sequence[GivenItem], scheduler: str
+    function: Callable,
+    items: Sequence[GivenItem],
+    scheduler: str,
 ) -> Iterator[tuple[GivenItem, Any]]:
     with extras():
         from distributed import Client, KilledWorker, as_completed
     try:
         client = Client(scheduler, timeout=PATIENCE)
     except (OSError, ValueError) as error:
-        raise DatasetError(f"{scheduler}: no dask scheduler answers there ({error})") from None
+        raise DatasetError(
+            f"{scheduler}: no dask scheduler answers there ({error})"
+        ) from None
     with client:
         jobs = dict(zip(client.map(function, items, pure=False), items, strict=True))
         for job in as_completed(jobs):

@@ -78,9 +78,16 @@ def predict(
     ).hexdigest()
     with writing(out), unfinished(out, key) as place:
         files = [place / f"{i}.npz" for i in objects]
-        items = [item for item in zip(objects.tolist(), files, strict=True) if not item[1].exists()]
+        items = [
+            item
+            for item in zip(objects.tolist(), files, strict=True)
+            if not item[1].exists()
+        ]
         networks = tuple((name, _card_file(card)) for name, card in maps.items())
-        work = partial(_predict_object, (store.path.absolute(), _card_file(recogniser), networks))
+        work = partial(
+            _predict_object,
+            (store.path.absolute(), _card_file(recogniser), networks),
+        )
         yield from counted(
             work,
             items,
@@ -96,16 +103,31 @@ def predict(
             for name, found in arrays.items()
             if name.startswith("map/")
         }
-        logits = arrays["logits"] if of_size is None else arrays["logits"] + of_size[:, None]
-        bins = arrays.get("azimuth_bins")
-        replace(plan, logits=logits, of_size=of_size, azimuth_bins=bins, maps=maps_found).save(
-            out, overwrite
+        logits = (
+            arrays["logits"] if of_size is None else arrays["logits"] + of_size[:, None]
         )
+        bins = arrays.get("azimuth_bins")
+        replace(
+            plan,
+            logits=logits,
+            of_size=of_size,
+            azimuth_bins=bins,
+            maps=maps_found,
+        ).save(out, overwrite)
 
 
-def _plan(store: ViewStore, objects: Index, recogniser: ModelCard, maps: Cards) -> Predictions:
+def _plan(
+    store: ViewStore,
+    objects: Index,
+    recogniser: ModelCard,
+    maps: Cards,
+) -> Predictions:
     """What store and cards say of the objects; what the networks say is still to come."""
-    own = [card for card in (recogniser, *maps.values()) if card.path.parent != BUNDLED_MODELS]
+    own = [
+        card
+        for card in (recogniser, *maps.values())
+        if card.path.parent != BUNDLED_MODELS
+    ]
     made_by = [
         *store.commands,
         *(line for card in own for line in card.training.commands),
@@ -118,7 +140,9 @@ def _plan(store: ViewStore, objects: Index, recogniser: ModelCard, maps: Cards) 
             name: (card.name, card.sha256)
             for name, card in ({"recogniser": recogniser} | maps).items()
         },
-        valley_classes={name: card.valleys(recogniser.classes) for name, card in maps.items()},
+        valley_classes={
+            name: card.valleys(recogniser.classes) for name, card in maps.items()
+        },
         calibration=recogniser.calibration,
         commands=tuple(dict.fromkeys(made_by)),
     )
@@ -130,7 +154,9 @@ def _card_file(card: ModelCard) -> Path:
 
 @lru_cache(maxsize=1)
 def _open(
-    store: Path, recogniser: Path, maps: Files
+    store: Path,
+    recogniser: Path,
+    maps: Files,
 ) -> tuple[ViewStore, NetworkRecogniser, dict[str, MapNetwork]]:
     """Open store and networks in a process, with one thread each."""
     networks = {name: MapNetwork(card, threads=1) for name, card in maps}
@@ -154,7 +180,9 @@ def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> 
 
     found: dict[str, Any] = {}
     for name, network in maps.items():
-        answers = [network.from_inputs(inputs[network.card.input][batch]) for batch in batches]
+        answers = [
+            network.from_inputs(inputs[network.card.input][batch]) for batch in batches
+        ]
         for kind in answers[0]:
             values = np.concatenate([answer[kind] for answer in answers])
             found[f"map/{name}{kind.removeprefix(network.card.kind)}"] = values
@@ -169,7 +197,9 @@ def _predict_object(files: tuple[Path, Path, Files], item: tuple[int, Path]) -> 
         found["azimuth_bins"] = np.concatenate(bins)
 
     # a view in which nothing is seen says nothing
-    nothing = np.array([not enough_shows(depth > 0) for depth in store.read("depth", i)])
+    nothing = np.array(
+        [not enough_shows(depth > 0) for depth in store.read("depth", i)]
+    )
     for name in {"azimuth_bins", "logits"} & found.keys():
         found[name][nothing] = 0
 

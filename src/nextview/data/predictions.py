@@ -95,11 +95,17 @@ class Predictions:
         }
 
         for name, values in (
-            self._arrays() | {f"map {name}": values for name, values in self.maps.items()}
+            self._arrays()
+            | {f"map {name}": values for name, values in self.maps.items()}
         ).items():
             shape = shapes.get(
                 name,
-                (n, v, self.sphere.rings, self.sphere.azimuths if name.endswith("-sphere") else 3),
+                (
+                    n,
+                    v,
+                    self.sphere.rings,
+                    self.sphere.azimuths if name.endswith("-sphere") else 3,
+                ),
             )
             if values.shape != shape:
                 raise PredictionsError(
@@ -110,15 +116,23 @@ class Predictions:
                     f"{name} of these predictions is of the wrong type, {values.dtype}"
                 )
             if values.dtype.kind == "f" and not np.isfinite(values).all():
-                bad = self.names[int(np.isfinite(values.reshape(n, -1)).all(1).argmin())]
+                bad = self.names[
+                    int(np.isfinite(values.reshape(n, -1)).all(1).argmin())
+                ]
                 raise PredictionsError(f"{name} of object {bad} is not a finite number")
 
-        if not all(isinstance(name, str) for name in (*self.names, *self.classes, *self.models)):
+        if not all(
+            isinstance(name, str) for name in (*self.names, *self.classes, *self.models)
+        ):
             raise PredictionsError("a name in these predictions is not text")
         if len(set(self.names)) < n:
-            raise PredictionsError("two objects of these predictions have the same name")
+            raise PredictionsError(
+                "two objects of these predictions have the same name"
+            )
         if ((self.labels < 0) | (self.labels >= c)).any():
-            raise PredictionsError(f"a label of these predictions is not one of the {c} classes")
+            raise PredictionsError(
+                f"a label of these predictions is not one of the {c} classes"
+            )
 
     def __len__(self) -> int:
         return len(self.names)
@@ -173,7 +187,9 @@ class Predictions:
         return Evidence(
             self.logits[objects, views],
             {name: values[objects, views] for name, values in self.maps.items()},
-            azimuth_bins=None if self.azimuth_bins is None else self.azimuth_bins[objects, views],
+            azimuth_bins=None
+            if self.azimuth_bins is None
+            else self.azimuth_bins[objects, views],
             seen=self.seen[objects, views],
         )
 
@@ -197,9 +213,16 @@ class Predictions:
 
     def of_objects(self, kept: Index) -> "Predictions":
         """Some of the objects, by their rows, (n,)."""
-        arrays: dict[str, Any] = {name: values[kept] for name, values in self._arrays().items()}
+        arrays: dict[str, Any] = {
+            name: values[kept] for name, values in self._arrays().items()
+        }
         maps = {name: values[kept] for name, values in self.maps.items()}
-        return replace(self, **arrays, maps=maps, names=tuple(self.names[i] for i in kept))
+        return replace(
+            self,
+            **arrays,
+            maps=maps,
+            names=tuple(self.names[i] for i in kept),
+        )
 
     @classmethod
     def joined(cls, parts: Sequence["Predictions"]) -> "Predictions":
@@ -211,9 +234,15 @@ class Predictions:
             else None
             for name in found[0]
         }
-        maps = {name: np.concatenate([part.maps[name] for part in parts]) for name in parts[0].maps}
+
+        maps = {
+            name: np.concatenate([part.maps[name] for part in parts])
+            for name in parts[0].maps
+        }
         names = (
-            f"{name}#{k}" if k else name for k, part in enumerate(parts) for name in part.names
+            f"{name}#{k}" if k else name
+            for k, part in enumerate(parts)
+            for name in part.names
         )
         return replace(parts[0], **arrays, maps=maps, names=tuple(names))
 
@@ -246,18 +275,30 @@ class Predictions:
         store = store if isinstance(store, ViewStore) else ViewStore.open(store)
         objects = some_objects(store, split)
         logits = np.array(logits, np.float32)
-        made = replace(cls.of_objects_in(store, objects, classes or store.classes), logits=logits)
+        made = replace(
+            cls.of_objects_in(store, objects, classes or store.classes),
+            logits=logits,
+        )
+
         if (logits >= 0).all() and np.allclose(logits.sum(2), 1, atol=1e-3):
             raise PredictionsError(
                 "these are probabilities where logits are expected; hand in their logarithms"
             )
+
         for row, i in enumerate(objects):
-            logits[row, [not enough_shows(depth > 0) for depth in store.read("depth", i)]] = 0
+            logits[
+                row,
+                [not enough_shows(depth > 0) for depth in store.read("depth", i)],
+            ] = 0
+
         return made
 
     @classmethod
     def of_objects_in(
-        cls, store: ViewStore, objects: Index, classes: Sequence[str]
+        cls,
+        store: ViewStore,
+        objects: Index,
+        classes: Sequence[str],
     ) -> "Predictions":
         """Create empty predictions of objects in a store; all logits are 0.
 
@@ -283,7 +324,10 @@ class Predictions:
         several[group, store.labels] = True
 
         return cls(
-            logits=np.zeros((len(objects), len(store.sphere), len(classes)), np.float32),
+            logits=np.zeros(
+                (len(objects), len(store.sphere), len(classes)),
+                np.float32,
+            ),
             maps={},
             depth_entropy=store.measure()[objects],
             names=tuple(store.names[i] for i in objects),
@@ -324,9 +368,9 @@ class Predictions:
             "distance": self.sphere.distance,
             "calibration": np.array(msgspec.json.encode(self.calibration).decode()),
             "store": np.array(self.store),
-            "models": np.array([(kind, *model) for kind, model in self.models.items()]).reshape(
-                -1, 3
-            ),
+            "models": np.array(
+                [(kind, *model) for kind, model in self.models.items()]
+            ).reshape(-1, 3),
             "commands": np.array(self.commands, np.str_),
         }
 
@@ -341,8 +385,12 @@ class Predictions:
         """
         path = Path(path)
         if not path.exists():
-            raise PredictionsError(f"{path}: there is no such file; make one with nextview predict")
+            raise PredictionsError(
+                f"{path}: there is no such file; make one with nextview predict"
+            )
+
         regular_file(path, "a predictions file", PredictionsError)
+
         try:
             return cls._from(_read(path))
         except KeyError as error:
@@ -351,7 +399,9 @@ class Predictions:
             raise PredictionsError(f"{path}: {error}") from None
         except DAMAGED as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise PredictionsError(f"{path}: not a predictions file ({reason})") from None
+            raise PredictionsError(
+                f"{path}: not a predictions file ({reason})"
+            ) from None
 
     @classmethod
     def _from(cls, f: dict[str, NDArray]) -> "Predictions":
@@ -377,13 +427,21 @@ class Predictions:
             names=tuple(f["names"].tolist()),
             classes=tuple(f["classes"].tolist()),
             sphere=ViewSphere(
-                tuple(f["elevations"].tolist()), int(f["azimuths"]), float(f["distance"])
+                tuple(f["elevations"].tolist()),
+                int(f["azimuths"]),
+                float(f["distance"]),
             ),
             models={kind: (name, sha) for kind, name, sha in f["models"].tolist()},
             valley_classes={
-                name: tuple(classes.tolist()) for name, classes in group("valley/").items()
+                name: tuple(classes.tolist())
+                for name, classes in group("valley/").items()
             },
-            calibration=decode_record(trust, Calibration, "not a calibration", PredictionsError),
+            calibration=decode_record(
+                trust,
+                Calibration,
+                "not a calibration",
+                PredictionsError,
+            ),
             store=str(f.get("store", "")),
             commands=tuple(f["commands"].tolist()) if "commands" in f else (),
         )
@@ -393,12 +451,17 @@ def _read(path: Path) -> dict[str, NDArray]:
     """Read the arrays of a file, once the sizes that they announce were checked."""
     with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
         members = file.zip.infolist()
-        if sum(member.file_size for member in members) > PACKED * path.stat().st_size + SPARE:
+        if (
+            sum(member.file_size for member in members)
+            > PACKED * path.stat().st_size + SPARE
+        ):
             raise PredictionsError("announces more than such a file can hold")
         for member in members:
             with file.zip.open(member) as stream:
                 npy.read_magic(stream)
                 shape, _, dtype = npy.read_array_header_1_0(stream)
             if math.prod(shape) * dtype.itemsize > member.file_size:
-                raise PredictionsError(f"{member.filename} announces more than it holds")
+                raise PredictionsError(
+                    f"{member.filename} announces more than it holds"
+                )
         return dict(file)

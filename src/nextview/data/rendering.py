@@ -51,9 +51,13 @@ from nextview.simulation.simulated import OccludedCamera, SimulatedCamera
 from nextview.types import Float
 
 AnySensor = Sensor | SensorMix | None
-LARGEST_CHUNK = 2**31 - 2**20  # bytes that may be compressed at once, the compressor's own included
+LARGEST_CHUNK = (
+    2**31 - 2**20
+)  # bytes that may be compressed at once, the compressor's own included
 ODD_MESHES = 10  # that are named
-FARTHEST_STORED = np.iinfo(np.uint16).max * DEPTH_UNIT  # depth that can be stored, object radii
+FARTHEST_STORED = (
+    np.iinfo(np.uint16).max * DEPTH_UNIT
+)  # depth that can be stored, object radii
 # sets the draws of a sensor apart from those of a deformation: no byte of a name is as large
 SENSING = 256
 
@@ -94,10 +98,19 @@ class Deform:
         """The new object, normalised again."""
         factors, angle = self.draw(seed, name)
         stretched = mesh.vertices * mesh.radius * factors
-        return make_mesh(stretched @ rotation_z(angle).T, mesh.faces, mesh.name, mesh.unit)
+        return make_mesh(
+            stretched @ rotation_z(angle).T,
+            mesh.faces,
+            mesh.name,
+            mesh.unit,
+        )
 
 
-def render_object(camera: Camera, sphere: ViewSphere, size: int) -> dict[str, np.ndarray]:
+def render_object(
+    camera: Camera,
+    sphere: ViewSphere,
+    size: int,
+) -> dict[str, np.ndarray]:
     """Render all views of an object as the store keeps them.
 
     Args:
@@ -116,14 +129,17 @@ def render_object(camera: Camera, sphere: ViewSphere, size: int) -> dict[str, np
         observation = camera.observe(pose)
         image[view] = observation.picture
         points[view] = observation.points
-        depth[view] = np.rint(observation.depth / DEPTH_UNIT).clip(max=np.iinfo(np.uint16).max)
+        depth[view] = np.rint(observation.depth / DEPTH_UNIT).clip(
+            max=np.iinfo(np.uint16).max
+        )
 
     return {
         "image": image,
         "depth": depth,
         "points": np.rint(points / POINT_UNIT).clip(-32767, 32767).astype(np.int16),
         "measures/depth_entropy": np.array(
-            [depth_entropy(d * DEPTH_UNIT) for d in depth], np.float32
+            [depth_entropy(d * DEPTH_UNIT) for d in depth],
+            np.float32,
         ),
     }
 
@@ -202,21 +218,32 @@ def render(
         with ThreadPoolExecutor() as pool:
             hashes = list(pool.map(_hash, [e.path for e in entries]))
         recipe = {
-            name: getattr(options, name) for name in ("seed", "noise_seed", "unit", "largest_part")
+            name: getattr(options, name)
+            for name in ("seed", "noise_seed", "unit", "largest_part")
         } | vars(options.deform)
-        recipe |= {"sha256": hashes, "sensor": None if sensor is None else sensor.to_dict()}
-        recipe |= {"scene": None if options.meshes is None else SCENE_SIDE, "dataset": dataset.name}
+        recipe |= {
+            "sha256": hashes,
+            "sensor": None if sensor is None else sensor.to_dict(),
+        }
+        recipe |= {
+            "scene": None if options.meshes is None else SCENE_SIDE,
+            "dataset": dataset.name,
+        }
         store = _begin(path, describe(entries, sphere, size, recipe), overwrite)
         if (made_by := command()) not in store.commands:
             store.note(commands=[*store.commands, made_by])
         # Largest files first, so that no worker is left with a long one at the end.
         todo = sorted(
-            np.flatnonzero(~store.done).tolist(), key=lambda i: -entries[i].path.stat().st_size
+            np.flatnonzero(~store.done).tolist(),
+            key=lambda i: -entries[i].path.stat().st_size,
         )
         items = [(i, entries[i]) for i in todo]
         odd: list[str] = []
         for (i, entry), result in each(
-            partial(_render_entry, path, options, sensor), items, workers, scheduler
+            partial(_render_entry, path, options, sensor),
+            items,
+            workers,
+            scheduler,
         ):
             reason: str | None
             if isinstance(result, WorkerDied):
@@ -225,7 +252,9 @@ def render(
                 reason, doubts = result
                 odd += [f"{entry.path}: {'; '.join(doubts)}"] if doubts else []
             others = {
-                name: said for name, said in store.attributes.failures.items() if name != entry.name
+                name: said
+                for name, said in store.attributes.failures.items()
+                if name != entry.name
             }
             if reason is not None:
                 # Only this process writes reasons; the status comes last, as for an object that is
@@ -244,11 +273,17 @@ def _warn(odd: list[str]) -> None:
         _log.warning("%s", sentence)
     if len(odd) > ODD_MESHES:
         _log.warning(
-            "and %d more meshes look odd; nextview recognise says it of each", len(odd) - ODD_MESHES
+            "and %d more meshes look odd; nextview recognise says it of each",
+            len(odd) - ODD_MESHES,
         )
 
 
-def _check(path: Path, sphere: ViewSphere, size: int, options: RenderOptions) -> AnySensor:
+def _check(
+    path: Path,
+    sphere: ViewSphere,
+    size: int,
+    options: RenderOptions,
+) -> AnySensor:
     """Refuse settings that make no views; the sensor, if there is one."""
     whole(
         size,
@@ -309,13 +344,18 @@ def listing(dataset: Path, options: RenderOptions) -> Listing:
                 f"{dataset}: holds scenes; say with --meshes where the meshes are in them"
             ) from None
         raise
-    return replace(found, entries=select(found.entries, dataset, options.split, options.held_out))
+    return replace(
+        found,
+        entries=select(found.entries, dataset, options.split, options.held_out),
+    )
 
 
 def rotations(store: ViewStore) -> Float:
     """Return the rotation about z of each object of a store, radians, (N,)."""
     deform = Deform(store.attributes.stretch, store.attributes.rotated)
-    return np.array([deform.draw(store.attributes.seed, name)[1] for name in store.names])
+    return np.array(
+        [deform.draw(store.attributes.seed, name)[1] for name in store.names]
+    )
 
 
 def deformed(store: ViewStore, mesh: Mesh, name: str) -> Mesh:
@@ -364,16 +404,23 @@ def _begin(path: Path, wanted: Attributes, overwrite: bool) -> ViewStore:
     if wanted.unit is not None and there.unit is None:
         store.note(unit=wanted.unit)
     if wanted.unit not in (None, there.unit):
-        raise DatasetError(f"{path}: its meshes are measured in {there.unit}, not {wanted.unit}")
+        raise DatasetError(
+            f"{path}: its meshes are measured in {there.unit}, not {wanted.unit}"
+        )
     for name in store.rendered:
         store.array(name)  # says what is missing
-    for leftover in path.rglob("*.partial"):  # what was being written when a run was killed
+    for leftover in path.rglob(
+        "*.partial"
+    ):  # what was being written when a run was killed
         leftover.unlink()
     return store
 
 
 def _render_entry(
-    path: Path, options: RenderOptions, sensor: AnySensor, item: tuple[int, Entry]
+    path: Path,
+    options: RenderOptions,
+    sensor: AnySensor,
+    item: tuple[int, Entry],
 ) -> tuple[str | None, tuple[str, ...]]:
     """Render one object, or the target of one scene, into the store.
 
@@ -394,7 +441,10 @@ def _render_entry(
 
 
 def _rendered(
-    store: ViewStore, options: RenderOptions, sensor: AnySensor, entry: Entry
+    store: ViewStore,
+    options: RenderOptions,
+    sensor: AnySensor,
+    entry: Entry,
 ) -> tuple[dict[str, NDArray], tuple[str, ...]]:
     """What the store keeps of an object, and what is odd about its mesh."""
     sphere = store.sphere
@@ -406,7 +456,10 @@ def _rendered(
         # a sensor looks at a mesh of known unit in its true size
         unit = None if sensor is None else options.unit
         read = load_mesh(
-            entry.path, unit=unit, max_faces=options.max_faces, largest_part=options.largest_part
+            entry.path,
+            unit=unit,
+            max_faces=options.max_faces,
+            largest_part=options.largest_part,
         )
         doubts = mesh_warnings(replace(read, unit=options.unit))
         mesh = deformed(store, read, entry.name)
@@ -415,10 +468,14 @@ def _rendered(
             if sensor is None
             else SensedCamera(mesh, sensor, rng)
         )
-        return render_object(camera, sphere, size) | {"radius": np.array(mesh.radius)}, doubts
+        return render_object(camera, sphere, size) | {
+            "radius": np.array(mesh.radius)
+        }, doubts
 
     scene = build_scene(
-        SceneLayout.load(entry.path), Path(options.meshes).absolute(), options.max_faces
+        SceneLayout.load(entry.path),
+        Path(options.meshes).absolute(),
+        options.max_faces,
     )
     camera = (
         OccludedCamera(scene, size, sphere.distance)

@@ -32,7 +32,9 @@ from nextview.simulation.scene import footprint, mesh_hash, separation
 from nextview.simulation.scene_layout import SUFFIX
 from nextview.types import Float
 
-ROOM_NAME = "room"  # in the names of rooms, where other scenes have their level of clutter
+ROOM_NAME = (
+    "room"  # in the names of rooms, where other scenes have their level of clutter
+)
 ROOM_LAYOUTS_TRIED = 60
 VIEWS_TRIED = 60  # first views of one layout
 
@@ -52,7 +54,11 @@ TABLE_LEG = 0.05
 TABLE_EDGE = 0.08  # metres from the edge of the table to what lies on it, at least
 LEAST_SPACING = 0.08  # metres between two things on a table, at least
 MOST_BESIDE = 2
-BOOK = ((0.05, 0.25), (0.05, 0.2), (0.03, 0.15))  # width, depth and height of boxes on a table
+BOOK = (
+    (0.05, 0.25),
+    (0.05, 0.2),
+    (0.03, 0.15),
+)  # width, depth and height of boxes on a table
 CABINET = ((0.4, 1.2), (0.3, 0.5), (0.6, 2.0))
 
 # of the first view: metres from the target, metres over the floor, and over a table
@@ -63,14 +69,17 @@ CLOSEST_CAMERA = 0.8  # metres from the target's sphere
 TABLE_DISTANCE = (0.4, 0.7)
 CLOSEST_TO_SMALL = 0.25
 TABLE_ELEVATION = (20.0, 60.0)  # degrees
-AIM_OFF = 0.02  # standard deviation of where the camera is aimed, as a part of its distance
-LEAST_SHOWN = (
-    0.7  # share of the target's picture that nothing else hides in the first view, at least
+AIM_OFF = (
+    0.02  # standard deviation of where the camera is aimed, as a part of its distance
 )
+# share of the target's picture that nothing else hides in the first view, at least
+LEAST_SHOWN = 0.7
 PREVIEW_SIDE = 96  # pixels across, in which that is measured
 FIELD = 0.9  # of that picture: its half width at unit distance
 
-NO_POSE = tuple(np.eye(4).ravel().tolist())  # the first pose of a layout that has none yet
+NO_POSE = tuple(
+    np.eye(4).ravel().tolist()
+)  # the first pose of a layout that has none yet
 
 # the target, the other things, and the boxes beside them
 Furnished = tuple[Standing, list[Standing], list[Slab]]
@@ -191,12 +200,24 @@ def draw_rooms(
     todo = [task for task in wanted if not task.path.exists()]
     source = _source(dataset.absolute(), unit)
     with writing(out):
-        for task, result in each(partial(_draw, source, seed), todo, workers, scheduler):
-            yield task.name, f"{task.name}: {result}" if isinstance(result, WorkerDied) else result
+        for task, result in each(
+            partial(_draw, source, seed),
+            todo,
+            workers,
+            scheduler,
+        ):
+            yield (
+                task.name,
+                f"{task.name}: {result}" if isinstance(result, WorkerDied) else result,
+            )
 
 
 def room_tasks(
-    dataset: Path, out: Path, rooms: int | None, seed: int, split: str | None
+    dataset: Path,
+    out: Path,
+    rooms: int | None,
+    seed: int,
+    split: str | None,
 ) -> list[RoomTask]:
     """Return a task for each room to draw, see ``draw_rooms``.
 
@@ -315,10 +336,16 @@ def life_radius(mesh: Mesh, label: str, rng: np.random.Generator) -> float:
 
 
 def _layout(
-    source: RoomMeshes, task: RoomTask, mesh: Mesh, radius: float, rng: np.random.Generator
+    source: RoomMeshes,
+    task: RoomTask,
+    mesh: Mesh,
+    radius: float,
+    rng: np.random.Generator,
 ) -> RoomLayout | None:
     """A room without a first view, its target on the floor or a table; None where nothing fits."""
-    width, depth, height = rng.uniform(*np.transpose([ROOM_SIDE, ROOM_SIDE, ROOM_HEIGHT]))
+    width, depth, height = rng.uniform(
+        *np.transpose([ROOM_SIDE, ROOM_SIDE, ROOM_HEIGHT])
+    )
     small = task.label in ON_TABLES or (mesh.metres is not None and radius < HAND_SIZED)
     furnish = _on_table if small else _on_floor
 
@@ -417,7 +444,12 @@ def _standing(
     """
     wall = int(rng.integers(4))
     azimuth = np.pi / 2 * wall - back if against else rng.uniform(0, 2 * np.pi)
-    thing = Standing(file, mesh_hash(source.folder / file), _short(radius), azimuth=_short(azimuth))
+    thing = Standing(
+        file,
+        mesh_hash(source.folder / file),
+        _short(radius),
+        azimuth=_short(azimuth),
+    )
     half = np.ptp(at_rest(mesh.vertices, thing)[:, :2], axis=0) / 2
     free = np.array(room) / 2 - half - AT_WALL[1]
     if (free <= 0).any():
@@ -446,7 +478,9 @@ def _furniture(
     for _ in range(int(rng.integers(FURNITURE[0], FURNITURE[1] + 1))):
         for _ in range(PLACES_TRIED):
             thing: Standing | Slab | None = _cabinet(room, rng)
-            corners = _slab_corners(thing) if isinstance(thing, Slab) else np.zeros((0, 3))
+            corners = (
+                _slab_corners(thing) if isinstance(thing, Slab) else np.zeros((0, 3))
+            )
             if others and rng.integers(3):
                 file, label = others[int(rng.integers(len(others)))]
                 mesh = _other(source.folder / file)
@@ -529,7 +563,9 @@ def _lying(
     Its footprint is added to those of the other things.
     """
     radius, azimuth, rest = how
-    rotation = IDENTITY if np.array_equal(rest, np.eye(3)) else tuple(rest.ravel().tolist())
+    rotation = (
+        IDENTITY if np.array_equal(rest, np.eye(3)) else tuple(rest.ravel().tolist())
+    )
     sha256 = mesh_hash(source.folder / file)
 
     for _ in range(PLACES_TRIED):
@@ -553,7 +589,11 @@ def _lying(
 
 
 def _beside(
-    source: RoomMeshes, task: RoomTask, top: Slab, taken: list[Float], rng: np.random.Generator
+    source: RoomMeshes,
+    task: RoomTask,
+    top: Slab,
+    taken: list[Float],
+    rng: np.random.Generator,
 ) -> Standing | Slab | None:
     """Another thing on a table, or a box; None where it does not fit."""
     others = [file for file in source.small.get(task.split, ()) if file != task.target]
@@ -586,10 +626,17 @@ def _fits(outline: Float, top: Slab, taken: list[Float]) -> bool:
     """Whether an outline, (K, 2), lies on a table, away from its edge and from what is taken."""
     own = (outline - (top.x, top.y)) @ rotation_z(top.azimuth)[:2, :2]
     inside = (np.abs(own) < np.array([top.width, top.depth]) / 2 - TABLE_EDGE / 2).all()
-    return bool(inside) and all(separation(outline, other) >= LEAST_SPACING for other in taken)
+    return bool(inside) and all(
+        separation(outline, other) >= LEAST_SPACING for other in taken
+    )
 
 
-def _slab(place: Sequence[float], azimuth: float, size: Sequence[float], even: bool = True) -> Slab:
+def _slab(
+    place: Sequence[float],
+    azimuth: float,
+    size: Sequence[float],
+    even: bool = True,
+) -> Slab:
     """A box whose bottom is at a place, (3,), of a width, a depth and a height."""
     x, y, z = map(_short, place)
     width, depth, height = map(_short, size)
@@ -599,7 +646,10 @@ def _slab(place: Sequence[float], azimuth: float, size: Sequence[float], even: b
 def _slab_corners(slab: Slab) -> Float:
     """The corners of a box, (8, 3)."""
     half = np.array([slab.width, slab.depth]) / 2
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)], float)
+    corners = np.array(
+        [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)],
+        float,
+    )
     corners *= (*half, slab.height)
     return corners @ rotation_z(slab.azimuth).T + (slab.x, slab.y, slab.z)
 
@@ -612,7 +662,11 @@ def _first_view(room: Room, rng: np.random.Generator) -> Float | None:
         if room.layout.kind == "floor" or room.layout.label in ON_TABLES:
             distance = max(rng.uniform(*FLOOR_DISTANCE), room.radius + CLOSEST_CAMERA)
             lowest = max(FLOOR_HEIGHT[0], room.layout.target.z + ABOVE_TABLE)
-            rise = np.clip((rng.uniform(lowest, FLOOR_HEIGHT[1]) - centre[2]) / distance, -1, 1)
+            rise = np.clip(
+                (rng.uniform(lowest, FLOOR_HEIGHT[1]) - centre[2]) / distance,
+                -1,
+                1,
+            )
         else:
             distance = max(rng.uniform(*TABLE_DISTANCE), room.radius + CLOSEST_TO_SMALL)
             rise = np.sin(np.radians(rng.uniform(*TABLE_ELEVATION)))

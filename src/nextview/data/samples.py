@@ -60,7 +60,9 @@ SAMPLE_MESHES: dict[str, Callable[[], list[BoxCorners]]] = {
 def sample_mesh(name: str) -> Mesh:
     """A sample object by name."""
     if name not in SAMPLE_MESHES:
-        raise UsageError(f"no sample is called {name!r}; there are {', '.join(SAMPLE_MESHES)}")
+        raise UsageError(
+            f"no sample is called {name!r}; there are {', '.join(SAMPLE_MESHES)}"
+        )
     return boxes_mesh(SAMPLE_MESHES[name](), name)
 
 
@@ -76,7 +78,14 @@ def boxes_mesh(boxes: list[BoxCorners], name: str) -> Mesh:
     """
     corner = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
     sides = np.array(
-        [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+        [
+            (0, 1, 3, 2),
+            (4, 6, 7, 5),
+            (0, 4, 5, 1),
+            (2, 3, 7, 6),
+            (0, 2, 6, 4),
+            (1, 5, 7, 3),
+        ]
     )
     triangles = np.concatenate([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]])
     spans = np.sort(np.array(boxes, float), axis=1)  # (boxes, low and high, xyz)

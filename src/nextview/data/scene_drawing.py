@@ -34,7 +34,13 @@ from nextview.simulation.scene import (
     place,
     separation,
 )
-from nextview.simulation.scene_layout import CLUTTER_LEVELS, SUFFIX, Block, Placement, SceneLayout
+from nextview.simulation.scene_layout import (
+    CLUTTER_LEVELS,
+    SUFFIX,
+    Block,
+    Placement,
+    SceneLayout,
+)
 from nextview.simulation.simulated import SimulatedCamera, visible_shares
 from nextview.types import Mask
 
@@ -55,8 +61,14 @@ THING_GAP = 0.04  # between things, at least, object radii
 # from the target's middle, object radii
 CLUTTER_DISTANCES = {"light": (0.5, 2.6), "medium": (0.5, 2.3), "heavy": (0.5, 2.1)}
 OBJECT_RADIUS = (0.5, 1.1)
-FEWEST_OBJECTS = 2  # of things that are no boxes or walls, if there are any meshes for them
-OBJECTS = {"light": 0.7, "medium": 0.6, "heavy": 0.4}  # share of objects among objects and boxes
+FEWEST_OBJECTS = (
+    2  # of things that are no boxes or walls, if there are any meshes for them
+)
+OBJECTS = {
+    "light": 0.7,
+    "medium": 0.6,
+    "heavy": 0.4,
+}  # share of objects among objects and boxes
 # what is low hides nothing from above
 BOX_HEIGHT = {"light": BLOCK_HEIGHT, "medium": BLOCK_HEIGHT, "heavy": (1.4, 2.9)}
 # what a thing hides at least: the table is soon full
@@ -67,9 +79,8 @@ WALL_AWAY = (1.2, 1.9)
 WALL_WIDTH = (2.0, 3.5)
 WALL_DEPTH = 0.1
 WALL_HEIGHT = (1.0, 2.6)
-MESHES_TRIED = (
-    8  # meshes that are tried in one scene, at several places each: reading them takes longest
-)
+# meshes that are tried in one scene, at several places each: reading them takes longest
+MESHES_TRIED = 8
 # triangles of an object around the target: larger ones are passed over, for the sake of time
 MOST_FACES = 100_000
 MOST_SCENES = 100_000  # at each level, of each split
@@ -158,14 +169,24 @@ def draw_scenes(
 
     files: dict[str, list[str]] = {}
     for entry in list_dataset(dataset):
-        files.setdefault(entry.split, []).append(entry.path.relative_to(dataset).as_posix())
+        files.setdefault(entry.split, []).append(
+            entry.path.relative_to(dataset).as_posix()
+        )
     meshes = {
-        name: Meshes(dataset.absolute(), tuple(sorted(found))) for name, found in files.items()
+        name: Meshes(dataset.absolute(), tuple(sorted(found)))
+        for name, found in files.items()
     }
 
     with writing(out):
-        for task, result in each(partial(_draw, meshes, seed), todo, workers, scheduler):
-            reason = f"{task.name}: {result}" if isinstance(result, WorkerDied) else result
+        for task, result in each(
+            partial(_draw, meshes, seed),
+            todo,
+            workers,
+            scheduler,
+        ):
+            reason = (
+                f"{task.name}: {result}" if isinstance(result, WorkerDied) else result
+            )
             yield task.name, reason
 
 
@@ -217,7 +238,13 @@ def tasks(
                 name = f"{entry.name}@{level}-{number // len(mine)}"
                 path = out.absolute() / entry.label / one / f"{name}{SUFFIX}"
                 found.append(
-                    SceneTask(entry.path.relative_to(dataset).as_posix(), one, level, name, path)
+                    SceneTask(
+                        entry.path.relative_to(dataset).as_posix(),
+                        one,
+                        level,
+                        name,
+                        path,
+                    )
                 )
 
     return found
@@ -226,13 +253,21 @@ def tasks(
 def _draw(meshes: dict[str, Meshes], seed: int, task: SceneTask) -> str | None:
     """Draw one scene into its file; the reason if that cannot be."""
     try:
-        draw_scene(task.target, meshes[task.split], task.level, seed, task.name).save(task.path)
+        draw_scene(task.target, meshes[task.split], task.level, seed, task.name).save(
+            task.path
+        )
     except (MeshError, DatasetError) as error:
         return str(error)
     return None
 
 
-def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) -> SceneLayout:
+def draw_scene(
+    target: str,
+    meshes: Meshes,
+    level: str,
+    seed: int,
+    name: str,
+) -> SceneLayout:
     """Draw a scene around a target.
 
     Args:
@@ -268,18 +303,34 @@ def draw_scene(target: str, meshes: Meshes, level: str, seed: int, name: str) ->
 
         if placed is not None:
             scene = TargetScene(mesh, tuple(item for _, item in placed))
-            objects = tuple(thing for thing, _ in placed if isinstance(thing, Placement))
+            objects = tuple(
+                thing for thing, _ in placed if isinstance(thing, Placement)
+            )
             blocks = tuple(thing for thing, _ in placed if isinstance(thing, Block))
             shares = tuple(
                 _rounded(
-                    *visible_shares(scene, SCENE_VIEWS.poses, SHARE_PIXELS, SCENE_VIEWS.distance)
+                    *visible_shares(
+                        scene,
+                        SCENE_VIEWS.poses,
+                        SHARE_PIXELS,
+                        SCENE_VIEWS.distance,
+                    )
                 )
             )
             unreachable = tuple(
                 np.flatnonzero(~scene.reachable(SCENE_VIEWS.poses[:, :3, 3])).tolist()
             )
             middle = Placement(target, mesh_hash(meshes.folder / target))
-            return SceneLayout(name, level, seed, middle, objects, blocks, shares, unreachable)
+            return SceneLayout(
+                name,
+                level,
+                seed,
+                middle,
+                objects,
+                blocks,
+                shares,
+                unreachable,
+            )
     raise DatasetError(
         f"{meshes.folder / target}: no layout of {SCENE_LAYOUTS_TRIED} lets"
         f" {CLUTTER_LEVELS[level]:.0%} of it show"
@@ -298,12 +349,17 @@ class _Hiding:
         for view, pose in enumerate(SCENE_VIEWS.poses):
             seen = camera.observe(pose)
             rows, columns = np.nonzero(seen.depth)
-            ahead = PinholeCamera.of(seen.intrinsics, seen.depth.shape).rays_through(rows, columns)
+            ahead = PinholeCamera.of(seen.intrinsics, seen.depth.shape).rays_through(
+                rows,
+                columns,
+            )
             rays.append(seen.depth[rows, columns, None] * ahead @ pose[:3, :3].T)
             eyes.append(np.broadcast_to(pose[:3, 3], rays[-1].shape))
             views.append(np.full(len(rows), view))
 
-        self.eyes, self.rays = (np.concatenate(rows).astype(np.float32) for rows in (eyes, rays))
+        self.eyes, self.rays = (
+            np.concatenate(rows).astype(np.float32) for rows in (eyes, rays)
+        )
         self.views = np.concatenate(views)
         self.whole = np.maximum(np.bincount(self.views, minlength=len(SCENE_VIEWS)), 1)
 
@@ -318,7 +374,8 @@ class _Hiding:
             Whether each ray is blocked by the item, (R,) bool.
         """
         length, _ = RayCaster([(item.vertices, item.faces)]).cast(
-            self.eyes[still], self.rays[still]
+            self.eyes[still],
+            self.rays[still],
         )
         hidden = np.zeros(len(still), bool)
         hidden[still] = length < 1
@@ -327,7 +384,9 @@ class _Hiding:
     def share(self, still: Mask) -> float:
         """Share of the target that shows, on the average over the views."""
         return float(
-            (np.bincount(self.views[still], minlength=len(SCENE_VIEWS)) / self.whole).mean()
+            (
+                np.bincount(self.views[still], minlength=len(SCENE_VIEWS)) / self.whole
+            ).mean()
         )
 
 
@@ -359,9 +418,14 @@ def _layout(
 
         short = (
             bool(others)
-            and sum(isinstance(thing, Placement) for thing, _ in placed) < FEWEST_OBJECTS
+            and sum(isinstance(thing, Placement) for thing, _ in placed)
+            < FEWEST_OBJECTS
         )
-        thing = _wall(rng) if len(placed) < walls else _thing(others, folder, level, short, rng)
+        thing = (
+            _wall(rng)
+            if len(placed) < walls
+            else _thing(others, folder, level, short, rng)
+        )
         item = _stood(thing, folder, floor)
         if item is None or np.abs(item.footprint).max() > SCENE_TABLE:
             continue
@@ -388,20 +452,30 @@ def _layout(
 
 
 def _thing(
-    others: Sequence[str], folder: Path, level: str, short: bool, rng: np.random.Generator
+    others: Sequence[str],
+    folder: Path,
+    level: str,
+    short: bool,
+    rng: np.random.Generator,
 ) -> Placement | Block:
     """An object or a box, anywhere around; an object where there are too few."""
     away = rng.uniform(*CLUTTER_DISTANCES[level])
     towards = rng.uniform(0, 2 * np.pi)
     azimuth = rng.uniform(0, 2 * np.pi)
     there = away * np.cos(towards), away * np.sin(towards), azimuth
+
     if short or (others and rng.random() < OBJECTS[level]):
         file = others[int(rng.integers(len(others)))]
         return Placement(
-            file, mesh_hash(folder / file), *_rounded(*there, rng.uniform(*OBJECT_RADIUS))
+            file,
+            mesh_hash(folder / file),
+            *_rounded(*there, rng.uniform(*OBJECT_RADIUS)),
         )
+
     x, y, azimuth, *size = _rounded(
-        *there, *rng.uniform(*FOOTPRINT, 2), rng.uniform(*BOX_HEIGHT[level])
+        *there,
+        *rng.uniform(*FOOTPRINT, 2),
+        rng.uniform(*BOX_HEIGHT[level]),
     )
     return Block(x, y, azimuth, size[0], size[1], size[2])
 
@@ -415,7 +489,11 @@ def _wall(rng: np.random.Generator) -> Block:
     y = away * np.sin(towards)
     azimuth = towards + np.pi / 2 + lean
     x, y, azimuth, width, height = _rounded(
-        x, y, azimuth, rng.uniform(*WALL_WIDTH), rng.uniform(*WALL_HEIGHT)
+        x,
+        y,
+        azimuth,
+        rng.uniform(*WALL_WIDTH),
+        rng.uniform(*WALL_HEIGHT),
     )
     return Block(x, y, azimuth, width, WALL_DEPTH, height, wall=True)
 

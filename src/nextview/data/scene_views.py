@@ -60,7 +60,12 @@ def render_scene(scene: TargetScene, sphere: ViewSphere) -> dict[str, NDArray]:
     Returns:
         The arrays by their names in the store.
     """
-    camera = SceneCamera(scene, scene_intrinsics(sphere.distance), (SCENE_SIDE, SCENE_SIDE))
+    camera = SceneCamera(
+        scene,
+        scene_intrinsics(sphere.distance),
+        (SCENE_SIDE, SCENE_SIDE),
+    )
+
     looks = [camera.look(pose) for pose in sphere.poses]
     positions = sphere.poses[:, :3, 3]
     depth = np.rint(np.stack([depth for depth, _ in looks]) / SCENE_UNIT)
@@ -69,7 +74,10 @@ def render_scene(scene: TargetScene, sphere: ViewSphere) -> dict[str, NDArray]:
         "scene/owner": np.stack([owner for _, owner in looks]),
         "scene/reachable": scene.reachable(positions),
         "measures/visible_share": visible_shares(
-            scene, sphere.poses, SHARE_SIZE, sphere.distance
+            scene,
+            sphere.poses,
+            SHARE_SIZE,
+            sphere.distance,
         ).astype(np.float32),
         "measures/clearance": scene.clearance(positions).astype(np.float32),
     }
@@ -150,7 +158,10 @@ def sight_of(scenes: "SceneSight | None", objects: Index) -> tuple[Constrain, Vi
     if scenes is None:
         return unconstrained, lambda state: np.ones(state.visited.shape)
     return (
-        lambda state: replace(state, reachable=scenes.reachable[objects[state.episodes]]),
+        lambda state: replace(
+            state,
+            reachable=scenes.reachable[objects[state.episodes]],
+        ),
         lambda state: scenes.visibility(objects[state.episodes], state.visited),
     )
 
@@ -187,7 +198,10 @@ class SceneSight:
     rows: Index
     reachable: Mask
     _found: dict[tuple[int, bytes], Float32] = field(default_factory=dict, repr=False)
-    _frames: dict[tuple[int, int], tuple[bytes, float]] = field(default_factory=dict, repr=False)
+    _frames: dict[tuple[int, int], tuple[bytes, float]] = field(
+        default_factory=dict,
+        repr=False,
+    )
 
     @classmethod
     def of(cls, store: ViewStore, names: Sequence[str]) -> "SceneSight | None":
@@ -207,8 +221,14 @@ class SceneSight:
             return None
         rows = store.rows_of(names)
         if (rows < 0).any():
-            raise DatasetError(f"{store.path}: holds no scene {names[int(rows.argmin())]}")
-        return cls(store, rows, np.stack([store.read("scene/reachable", i) for i in rows]))
+            raise DatasetError(
+                f"{store.path}: holds no scene {names[int(rows.argmin())]}"
+            )
+        return cls(
+            store,
+            rows,
+            np.stack([store.read("scene/reachable", i) for i in rows]),
+        )
 
     def of_scenes(self, kept: Index) -> "SceneSight":
         """Some of the scenes, by their index; also the same one several times."""
@@ -228,24 +248,46 @@ class SceneSight:
             (int(self.rows[scene]), np.packbits(row).tobytes())
             for scene, row in zip(scenes, visited, strict=True)
         ]
-        new = {key: row for key, row in zip(keys, visited, strict=True) if key not in self._found}
+        new = {
+            key: row
+            for key, row in zip(keys, visited, strict=True)
+            if key not in self._found
+        }
         read = lru_cache(maxsize=1)(partial(scene_views, self.store))
         for key in sorted(new):  # scene by scene, each read once
-            frames = (self._frame(key[0], int(view), read) for view in np.flatnonzero(new[key]))
+            frames = (
+                self._frame(key[0], int(view), read)
+                for view in np.flatnonzero(new[key])
+            )
             scene = reduce(SeenScene.and_also, frames, SeenScene.unseen())
             self._found[key] = expected_visibility(
-                scene, self.store.sphere.poses[:, :3, 3]
+                scene,
+                self.store.sphere.poses[:, :3, 3],
             ).expected.astype(np.float32)
         return np.stack([self._found[key] for key in keys]).astype(np.float64)
 
-    def _frame(self, row: int, view: int, read: Callable[[int], SceneViews]) -> SeenScene:
+    def _frame(
+        self,
+        row: int,
+        view: int,
+        read: Callable[[int], SceneViews],
+    ) -> SeenScene:
         """Return what the frame from one view shows, kept packed."""
         if (row, view) not in self._frames:
-            asked = sight_lines(VISIBILITY_GRID, self.store.sphere.poses[:, :3, 3].tobytes()).asked
+            asked = sight_lines(
+                VISIBILITY_GRID,
+                self.store.sphere.poses[:, :3, 3].tobytes(),
+            ).asked
             seen = SeenScene(Occupancy.unseen(VISIBILITY_GRID, asked)).seen(
                 read(row).scene_view(view)
             )
-            self._frames[row, view] = zlib.compress(seen.occupancy.cells.tobytes(), 1), seen.floor
+            self._frames[row, view] = (
+                zlib.compress(seen.occupancy.cells.tobytes(), 1),
+                seen.floor,
+            )
+
         packed, floor = self._frames[row, view]
-        cells = np.frombuffer(zlib.decompress(packed), np.uint8).reshape((VISIBILITY_GRID.n,) * 3)
+        cells = np.frombuffer(zlib.decompress(packed), np.uint8).reshape(
+            (VISIBILITY_GRID.n,) * 3
+        )
         return SeenScene(Occupancy(VISIBILITY_GRID, cells), floor)

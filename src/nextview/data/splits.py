@@ -33,12 +33,19 @@ def deduplicated(labels: Index, measured: Floats) -> Index:
         Index, ascending.
     """
     _, first = np.unique(
-        np.stack([duplicate_groups(measured), labels], 1), axis=0, return_index=True
+        np.stack([duplicate_groups(measured), labels], 1),
+        axis=0,
+        return_index=True,
     )
     return np.sort(first)
 
 
-def divide(labels: Index, measured: Floats, share: float, seed: int) -> tuple[Index, Index]:
+def divide(
+    labels: Index,
+    measured: Floats,
+    share: float,
+    seed: int,
+) -> tuple[Index, Index]:
     """Divide objects into a training and a validation part; copies stay together.
 
     Args:
@@ -60,7 +67,11 @@ def divide(labels: Index, measured: Floats, share: float, seed: int) -> tuple[In
     return np.flatnonzero(~validates), np.flatnonzero(validates)
 
 
-def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple[Index, Index]:
+def split_training(
+    store: ViewStore,
+    share: float = 0.1,
+    seed: int = 0,
+) -> tuple[Index, Index]:
     """Divide the rendered objects of the training split; see ``divide``.
 
     Args:
@@ -76,12 +87,24 @@ def split_training(store: ViewStore, share: float = 0.1, seed: int = 0) -> tuple
     """
     usable = np.flatnonzero(store.done & np.isin(store.splits, ("train", "")))
     if len(usable) == 0:
-        raise DatasetError(f"{store.path}: holds no rendered object of the training split")
-    training, validation = divide(store.labels[usable], store.measure()[usable], share, seed)
+        raise DatasetError(
+            f"{store.path}: holds no rendered object of the training split"
+        )
+    training, validation = divide(
+        store.labels[usable],
+        store.measure()[usable],
+        share,
+        seed,
+    )
     return usable[training], usable[validation]
 
 
-def check_any(store: ViewStore, training: Index, validation: Index, lacking: str = "") -> None:
+def check_any(
+    store: ViewStore,
+    training: Index,
+    validation: Index,
+    lacking: str = "",
+) -> None:
     """Check that there are objects for training and for validation.
 
     Args:
@@ -127,7 +150,11 @@ def sample(objects: Index, count: int | None = None) -> Index:
     if count is not None:
         whole(count, "the number of objects", 1)
     n = len(objects)
-    return objects if count is None or count >= n else objects[np.arange(count) * n // count]
+    return (
+        objects
+        if count is None or count >= n
+        else objects[np.arange(count) * n // count]
+    )
 
 
 def some_objects(

@@ -36,7 +36,14 @@ DONE = 1
 FAILED = 2
 PLANNED = 5  # views of a plan: the thesis's longest episode
 # by rendering; more in scenes:
-RENDERED_ARRAYS = ("image", "depth", "points", "measures/depth_entropy", "radius", "status")
+RENDERED_ARRAYS = (
+    "image",
+    "depth",
+    "points",
+    "measures/depth_entropy",
+    "radius",
+    "status",
+)
 SCENE = (
     "scene/depth",
     "scene/owner",
@@ -79,7 +86,10 @@ class Attributes(msgspec.Struct, omit_defaults=True):
     names: Annotated[list[Name], Meta(min_length=1)]
     labels: list[Name]
     splits: list[Split]
-    elevations: Annotated[list[Annotated[float, Meta(ge=-90, le=90)]], Meta(min_length=1)]
+    elevations: Annotated[
+        list[Annotated[float, Meta(ge=-90, le=90)]],
+        Meta(min_length=1),
+    ]
     azimuths: Annotated[int, Meta(ge=3, le=100_000)]
     distance: Annotated[float, Meta(gt=1, lt=1e300)]
     size: Pixels
@@ -98,7 +108,10 @@ class Attributes(msgspec.Struct, omit_defaults=True):
 
 
 def describe(
-    entries: Sequence[Entry], sphere: ViewSphere, size: int, recipe: Mapping[str, Any]
+    entries: Sequence[Entry],
+    sphere: ViewSphere,
+    size: int,
+    recipe: Mapping[str, Any],
 ) -> Attributes:
     """Return the attributes of a new store.
 
@@ -146,7 +159,12 @@ class ViewStore:
     attributes: Attributes
 
     @classmethod
-    def create(cls, path: Path, attributes: Attributes, overwrite: bool = False) -> "ViewStore":
+    def create(
+        cls,
+        path: Path,
+        attributes: Attributes,
+        overwrite: bool = False,
+    ) -> "ViewStore":
         """Create an empty store, complete or not at all.
 
         Args:
@@ -173,7 +191,9 @@ class ViewStore:
         """Open a store; DatasetError if there is none, it is of another format, or damaged."""
         path = Path(path)
         if not (path / "zarr.json").is_file():
-            raise DatasetError(f"{path}: there is no view store; make one with nextview render")
+            raise DatasetError(
+                f"{path}: there is no view store; make one with nextview render"
+            )
 
         try:
             group = zarr.open_group(path, mode="r+")
@@ -192,20 +212,30 @@ class ViewStore:
         return cls(
             path,
             group,
-            decode_record(content, Attributes, f"{path}: zarr.json is damaged", DatasetError),
+            decode_record(
+                content,
+                Attributes,
+                f"{path}: zarr.json is damaged",
+                DatasetError,
+            ),
         )
 
     @property
     def rendered(self) -> tuple[str, ...]:
         """Names of the arrays that rendering makes: more for cluttered scenes."""
-        return RENDERED_ARRAYS if self.attributes.scene is None else (*RENDERED_ARRAYS, *SCENE)
+        return (
+            RENDERED_ARRAYS
+            if self.attributes.scene is None
+            else (*RENDERED_ARRAYS, *SCENE)
+        )
 
     @property
     def added(self) -> list[str]:
         """Names of the arrays that were added later."""
         files = self.path.glob("[!.]*/*/zarr.json")
         return sorted(
-            {file.parent.relative_to(self.path).as_posix() for file in files} - {*self.rendered}
+            {file.parent.relative_to(self.path).as_posix() for file in files}
+            - {*self.rendered}
         )
 
     def note(self, **changes: Any) -> None:
@@ -250,7 +280,11 @@ class ViewStore:
             "scene/reachable": ((v,), "bool", False),
         }
         # a plan or measure
-        added = ((v, min(PLANNED, v)) if name.startswith("plans/") else (v,), "float32", np.nan)
+        added = (
+            (v, min(PLANNED, v)) if name.startswith("plans/") else (v,),
+            "float32",
+            np.nan,
+        )
         return layouts.get(name, added)
 
     def array(self, name: str) -> zarr.Array:
@@ -272,7 +306,9 @@ class ViewStore:
             not isinstance(array, zarr.Array)
             or (array.shape, array.chunks, str(array.dtype)) != wanted
         ):
-            raise DatasetError(f"{self.path}: the array {name} is not one of {wanted[0]} {dtype}")
+            raise DatasetError(
+                f"{self.path}: the array {name} is not one of {wanted[0]} {dtype}"
+            )
 
         return array
 
@@ -294,7 +330,9 @@ class ViewStore:
     def _chunk(self, array: zarr.Array, i: int) -> Path:
         """The file with the values of object i in an array: its only chunk there."""
         return (
-            self.path / array.path / array.metadata.encode_chunk_key((i,) + (0,) * (array.ndim - 1))
+            self.path
+            / array.path
+            / array.metadata.encode_chunk_key((i,) + (0,) * (array.ndim - 1))
         )
 
     def has(self, name: str, i: int) -> bool:
@@ -428,7 +466,11 @@ class ViewStore:
     def radii(self) -> Float:
         """Of the objects, metres, (N,) float64; NaN where it is not known."""
         unit = self.attributes.unit
-        return np.full(len(self), np.nan) if unit is None else self.rows("radius") * UNITS[unit]
+        return (
+            np.full(len(self), np.nan)
+            if unit is None
+            else self.rows("radius") * UNITS[unit]
+        )
 
     @property
     def duplicates(self) -> list[list[int]]:
@@ -453,7 +495,9 @@ class ViewStore:
     @property
     def measures(self) -> list[str]:
         """Names of the view measures it holds, sorted."""
-        return sorted(file.parent.name for file in self.path.glob("measures/*/zarr.json"))
+        return sorted(
+            file.parent.name for file in self.path.glob("measures/*/zarr.json")
+        )
 
     def measure(self, name: str = "depth_entropy") -> Float32:
         """Return a measure of all views, (N, V) float32.
@@ -489,7 +533,9 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def check(
-    path: Path, workers: int | None = None, scheduler: str | None = None
+    path: Path,
+    workers: int | None = None,
+    scheduler: str | None = None,
 ) -> Iterator[tuple[str, str | None]]:
     """Read all arrays of all rendered objects and compare their checksums.
 
@@ -505,9 +551,16 @@ def check(
     for name in store.rendered:
         store.array(name)  # says what is wrong
     objects = np.flatnonzero(store.done).tolist()
-    for i, result in each(partial(_check_object, path.absolute()), objects, workers, scheduler):
+    for i, result in each(
+        partial(_check_object, path.absolute()),
+        objects,
+        workers,
+        scheduler,
+    ):
         problem = (
-            f"{path}: {store.names[i]}: {result}" if isinstance(result, WorkerDied) else result
+            f"{path}: {store.names[i]}: {result}"
+            if isinstance(result, WorkerDied)
+            else result
         )
         yield store.names[i], problem
 
@@ -515,7 +568,10 @@ def check(
 def _check_object(path: Path, i: int) -> str | None:
     store = opened(path)
     try:
-        for name in (*store.rendered, *(name for name in store.added if store.has(name, i))):
+        for name in (
+            *store.rendered,
+            *(name for name in store.added if store.has(name, i)),
+        ):
             store.read(name, i)
     except DatasetError as error:
         return str(error)

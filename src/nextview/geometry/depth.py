@@ -66,7 +66,11 @@ def headlight(depth: Float32, intrinsics: Float) -> NDArray[np.uint8]:
     # The surface is P = (x z, y z, z); the cross product of its derivatives, scaled:
     length = np.sqrt(across**2 + down**2 + (depth + x * across + y * down) ** 2)
     cosine = depth / (length * np.sqrt(x**2 + y**2 + 1) + 1e-30)
-    return np.where(depth > 0, 255 * (AMBIENT + (1 - AMBIENT) * cosine) + 0.5, 0).astype(np.uint8)
+    return np.where(
+        depth > 0,
+        255 * (AMBIENT + (1 - AMBIENT) * cosine) + 0.5,
+        0,
+    ).astype(np.uint8)
 
 
 @lru_cache(maxsize=8)
@@ -116,4 +120,6 @@ def visible_points(
     chosen = np.resize(chosen, CLOUD_POINTS)
     rows, columns = np.divmod(chosen, depth.shape[1])
     rays = PinholeCamera.of(intrinsics, depth.shape).rays_through(rows, columns)
-    return ((rays * flat[chosen, None]) @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
+    return ((rays * flat[chosen, None]) @ pose[:3, :3].T + pose[:3, 3]).astype(
+        np.float32
+    )

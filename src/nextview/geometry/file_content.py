@@ -35,7 +35,10 @@ TEXT_BEGINNINGS = (  # patterns in lower case, likewise
         rb"version https://git-lfs",
         "it is a pointer of Git LFS; git lfs pull fetches the file itself",
     ),
-    (rb"\S*/annex/objects/", "it is a pointer of git-annex; git annex get fetches the file itself"),
+    (
+        rb"\S*/annex/objects/",
+        "it is a pointer of git-annex; git annex get fetches the file itself",
+    ),
     (
         rb"\{\s*\"",
         "it is a JSON file, as glTF is that keeps its numbers elsewhere; export it as GLB",

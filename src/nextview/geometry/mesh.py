@@ -12,13 +12,25 @@ from nextview.errors import MeshError
 from nextview.files import regular_file
 from nextview.geometry.file_content import foreign_content
 from nextview.geometry.mesh_file import READERS
-from nextview.geometry.mesh_parts import keep_largest_part, mesh_doubts, refuse_lost_shape
+from nextview.geometry.mesh_parts import (
+    keep_largest_part,
+    mesh_doubts,
+    refuse_lost_shape,
+)
 from nextview.geometry.triangles import MAX_FACES, check_faces, no_faces
 from nextview.types import Float, Floats, Index
 
-BYTES_PER_FACE = 60  # how many bytes a mesh file may have for each triangle that it may have
+BYTES_PER_FACE = (
+    60  # how many bytes a mesh file may have for each triangle that it may have
+)
 FORMATS = tuple(READERS)
-UNITS = {"mm": 0.001, "cm": 0.01, "inch": 0.0254, "foot": 0.3048, "m": 1.0}  # of length, metres
+UNITS = {
+    "mm": 0.001,
+    "cm": 0.01,
+    "inch": 0.0254,
+    "foot": 0.3048,
+    "m": 1.0,
+}  # of length, metres
 ODD_RADII = (0.001, 20.0)  # metres: a radius outside is likelier one in another unit
 # twice the area, square object radii, below which a face counts as a line: rounding makes up to
 # 1e-15
@@ -121,20 +133,34 @@ def make_mesh(
     vertices = vertices - centre
     reach = np.abs(vertices).max()
     if not reach > 1e-9 * np.abs(centre).max() or reach < np.finfo(float).tiny:
-        raise MeshError(f"{name}: the mesh has no extent, all its vertices are in one place")
+        raise MeshError(
+            f"{name}: the mesh has no extent, all its vertices are in one place"
+        )
     vertices /= reach
     radius = np.sqrt((vertices**2).sum(1).max())
     if reach > np.finfo(float).max / radius:
-        raise MeshError(f"{name}: the mesh is too large, its radius is not a finite number")
+        raise MeshError(
+            f"{name}: the mesh is too large, its radius is not a finite number"
+        )
     normalised: Float = vertices / radius
     # most often the first few tell
     parts = (faces[first : first + 4096].T for first in range(0, len(faces), 4096))
     areas = (
-        np.cross(normalised[b] - normalised[a], normalised[c] - normalised[a]) for a, b, c in parts
+        np.cross(normalised[b] - normalised[a], normalised[c] - normalised[a])
+        for a, b, c in parts
     )
     if not any(np.abs(area).max() > FLAT for area in areas):
-        raise MeshError(f"{name}: the mesh has no area, all its faces are lines or points")
-    return Mesh(normalised, faces.astype(np.int32), centre, float(radius * reach), name, unit)
+        raise MeshError(
+            f"{name}: the mesh has no area, all its faces are lines or points"
+        )
+    return Mesh(
+        normalised,
+        faces.astype(np.int32),
+        centre,
+        float(radius * reach),
+        name,
+        unit,
+    )
 
 
 def _first_of_equals(rows: NDArray) -> Index:
@@ -158,7 +184,9 @@ def mesh_warnings(mesh: Mesh) -> tuple[str, ...]:
     """
     doubts = [*mesh.notes, *mesh_doubts(mesh.vertices, mesh.faces)]
     if mesh.metres is not None and not ODD_RADII[0] <= mesh.metres <= ODD_RADII[1]:
-        doubts.append(f"it has a radius of {mesh.metres:.3g} m: is its unit {mesh.unit}?")
+        doubts.append(
+            f"it has a radius of {mesh.metres:.3g} m: is its unit {mesh.unit}?"
+        )
     return tuple(doubts)
 
 
@@ -214,7 +242,9 @@ def load_mesh(
             f"{path}: the unit is one of {', '.join(UNITS)}, not {one_line(repr(unit))}"
         )
     if suffix not in FORMATS and not os.path.isdir(path):
-        raise MeshError(f"{path}: not a mesh format nextview reads ({', '.join(FORMATS)})")
+        raise MeshError(
+            f"{path}: not a mesh format nextview reads ({', '.join(FORMATS)})"
+        )
     regular_file(path, "a mesh", MeshError)
     most = BYTES_PER_FACE * whole(max_faces, "the largest number of faces", 1)
     if path.stat().st_size > most:
@@ -229,7 +259,9 @@ def load_mesh(
         check_faces(len(faces), max_faces)
         if len(faces) == 0:
             raise MeshError(
-                no_faces(len(vertices)) if len(vertices) else "it holds neither vertices nor faces"
+                no_faces(len(vertices))
+                if len(vertices)
+                else "it holds neither vertices nor faces"
             )
     except OSError as error:
         raise MeshError(f"{path}: cannot be read ({error.strerror})") from None
@@ -240,7 +272,9 @@ def load_mesh(
         reason = foreign_content(data, suffix)
         if reason is None:
             reason = (
-                str(error) if isinstance(error, MeshError) else f"{type(error).__name__}: {error}"
+                str(error)
+                if isinstance(error, MeshError)
+                else f"{type(error).__name__}: {error}"
             )
         raise MeshError(
             f"{path}: not a readable {suffix[1:].upper()} mesh ({one_line(reason, 240)})"

@@ -16,7 +16,12 @@ from typing import Any
 import numpy as np
 
 from nextview.errors import DAMAGED, MeshError
-from nextview.geometry.mesh_text import lines_of_words, numbers, plain_text, whole_numbers
+from nextview.geometry.mesh_text import (
+    lines_of_words,
+    numbers,
+    plain_text,
+    whole_numbers,
+)
 from nextview.geometry.ply_file import read_ply
 from nextview.geometry.stl_file import read_stl
 from nextview.geometry.triangles import MAX_FACES, check_faces, triangulate
@@ -93,14 +98,25 @@ def _plain_off(body: bytes, n_vertices: int, n_faces: int) -> MeshArrays | None:
     except ValueError:
         return None
 
-    if len(vertices) != 3 * n_vertices or len(faces) != 4 * n_faces or (faces[::4] != 3).any():
+    if (
+        len(vertices) != 3 * n_vertices
+        or len(faces) != 4 * n_faces
+        or (faces[::4] != 3).any()
+    ):
         return None
 
     triangles = faces.reshape(-1, 4)[:, 1:]
-    return None if triangles.max() >= n_vertices else (vertices.reshape(-1, 3), triangles)
+    return (
+        None if triangles.max() >= n_vertices else (vertices.reshape(-1, 3), triangles)
+    )
 
 
-def _off_by_lines(body: bytes, n_vertices: int, n_faces: int, max_faces: int) -> MeshArrays:
+def _off_by_lines(
+    body: bytes,
+    n_vertices: int,
+    n_faces: int,
+    max_faces: int,
+) -> MeshArrays:
     lines = lines_of_words(body)
     positions = array("d")
     corners = array("q")
@@ -111,7 +127,9 @@ def _off_by_lines(body: bytes, n_vertices: int, n_faces: int, max_faces: int) ->
     for words in islice(lines, n_faces):
         sides = int(words[0])
         if sides < 0 or len(words) < 1 + sides:
-            raise MeshError(f"face {len(sizes)} has {len(words) - 1} of {sides} corners")
+            raise MeshError(
+                f"face {len(sizes)} has {len(words) - 1} of {sides} corners"
+            )
         polygon = list(map(int, words[1 : 1 + sides]))
         if polygon and not 0 <= min(polygon) <= max(polygon) < n_vertices:
             raise MeshError(
@@ -147,7 +165,9 @@ def read_obj(data: bytes, max_faces: int = MAX_FACES) -> MeshArrays:
             count += 1
         elif word in (b"f", b"F"):
             if len(words) < 3:
-                raise MeshError(f"cut short, a face has {len(words)} of 3 or more corners")
+                raise MeshError(
+                    f"cut short, a face has {len(words)} of 3 or more corners"
+                )
             asked = [int(word.partition(b"/")[0]) for word in words]
             # below 0 from the last so far
             polygon = [index - 1 if index > 0 else count + index for index in asked]
@@ -172,11 +192,19 @@ def _coordinates(words: list[bytes], vertex: int) -> Iterator[float]:
     return map(float, words[:3])
 
 
-def _shape(positions: array, corners: array, sizes: array, max_faces: int) -> MeshArrays:
+def _shape(
+    positions: array,
+    corners: array,
+    sizes: array,
+    max_faces: int,
+) -> MeshArrays:
     """Return vertices and triangles from flat coordinates and polygons; see ``triangulate``."""
     vertices = np.array(positions).reshape(-1, 3)
     return vertices, triangulate(
-        vertices, np.array(corners, np.int64), np.array(sizes, np.int64), max_faces
+        vertices,
+        np.array(corners, np.int64),
+        np.array(sizes, np.int64),
+        max_faces,
     )
 
 
@@ -213,18 +241,31 @@ def _glb_parts(data: bytes) -> list[tuple[Float, Any]]:
     """The meshes of a GLB file, each with the matrix, (4, 4), that puts it in its place."""
     import trimesh
 
-    scene = trimesh.load_scene(io.BytesIO(data), "glb", process=False, skip_materials=True)
+    scene = trimesh.load_scene(
+        io.BytesIO(data),
+        "glb",
+        process=False,
+        skip_materials=True,
+    )
     nodes = [scene.graph.get(node) for node in scene.graph.nodes_geometry]
     placed = [(matrix, scene.geometry[name]) for matrix, name in nodes]
-    return [(matrix, shape) for matrix, shape in placed if isinstance(shape, trimesh.Trimesh)]
+    return [
+        (matrix, shape)
+        for matrix, shape in placed
+        if isinstance(shape, trimesh.Trimesh)
+    ]
 
 
 def _check_glb(data: bytes) -> None:
     """Check what the JSON announces, and refuse what trimesh would misread."""
     if data[:4] != b"glTF" or int.from_bytes(data[8:12], "little") != len(data):
-        raise MeshError("it does not begin with glTF, or is not as long as it announces")
+        raise MeshError(
+            "it does not begin with glTF, or is not as long as it announces"
+        )
     gltf = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
-    accessors, nodes, views = (gltf.get(key, []) for key in ("accessors", "nodes", "bufferViews"))
+    accessors, nodes, views = (
+        gltf.get(key, []) for key in ("accessors", "nodes", "bufferViews")
+    )
 
     # what trimesh would allocate without reading it
     taken = [
@@ -232,34 +273,57 @@ def _check_glb(data: bytes) -> None:
         for a in accessors
         if "bufferView" not in a or "byteStride" in views[a["bufferView"]]
     ]
-    if sum(taken) > len(data) or sum(view["byteLength"] for view in views) > 2 * len(data):
+    if sum(taken) > len(data) or sum(view["byteLength"] for view in views) > 2 * len(
+        data
+    ):
         raise MeshError("it announces more numbers than its bytes hold")
 
     if any("uri" in buffer for buffer in gltf.get("buffers", [])):
-        raise MeshError("it keeps numbers outside of its binary part, which is not read here")
+        raise MeshError(
+            "it keeps numbers outside of its binary part, which is not read here"
+        )
 
-    roots = gltf["scenes"][gltf.get("scene", 0)].get("nodes", []) if "scenes" in gltf else []
+    roots = (
+        gltf["scenes"][gltf.get("scene", 0)].get("nodes", [])
+        if "scenes" in gltf
+        else []
+    )
     placed = [*roots, *(child for node in nodes for child in node.get("children", []))]
-    if len(placed) != len(set(placed)) or len(nodes) > GLB_NODES or min(placed, default=0) < 0:
-        raise MeshError(f"a node is in its scene twice, or there are more than {GLB_NODES:,}")
+    if (
+        len(placed) != len(set(placed))
+        or len(nodes) > GLB_NODES
+        or min(placed, default=0) < 0
+    ):
+        raise MeshError(
+            f"a node is in its scene twice, or there are more than {GLB_NODES:,}"
+        )
 
-    for part in (part for mesh in gltf.get("meshes", []) for part in mesh["primitives"]):
+    for part in (
+        part for mesh in gltf.get("meshes", []) for part in mesh["primitives"]
+    ):
         used = [accessors[part[key]] for key in ("indices",) if key in part]
         used.append(accessors[part["attributes"]["POSITION"]])
         if part.get("mode", GLB_TRIANGLES) == GLB_FAN:
             raise MeshError("it has fans of triangles, which are not read here")
-        if any("bufferView" not in accessor or "sparse" in accessor for accessor in used):
+        if any(
+            "bufferView" not in accessor or "sparse" in accessor for accessor in used
+        ):
             raise MeshError(
                 "its positions or faces are compressed, sparse or without data, which is not read"
                 " here"
             )
         if any(accessor.get("normalized") for accessor in used):
-            raise MeshError("its positions are fractions of whole numbers, which are not read here")
+            raise MeshError(
+                "its positions are fractions of whole numbers, which are not read here"
+            )
         if min(accessor["count"] for accessor in used) < 0:
             raise MeshError("it announces a negative number of elements")
 
 
-READERS: dict[str, Callable[[bytes, int], MeshArrays]] = {  # by the suffix of a file's name
+READERS: dict[
+    str,
+    Callable[[bytes, int], MeshArrays],
+] = {  # by the suffix of a file's name
     ".off": read_off,
     ".obj": read_obj,
     ".ply": read_ply,

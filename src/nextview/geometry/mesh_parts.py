@@ -13,15 +13,22 @@ from nextview.errors import MeshError
 from nextview.types import Float
 
 # odd, of many bits
-HASH_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+HASH_FACTORS = np.array(
+    [0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9],
+    np.uint64,
+)
 FLAT_PART = 0.05  # thickness of a part, over its width, below which it is a plate
 SMALL_PART = 0.01  # of the surface of the largest part: smaller ones are crumbs
-FAR_PARTS = 3.0  # how many times as large as its main part a mesh has to be to be asked about
+FAR_PARTS = (
+    3.0  # how many times as large as its main part a mesh has to be to be asked about
+)
 WIDE_PLANE = 2.0  # how many times as large as what stands on it
 MOST_WIDE_PLANE = 25.0  # more, and what is beside it is no object but a bump
 # how much more of what is not in the plane is on one side of it: 0 as much on both, 1 all
 ONE_SIDED = 0.8
-PLANE_THICKNESS = 0.05  # of the mesh's size: what lies no farther from a plane belongs to it
+PLANE_THICKNESS = (
+    0.05  # of the mesh's size: what lies no farther from a plane belongs to it
+)
 PLANE_FACES = 100_000  # that are looked at in search of a plane
 PLANE_ANGLE = np.cos(np.radians(15))  # between its normal and those of its faces
 # object radii between two numbers of single precision, from where on a shape is lost
@@ -66,7 +73,8 @@ class Parts:
         count = int(places.max()) + 1 if len(places) else 0
         ends = np.concatenate([places[:, :2], places[:, 1:]]).astype(np.int32)
         graph = coo_array(
-            (np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count)
+            (np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])),
+            shape=(count, count),
         )
         _, component = connected_components(graph, directed=False)
         _, part = np.unique(component[places[:, 0]], return_inverse=True)
@@ -91,9 +99,14 @@ class Parts:
 
 def _places(vertices: Float) -> NDArray[np.intp]:
     """A number for each vertex, (V,), the same for those in the same place."""
-    bits = np.ascontiguousarray(vertices + 0.0).view(np.uint64)  # of zeros there are two
+    bits = np.ascontiguousarray(vertices + 0.0).view(
+        np.uint64
+    )  # of zeros there are two
     mixed = bits ^ (bits >> np.uint64(32))
-    _, places = np.unique((mixed * HASH_FACTORS).sum(1, dtype=np.uint64), return_inverse=True)
+    _, places = np.unique(
+        (mixed * HASH_FACTORS).sum(1, dtype=np.uint64),
+        return_inverse=True,
+    )
     return places
 
 
@@ -116,7 +129,8 @@ def _is_flat(points: Float) -> bool:
 
 
 def keep_largest_part(
-    vertices: Float, faces: NDArray[np.int32]
+    vertices: Float,
+    faces: NDArray[np.int32],
 ) -> tuple[NDArray[np.int32], tuple[str, ...]]:
     """Leave out what is not connected to the largest part of a mesh.
 
@@ -158,7 +172,9 @@ def refuse_lost_shape(vertices: Float, radius: float, name: str) -> None:
         step = float(np.spacing(np.float32(farthest)))
         if step < LOST_STEP * radius:
             return
-        steps = column / np.spacing(np.abs(column).astype(np.float32)).astype(np.float64)
+        steps = column / np.spacing(np.abs(column).astype(np.float32)).astype(
+            np.float64
+        )
     rounded = bool((steps == np.round(steps)).all())
     # A building whose corners stand at whole metres is not rounded: half of rounded numbers are odd
     # multiples.
@@ -186,7 +202,8 @@ def mesh_doubts(vertices: Float, faces: NDArray[np.integer]) -> tuple[str, ...]:
 
     if times >= FAR_PARTS:
         largest = (
-            f"it has {len(parts.areas):,} parts, and is {times:.1f} times as large as its main part"
+            f"it has {len(parts.areas):,} parts, and is {times:.1f} "
+            "times as large as its main part"
         )
         doubts.append(
             f"{largest}: does a table or a loose piece belong to it? --largest-part leaves them out"
@@ -235,7 +252,9 @@ def _plane_times(vertices: Float, faces: NDArray[np.integer]) -> float:
         return 1.0
     plane = used[~above]
     centred = plane - plane.mean(0)
-    width = np.sort(np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1], axis=0))[1] / 2
+    width = (
+        np.sort(np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1], axis=0))[1] / 2
+    )
     return size / rest if width > rest else 1.0
 
 

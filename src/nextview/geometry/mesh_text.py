@@ -59,7 +59,9 @@ def plain_text(data: bytes) -> bytes:
         try:
             data = data[mark:].decode(encoding).encode()
         except UnicodeDecodeError:
-            raise MeshError(f"it begins as {encoding.upper()} text, but is none") from None
+            raise MeshError(
+                f"it begins as {encoding.upper()} text, but is none"
+            ) from None
     elif mark:
         data = data[mark:]
     if b"\r" in data:
@@ -96,7 +98,10 @@ def _parsed(text: bytes, kind: type) -> NDArray:
     with warnings.catch_warnings(action="error", category=DeprecationWarning):
         try:
             return np.fromstring(text, kind, sep=" ")
-        except (DeprecationWarning, ValueError):  # which of them depends on NumPy's version
+        except (
+            DeprecationWarning,
+            ValueError,
+        ):  # which of them depends on NumPy's version
             raise ValueError(
                 "something other than numbers stands where numbers are expected"
             ) from None

@@ -10,7 +10,12 @@ from numpy.typing import NDArray
 
 from nextview.checks import number, one_line
 from nextview.errors import ObservationError
-from nextview.geometry.depth import FARTHEST_SURFACE, headlight, object_depth, visible_points
+from nextview.geometry.depth import (
+    FARTHEST_SURFACE,
+    headlight,
+    object_depth,
+    visible_points,
+)
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.types import Float, Float32, Mask
 
@@ -51,11 +56,18 @@ class SceneView:
 
     def __post_init__(self) -> None:
         if self.depth.ndim != 2 or self.target.shape != self.depth.shape:
-            what = "the depth of a scene and the object's pixels are images of one shape"
-            raise ObservationError(f"{what}, not {self.depth.shape} and {self.target.shape}")
+            what = (
+                "the depth of a scene and the object's pixels are images of one shape"
+            )
+            raise ObservationError(
+                f"{what}, not {self.depth.shape} and {self.target.shape}"
+            )
 
 
-@dataclass(frozen=True, eq=False)  # each is itself, and can be the key of what is made of it
+@dataclass(
+    frozen=True,
+    eq=False,
+)  # each is itself, and can be the key of what is made of it
 class Observation:
     """One view of an object. It keeps copies of the arrays, which nobody can write to.
 
@@ -143,7 +155,9 @@ class Observation:
     @cached_property
     def picture(self) -> NDArray[np.uint8]:
         """The image, (H, W) uint8; without one, the depth under a headlight."""
-        return headlight(self.depth, self.intrinsics) if self.image is None else self.image
+        return (
+            headlight(self.depth, self.intrinsics) if self.image is None else self.image
+        )
 
 
 def _own(values: NDArray[Any]) -> NDArray[Any]:
@@ -160,7 +174,9 @@ def enough_shows(mask: Mask) -> bool:
     n = np.count_nonzero(mask)
     if not least <= n < SPECKS * least:
         return bool(n >= least)
-    from scipy.ndimage import label  # only where little is seen: importing it takes time
+    from scipy.ndimage import (
+        label,
+    )  # only where little is seen: importing it takes time
 
     parts, _ = label(mask, np.ones((3, 3)))
     return bool(np.bincount(parts.ravel())[1:].max() >= least)
@@ -190,7 +206,9 @@ def checked_pose(pose: Any) -> Float:
             f"the pose is a camera-to-world matrix of the shape (4, 4), not {pose.shape}"
         )
     if not (np.abs(pose) < LARGEST_ENTRY).all():  # not so if there is a NaN
-        raise ObservationError("the pose holds NaN or infinity, or a number that no camera has")
+        raise ObservationError(
+            "the pose holds NaN or infinity, or a number that no camera has"
+        )
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID:
         raise ObservationError(
             f"the last row of the pose is {pose[3].tolist()}, not 0 0 0 1: is it transposed?"
@@ -229,13 +247,18 @@ def checked_intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> Float:
     Raises:
         ObservationError: no camera has this matrix.
     """
-    intrinsics = numbers(intrinsics, "the matrix of intrinsics").astype(np.float64, copy=False)
+    intrinsics = numbers(intrinsics, "the matrix of intrinsics").astype(
+        np.float64,
+        copy=False,
+    )
     if intrinsics.shape != (3, 3):
         raise ObservationError(
             f"the intrinsics are a pinhole matrix of the shape (3, 3), not {intrinsics.shape}"
         )
     if not (np.abs(intrinsics) < LARGEST_ENTRY).all():  # not so if there is a NaN
-        raise ObservationError("the intrinsics hold NaN, infinity or a number that no camera has")
+        raise ObservationError(
+            "the intrinsics hold NaN, infinity or a number that no camera has"
+        )
     if np.abs(intrinsics[2] - (0, 0, 1)).max() > RIGID:
         last = intrinsics[2].tolist()
         raise ObservationError(
@@ -243,9 +266,13 @@ def checked_intrinsics(intrinsics: Any, shape: tuple[int, ...]) -> Float:
         )
 
     focal = intrinsics[0, 0], intrinsics[1, 1]
-    if not min(focal) > 0.01 * max(shape):  # less would show all that lies ahead: metres, say
+    if not min(focal) > 0.01 * max(
+        shape
+    ):  # less would show all that lies ahead: metres, say
         wanted = f"positive numbers of pixels, about as many as the image has a side ({max(shape)})"
-        raise ObservationError(f"the focal lengths are {wanted}, not {focal[0]:g} and {focal[1]:g}")
+        raise ObservationError(
+            f"the focal lengths are {wanted}, not {focal[0]:g} and {focal[1]:g}"
+        )
 
     return intrinsics
 
@@ -286,21 +313,27 @@ def array_of(values: Any, what: str) -> NDArray[Any]:
     """
     try:
         array = (
-            np.ma.filled(values, 0) if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
+            np.ma.filled(values, 0)
+            if isinstance(values, np.ma.MaskedArray)
+            else np.asarray(values)
         )
     # rows of different lengths, or what cannot become an array at all
     except (ValueError, TypeError) as error:
         raise ObservationError(
             f"{what} cannot be taken for an array of numbers ({error})"
         ) from None
-    return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
+    return (
+        array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
+    )
 
 
 def depth_image(depth: Any) -> NDArray[Any]:
     """A depth image, (H, W), of numbers in any unit; ObservationError if it is none."""
     depth = numbers(depth, "the depth")
     if depth.ndim != 2 or depth.size == 0:
-        raise ObservationError(f"the depth is one image of the shape (H, W), not {depth.shape}")
+        raise ObservationError(
+            f"the depth is one image of the shape (H, W), not {depth.shape}"
+        )
     return depth
 
 
@@ -322,11 +355,15 @@ def _check_unit(given: Float32, near: int) -> None:
 
 
 def _image(
-    image: Any, shape: tuple[int, ...], what: str = "the image is grey"
+    image: Any,
+    shape: tuple[int, ...],
+    what: str = "the image is grey",
 ) -> NDArray[np.uint8]:
     image = numbers(image, "the image")
     if image.shape != shape:
-        raise ObservationError(f"{what} and of the depth's shape {shape}, not {image.shape}")
+        raise ObservationError(
+            f"{what} and of the depth's shape {shape}, not {image.shape}"
+        )
     if image.dtype != np.uint8 and (
         image.dtype.kind == "f" or image.min() < 0 or image.max() > 255
     ):

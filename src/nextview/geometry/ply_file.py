@@ -112,14 +112,21 @@ def read_ply(data: bytes, max_faces: int = MAX_FACES) -> tuple[Float, Index]:
     is_text, elements, body = _open(data)
     row_bytes = None
     if is_text:
-        body, row_bytes = _numbers_of_rows(body, sum(element.rows for element in elements))
+        body, row_bytes = _numbers_of_rows(
+            body,
+            sum(element.rows for element in elements),
+        )
 
     at = 0
     row = 0
     scalars: dict[str, Scalars] = {}
     lists: dict[str, Lists] = {}
     for element in elements:
-        scalars[element.name], lists[element.name], sizes = _read_element(body, at, element)
+        scalars[element.name], lists[element.name], sizes = _read_element(
+            body,
+            at,
+            element,
+        )
         sizes = np.broadcast_to(sizes, element.rows)
         if row_bytes is not None:
             _check_rows(element, row_bytes[row : row + element.rows], sizes)
@@ -128,7 +135,11 @@ def read_ply(data: bytes, max_faces: int = MAX_FACES) -> tuple[Float, Index]:
 
     vertices = _vertices(scalars.get("vertex", {}))
     faces = triangulate(vertices, *_corners("face", lists), max_faces)
-    strips = triangulate(vertices, *_strips(*_corners("tristrips", lists), max_faces), max_faces)
+    strips = triangulate(
+        vertices,
+        *_strips(*_corners("tristrips", lists), max_faces),
+        max_faces,
+    )
     if len(faces) + len(strips) == 0 and len(vertices):
         _say_what_it_is(elements, len(vertices))
     return vertices, np.concatenate([faces, strips])
@@ -158,9 +169,12 @@ def _open(data: bytes) -> tuple[bool, list[Element], bytes]:
     end = re.compile(rb"[\r\n]end_header[ \t]*" + ending).search(data)
     if end is None:
         raise MeshError("its header does not end with end_header")
-    lines = [line.decode("latin-1").split() for line in data[: end.start()].splitlines()]
+    lines = [
+        line.decode("latin-1").split() for line in data[: end.start()].splitlines()
+    ]
     order = next(
-        (words[1] for words in lines if words[:1] == ["format"] and len(words) > 1), "missing"
+        (words[1] for words in lines if words[:1] == ["format"] and len(words) > 1),
+        "missing",
     )
     if order not in BYTE_ORDERS:
         raise MeshError(f"its format is one of {', '.join(BYTE_ORDERS)}, not {order}")
@@ -172,10 +186,14 @@ def _open(data: bytes) -> tuple[bool, list[Element], bytes]:
 
     body = data[end.end() :]
     elements = [
-        element for element in _elements(lines, is_text, BYTE_ORDERS[order]) if element.rows
+        element
+        for element in _elements(lines, is_text, BYTE_ORDERS[order])
+        if element.rows
     ]
     if sum(element.rows for element in elements) > len(body):
-        raise MeshError("the file is cut short, its header announces more rows than there are")
+        raise MeshError(
+            "the file is cut short, its header announces more rows than there are"
+        )
     return is_text, elements, body
 
 
@@ -196,10 +214,14 @@ def _elements(lines: list[list[str]], is_text: bool, order: str) -> list[Element
             found.append((name, rows, []))
         elif words[:1] == ["property"]:
             if not found:
-                raise MeshError(f"its header has the line {' '.join(words)!r} before any element")
+                raise MeshError(
+                    f"its header has the line {' '.join(words)!r} before any element"
+                )
             found[-1][2].append(_property(words, is_text, order))
     return [
-        Element(name, rows, tuple(properties)) for name, rows, properties in found if properties
+        Element(name, rows, tuple(properties))
+        for name, rows, properties in found
+        if properties
     ]
 
 
@@ -219,12 +241,16 @@ def _property(words: list[str], is_text: bool, order: str) -> Property:
     kinds = words[2:-1] if is_list else words[1:-1]
     if len(kinds) != (2 if is_list else 1) or not NUMBER_KINDS.keys() >= set(kinds):
         raise _bad_line(words)
-    types = [np.dtype("f8" if is_text else order + NUMBER_KINDS[kind]) for kind in kinds]
+    types = [
+        np.dtype("f8" if is_text else order + NUMBER_KINDS[kind]) for kind in kinds
+    ]
     return Property(words[-1], types[-1], types[0] if is_list else None)
 
 
 def _bad_line(words: list[str]) -> MeshError:
-    return MeshError(f"its header has the line {' '.join(words)!r}, which is none of a PLY file")
+    return MeshError(
+        f"its header has the line {' '.join(words)!r}, which is none of a PLY file"
+    )
 
 
 def _numbers_of_rows(body: bytes, rows: int) -> tuple[bytes, Index]:
@@ -240,7 +266,9 @@ def _numbers_of_rows(body: bytes, rows: int) -> tuple[bytes, Index]:
     words = np.diff(np.searchsorted(begins, line_ends), prepend=0)
     words = words[words > 0][:rows]
     if len(words) < rows:
-        raise MeshError("the file is cut short, its header announces more rows than there are")
+        raise MeshError(
+            "the file is cut short, its header announces more rows than there are"
+        )
     total = int(words.sum())
     found = numbers(text if total == len(begins) else text[: begins[total]])
     if len(found) != total:
@@ -248,7 +276,11 @@ def _numbers_of_rows(body: bytes, rows: int) -> tuple[bytes, Index]:
     return found.tobytes(), BYTES_OF_NUMBER * words
 
 
-def _read_element(data: bytes, at: int, element: Element) -> tuple[Scalars, Lists, Index]:
+def _read_element(
+    data: bytes,
+    at: int,
+    element: Element,
+) -> tuple[Scalars, Lists, Index]:
     """Read the columns of an element, and the bytes of each row.
 
     These are (rows,), or () if all are equal.
@@ -266,7 +298,9 @@ def _read_element(data: bytes, at: int, element: Element) -> tuple[Scalars, List
         for column in element.properties
     )
     if at + element.rows * least > len(data):
-        raise MeshError("the file is cut short, its header announces more rows than there are")
+        raise MeshError(
+            "the file is cut short, its header announces more rows than there are"
+        )
 
     first_row, _ = _walk(data, at, element, 1)
     lengths = {name: int(own[0, 1]) for name, own in first_row.items()}
@@ -309,14 +343,22 @@ def _gathered(data: bytes, places: Index, kind: np.dtype) -> NDArray:
 
 
 def _table(
-    data: bytes, at: int, element: Element, lengths: dict[str, int]
+    data: bytes,
+    at: int,
+    element: Element,
+    lengths: dict[str, int],
 ) -> tuple[Scalars, Lists, Index] | None:
     """Read an element whose lists of a column all have one length; None if they do not.
 
     This is ``_read_element`` at full speed.
     """
-    width = sum(column.kind.itemsize * lengths.get(column.name, 1) for column in element.properties)
-    width += sum(column.count.itemsize for column in element.lists if column.count is not None)
+    width = sum(
+        column.kind.itemsize * lengths.get(column.name, 1)
+        for column in element.properties
+    )
+    width += sum(
+        column.count.itemsize for column in element.lists if column.count is not None
+    )
     if at + element.rows * width > len(data):
         return None
 
@@ -324,7 +366,13 @@ def _table(
     lists: Lists = {}
     for column in element.properties:
         if column.count is None:
-            scalars[column.name] = np.ndarray(element.rows, column.kind, data, at, width)
+            scalars[column.name] = np.ndarray(
+                element.rows,
+                column.kind,
+                data,
+                at,
+                width,
+            )
             at += column.kind.itemsize
             continue
 
@@ -336,7 +384,11 @@ def _table(
 
         size = column.kind.itemsize
         held = np.ndarray(
-            (element.rows, length), column.kind, data, at if length else 0, (width, size)
+            (element.rows, length),
+            column.kind,
+            data,
+            at if length else 0,
+            (width, size),
         )
         lists[column.name] = (held.reshape(-1), counts.astype(np.int64))
         at += size * length
@@ -344,7 +396,12 @@ def _table(
     return scalars, lists, np.array(width)
 
 
-def _walk(data: bytes, at: int, element: Element, rows: int) -> tuple[dict[str, Index], Index]:
+def _walk(
+    data: bytes,
+    at: int,
+    element: Element,
+    rows: int,
+) -> tuple[dict[str, Index], Index]:
     """Return start and length of each list, (rows, 2) by column, and the end of each row."""
     steps = []
     skipped = 0
@@ -354,7 +411,9 @@ def _walk(data: bytes, at: int, element: Element, rows: int) -> tuple[dict[str, 
             continue
         code = FORMAT_CODES.get(column.count.str[1:])
         if code is None:
-            raise MeshError(f"the lengths of its lists {column.name} are not whole numbers")
+            raise MeshError(
+                f"the lengths of its lists {column.name} are not whole numbers"
+            )
         order = column.count.str[0].replace("|", "=")
         count = struct.Struct(order + code)
         steps.append((skipped, count.unpack_from, count.size, column.kind.itemsize))
@@ -366,7 +425,9 @@ def _walk(data: bytes, at: int, element: Element, rows: int) -> tuple[dict[str, 
         for which, (before, count_at, count_bytes, item_bytes) in enumerate(steps):
             at += before
             if at + count_bytes > len(data):
-                raise MeshError(f"the file is cut short in row {row:,} of element {element.name}")
+                raise MeshError(
+                    f"the file is cut short in row {row:,} of element {element.name}"
+                )
             (length,) = count_at(data, at)
             if not 0 <= length <= len(data) or length != int(length):
                 raise MeshError(
@@ -381,7 +442,9 @@ def _walk(data: bytes, at: int, element: Element, rows: int) -> tuple[dict[str, 
         raise MeshError(
             f"the file is cut short, the rows of its element {element.name} need more bytes"
         )
-    return {column.name: found[:, which] for which, column in enumerate(element.lists)}, ends
+    return {
+        column.name: found[:, which] for which, column in enumerate(element.lists)
+    }, ends
 
 
 def _vertices(columns: Scalars) -> Float:
@@ -391,7 +454,9 @@ def _vertices(columns: Scalars) -> Float:
     missing = [axis for axis in "xyz" if axis not in columns]
     if missing:
         raise MeshError(f"its vertices have no {', '.join(missing)}")
-    with np.errstate(invalid="ignore"):  # of numbers that are none, which are refused with the mesh
+    with np.errstate(
+        invalid="ignore"
+    ):  # of numbers that are none, which are refused with the mesh
         return np.stack([columns[axis].astype(np.float64) for axis in "xyz"], 1)
 
 
@@ -416,7 +481,8 @@ def _corners(element: str, lists: dict[str, Lists]) -> Corners:
 def _strips(corners: Index, sizes: Index, max_faces: int) -> Corners:
     """Return the triangles of strips, with every second one wound the other way."""
     check_faces(
-        int(np.maximum(sizes - 2, 0).sum()) - 3 * int((corners == STRIP_END).sum()), max_faces
+        int(np.maximum(sizes - 2, 0).sum()) - 3 * int((corners == STRIP_END).sum()),
+        max_faces,
     )
     row = np.repeat(np.arange(len(sizes)), sizes)
     place = np.arange(len(corners))
@@ -446,7 +512,9 @@ def _say_what_it_is(elements: list[Element], n_vertices: int) -> None:
     }
 
     if "range_grid" in names:
-        one_side = "a range grid, which is one depth image: it shows the object from one side"
+        one_side = (
+            "a range grid, which is one depth image: it shows the object from one side"
+        )
         raise MeshError(
             f"it holds {one_side}; merge the grids of all sides to a mesh, or teach depth frames"
         )

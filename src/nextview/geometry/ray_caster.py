@@ -13,12 +13,18 @@ Triangles = tuple[Floats, NDArray[np.int32]]  # vertices, (N, 3), and faces, (F,
 
 def embree_scene(things: Sequence[Triangles]) -> Any:
     """An Embree scene of some things, each with its number."""
-    from embreex.mesh_construction import TriangleMesh  # only who casts rays pays for the import
+    from embreex.mesh_construction import (
+        TriangleMesh,
+    )  # only who casts rays pays for the import
     from embreex.rtcore_scene import EmbreeScene
 
     scene = EmbreeScene()
     for vertices, faces in things:
-        TriangleMesh(scene, vertices.astype(np.float32), np.ascontiguousarray(faces, np.int32))
+        TriangleMesh(
+            scene,
+            vertices.astype(np.float32),
+            np.ascontiguousarray(faces, np.int32),
+        )
     return scene
 
 
@@ -40,8 +46,14 @@ class RayCaster:
             nothing; and the index of the thing that it meets, (N,) int64, -1 for none.
         """
         origins = np.ascontiguousarray(np.broadcast_to(origins, rays.shape), np.float32)
-        hits = self._scene.run(origins, np.ascontiguousarray(rays, np.float32), output=1)
+        hits = self._scene.run(
+            origins,
+            np.ascontiguousarray(rays, np.float32),
+            output=1,
+        )
         hit = hits["primID"] >= 0
         return np.where(hit, hits["tfar"], np.float32(np.inf)), np.where(
-            hit, hits["geomID"].astype(np.int64), -1
+            hit,
+            hits["geomID"].astype(np.int64),
+            -1,
         )

@@ -13,8 +13,12 @@ from nextview.types import Float
 
 LIKELY_POSE = 0.1  # resting poses less likely than this are left out
 MOST_RESTING_POSES = 4  # and all but so many, the mesh's own among them
-SAME_TILT = np.radians(20)  # resting poses whose directions up are within this angle are one
-RARE_REST = 0.05  # this share of the throws, those into the rarest poses, is not looked at
+SAME_TILT = np.radians(
+    20
+)  # resting poses whose directions up are within this angle are one
+RARE_REST = (
+    0.05  # this share of the throws, those into the rarest poses, is not looked at
+)
 # thickness, object radii, below which an object is a sheet: it has two sides and no convex hull
 FLAT_SHEET = 1e-4
 
@@ -59,7 +63,9 @@ def resting_poses(mesh: Mesh) -> Float:
 
     likely = [pose for pose in others if pose.share >= LIKELY_POSE]
     likely.sort(key=lambda pose: -pose.share)
-    return np.stack([_upright(pose.up) for pose in [own, *likely[: MOST_RESTING_POSES - 1]]])
+    return np.stack(
+        [_upright(pose.up) for pose in [own, *likely[: MOST_RESTING_POSES - 1]]]
+    )
 
 
 def _stable_poses(mesh: Mesh) -> tuple[Float, Float]:
@@ -81,7 +87,9 @@ def _stable_poses(mesh: Mesh) -> tuple[Float, Float]:
     except QhullError as error:
         reason = str(error).partition("\n")[0]
         _log.warning(
-            "%s: has no convex hull (%s); it is taken to lie only as in its file", mesh.name, reason
+            "%s: has no convex hull (%s); it is taken to lie only as in its file",
+            mesh.name,
+            reason,
         )
         return np.zeros((0, 3)), np.zeros(0)
 
@@ -206,4 +214,9 @@ def rotated(mesh: Mesh, rotation: Float) -> Mesh:
     Returns:
         The mesh in its new pose, of the same size and unit.
     """
-    return make_mesh(mesh.vertices @ rotation.T * mesh.radius, mesh.faces, mesh.name, mesh.unit)
+    return make_mesh(
+        mesh.vertices @ rotation.T * mesh.radius,
+        mesh.faces,
+        mesh.name,
+        mesh.unit,
+    )

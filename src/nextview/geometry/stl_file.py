@@ -16,10 +16,18 @@ from nextview.types import Float, Index
 
 HEADER_BYTES = 84
 # 50 bytes
-FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+FACET = np.dtype(
+    [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
+)
 # A line that begins or ends a solid; what follows is its name, which may be any text.
-SOLID_LINE = re.compile(rb"^[ \t]*(end[ \t]*)?solid\b[^\n]*", re.MULTILINE | re.IGNORECASE)
-LOOP_WORDS = re.compile(rb"\bvertex\s++(\S++\s++\S++\s++\S++)|\bendloop\b", re.IGNORECASE)
+SOLID_LINE = re.compile(
+    rb"^[ \t]*(end[ \t]*)?solid\b[^\n]*",
+    re.MULTILINE | re.IGNORECASE,
+)
+LOOP_WORDS = re.compile(
+    rb"\bvertex\s++(\S++\s++\S++\s++\S++)|\bendloop\b",
+    re.IGNORECASE,
+)
 
 
 def read_stl(data: bytes, max_faces: int = MAX_FACES) -> tuple[Float, Index]:
@@ -53,7 +61,9 @@ def read_stl(data: bytes, max_faces: int = MAX_FACES) -> tuple[Float, Index]:
     check_faces(announced, max_faces)
     facets = np.frombuffer(data, FACET, announced, HEADER_BYTES)
 
-    with np.errstate(invalid="ignore"):  # of numbers that are none, which are refused with the mesh
+    with np.errstate(
+        invalid="ignore"
+    ):  # of numbers that are none, which are refused with the mesh
         vertices = facets["corners"].reshape(-1, 3).astype(np.float64)
 
     return vertices, np.arange(len(vertices)).reshape(-1, 3)
@@ -62,7 +72,9 @@ def read_stl(data: bytes, max_faces: int = MAX_FACES) -> tuple[Float, Index]:
 def _begins_as_text(data: bytes) -> bool:
     """Return whether a file begins with the word solid and is not binary."""
     encoding, mark = encoding_of(data)
-    head = data[mark : mark + 4 * HEADER_BYTES].decode(encoding, "replace")[:HEADER_BYTES]
+    head = data[mark : mark + 4 * HEADER_BYTES].decode(encoding, "replace")[
+        :HEADER_BYTES
+    ]
     return head.lstrip()[:5].lower() == "solid" and "\0" not in head
 
 

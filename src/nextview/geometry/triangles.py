@@ -134,7 +134,9 @@ def _polygons_by_size(sizes: Index) -> list[tuple[int, Index]]:
         if size < 3:
             continue
         step = max(1, CORNERS_AT_ONCE // size)
-        groups.extend((size, same[start : start + step]) for start in range(0, len(same), step))
+        groups.extend(
+            (size, same[start : start + step]) for start in range(0, len(same), step)
+        )
     return groups
 
 
@@ -146,7 +148,10 @@ def _fan_is_right(points: Float) -> Mask:
     """
     with np.errstate(over="ignore", invalid="ignore"):
         spokes = points[:, 1:] - points[:, :1]
-        crosses = np.cross(spokes[:, :-1], spokes[:, 1:])  # twice the areas of the fan's triangles
+        crosses = np.cross(
+            spokes[:, :-1],
+            spokes[:, 1:],
+        )  # twice the areas of the fan's triangles
         normals = crosses.sum(1)
         squares = (normals**2).sum(1)
         along = np.einsum("nki,ni->nk", crosses, normals)
@@ -175,7 +180,9 @@ def _clip_ears(points: Float) -> Index | None:
     # Seen along an axis instead of the normal, a polygon is sheared: what overlaps does not change.
     flat = np.ascontiguousarray(points[:, [(axis + 1) % 3, (axis + 2) % 3]])
     triangles = (
-        triangulate_float64(flat, np.array([len(flat)], np.uint32)).astype(np.int64).reshape(-1, 3)
+        triangulate_float64(flat, np.array([len(flat)], np.uint32))
+        .astype(np.int64)
+        .reshape(-1, 3)
     )
     if len(triangles) == 0:
         return None

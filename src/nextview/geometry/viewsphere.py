@@ -17,7 +17,9 @@ from nextview.checks import number, one_line, points, whole
 from nextview.errors import UsageError
 from nextview.types import Float, Index
 
-CAMERA_DISTANCE = 3.0  # distance of the camera from the object's centre, in object radii
+CAMERA_DISTANCE = (
+    3.0  # distance of the camera from the object's centre, in object radii
+)
 # elevation and azimuth of a cell, in which travel off any grid is counted
 TRAVEL_CELL = np.radians((18.0, 45.0))
 # viewpoints that there may be: distances between all of them are kept, 200 MB at this number
@@ -40,7 +42,9 @@ def rotation_z(angle: ArrayLike) -> Float:
 
 
 def look_at_origin(
-    elevation: ArrayLike, azimuth: ArrayLike, distance: float = CAMERA_DISTANCE
+    elevation: ArrayLike,
+    azimuth: ArrayLike,
+    distance: float = CAMERA_DISTANCE,
 ) -> Float:
     """Return the poses of cameras that look at the origin with a level horizon.
 
@@ -53,7 +57,8 @@ def look_at_origin(
         Camera-to-world poses, (..., 4, 4) float64, OpenCV axes: x right, y down, z forward.
     """
     elevation, azimuth = np.broadcast_arrays(
-        np.asarray(elevation, float), np.asarray(azimuth, float)
+        np.asarray(elevation, float),
+        np.asarray(azimuth, float),
     )
 
     ce = np.cos(elevation)
@@ -66,7 +71,8 @@ def look_at_origin(
 
     pose = np.zeros((*elevation.shape, 4, 4))
     pose[..., :3, :] = np.stack(
-        [right, np.cross(-outward, right), -outward, distance * outward], -1
+        [right, np.cross(-outward, right), -outward, distance * outward],
+        -1,
     )
     pose[..., 3, 3] = 1.0
     return pose
@@ -126,12 +132,19 @@ def angle_between(a: Float, b: Float) -> Float:
 
 def elevation_of(directions: Float) -> Float:
     """Elevation of unit vectors, (..., 3), radians, (...)."""
-    return np.arctan2(directions[..., 2], np.hypot(directions[..., 0], directions[..., 1]))
+    return np.arctan2(
+        directions[..., 2],
+        np.hypot(directions[..., 0], directions[..., 1]),
+    )
 
 
 def azimuth_of(directions: Float) -> Float:
     """Azimuth of unit vectors, (..., 3), radians, 0 to 2 pi, (...)."""
-    return 2 * np.pi * (np.arctan2(directions[..., 1], directions[..., 0]) / (2 * np.pi) % 1.0)
+    return (
+        2
+        * np.pi
+        * (np.arctan2(directions[..., 1], directions[..., 0]) / (2 * np.pi) % 1.0)
+    )
 
 
 def direction_of(pose: Float) -> Float:
@@ -143,7 +156,9 @@ def direction_of(pose: Float) -> Float:
     position = pose[:3, 3]
     outward = position / np.linalg.norm(position) if position.any() else -pose[:3, 2]
     if np.hypot(outward[0], outward[1]) < SNAP:
-        outward = outward + 2e-6 * np.array([pose[0, 1], pose[1, 1], 0.0]) * np.sign(outward[2])
+        outward = outward + 2e-6 * np.array([pose[0, 1], pose[1, 1], 0.0]) * np.sign(
+            outward[2]
+        )
         outward /= np.linalg.norm(outward)
     return outward
 
@@ -172,7 +187,9 @@ class Viewpoints:
 
     def angles(self, view: int) -> tuple[float, float]:
         """(elevation, azimuth) of a view, degrees."""
-        return float(np.degrees(self.elevation[view])), float(np.degrees(self.azimuth[view]))
+        return float(np.degrees(self.elevation[view])), float(
+            np.degrees(self.azimuth[view])
+        )
 
     @cached_property
     def poses(self) -> Float:
@@ -187,11 +204,15 @@ class Viewpoints:
     @cached_property
     def travel(self) -> Float:
         """Distance between views in grid cells, shape (V, V), float64."""
-        return _fixed(self.travel_between(self.directions[:, None], self.directions[None, :]))
+        return _fixed(
+            self.travel_between(self.directions[:, None], self.directions[None, :])
+        )
 
     def cells(self, directions: Float) -> tuple[Float, Float]:
         """Return row and column of directions, (..., 3), on the grid that travel is counted in."""
-        return elevation_of(directions) / TRAVEL_CELL[0], azimuth_of(directions) / TRAVEL_CELL[1]
+        return elevation_of(directions) / TRAVEL_CELL[0], azimuth_of(
+            directions
+        ) / TRAVEL_CELL[1]
 
     def travel_between(self, a: Float, b: Float) -> Float:
         """Return the distance between directions in cells of the view grid.
@@ -255,7 +276,9 @@ class Directions(Viewpoints):
         height = (np.arange(n) + 0.5) / n
         azimuth = np.arange(n) * np.pi * (3 - np.sqrt(5))
         flat = np.sqrt(1 - height**2)
-        return cls(np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], 1))
+        return cls(
+            np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], 1)
+        )
 
 
 @dataclass(frozen=True)
@@ -336,7 +359,11 @@ class ViewSphere(Viewpoints):
     def poses(self) -> Float:
         """Camera-to-world pose of each view, shape (V, 4, 4), float64, OpenCV camera axes."""
         return _fixed(
-            look_at_origin(np.radians(self.elevations)[self.ring], self.azimuth, self.distance)
+            look_at_origin(
+                np.radians(self.elevations)[self.ring],
+                self.azimuth,
+                self.distance,
+            )
         )
 
     @cached_property
@@ -351,7 +378,9 @@ class ViewSphere(Viewpoints):
         It holds all rings at azimuth -1, 0 and +1, with wrap-around.
         """
         columns = (self.azimuth_index[:, None] + np.array([-1, 0, 1])) % self.azimuths
-        return _fixed(np.arange(self.rings)[None, :, None] * self.azimuths + columns[:, None, :])
+        return _fixed(
+            np.arange(self.rings)[None, :, None] * self.azimuths + columns[:, None, :]
+        )
 
     @cached_property
     def travel(self) -> Float:
@@ -369,7 +398,11 @@ class ViewSphere(Viewpoints):
         Beyond the last ring it is that ring.
         """
         order = np.argsort(self.elevations, kind="stable")
-        rings = np.interp(elevation_of(directions), np.radians(self.elevations)[order], order)
+        rings = np.interp(
+            elevation_of(directions),
+            np.radians(self.elevations)[order],
+            order,
+        )
         return rings, azimuth_of(directions) / (2 * np.pi) * self.azimuths
 
     @property
@@ -408,7 +441,10 @@ def viewpoints_of(what: str | Viewpoints | Any) -> Viewpoints:
 
     if fibonacci := re.fullmatch(r"fibonacci:(\d{1,5})", what):
         return Directions.fibonacci(int(fibonacci[1]))
-    if rings := re.fullmatch(r"rings:(-?\d+(?:\.\d+)?(?:,-?\d+(?:\.\d+)?)*)x(\d{1,4})", what):
+    if rings := re.fullmatch(
+        r"rings:(-?\d+(?:\.\d+)?(?:,-?\d+(?:\.\d+)?)*)x(\d{1,4})",
+        what,
+    ):
         return ViewSphere(tuple(map(float, rings[1].split(","))), int(rings[2]))
 
     if what not in VIEW_LAYOUTS:

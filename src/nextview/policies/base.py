@@ -76,7 +76,9 @@ class EpisodeState:
     @property
     def free(self) -> Mask:
         """The views that may be chosen: reachable and not visited, (B, V) bool."""
-        return ~self.visited if self.reachable is None else ~self.visited & self.reachable
+        return (
+            ~self.visited if self.reachable is None else ~self.visited & self.reachable
+        )
 
     def select(self, rows: Any) -> "EpisodeState":
         """Some of the episodes, by index or mask."""
@@ -209,7 +211,12 @@ def window_of(sphere: ViewSphere, state: EpisodeState, values: Floats) -> Floats
     return values[np.arange(len(values))[:, None, None], sphere.windows[state.current]]
 
 
-def considered(sphere: ViewSphere, state: EpisodeState, values: Float, scope: Scope) -> Float:
+def considered(
+    sphere: ViewSphere,
+    state: EpisodeState,
+    values: Float,
+    scope: Scope,
+) -> Float:
     """Return the values of the views that a policy may choose.
 
     Args:
@@ -222,12 +229,17 @@ def considered(sphere: ViewSphere, state: EpisodeState, values: Float, scope: Sc
         Values, (B, V); NaN outside of the scope.
     """
     return (
-        values if scope == "global" else in_window(sphere, state, window_of(sphere, state, values))
+        values
+        if scope == "global"
+        else in_window(sphere, state, window_of(sphere, state, values))
     )
 
 
 def best_view(
-    sphere: Viewpoints, state: EpisodeState, values: Floats, scope: Scope = "global"
+    sphere: Viewpoints,
+    state: EpisodeState,
+    values: Floats,
+    scope: Scope = "global",
 ) -> Index:
     """Return the free view with the highest value.
 
@@ -267,9 +279,13 @@ def best_in_window(sphere: ViewSphere, state: EpisodeState, scores: Floats) -> I
     free = state.free[rows[:, None], window]
     chosen = window[rows, np.where(free, flat, -np.inf).argmax(1)]
     stuck = ~free.any(1)
+
     if stuck.any():
         near = np.where(state.free[stuck], travel_from(sphere, state)[stuck], np.inf)
         chosen[stuck] = np.where(
-            np.isfinite(near).any(1), near.argmin(1), window[stuck, flat[stuck].argmax(1)]
+            np.isfinite(near).any(1),
+            near.argmin(1),
+            window[stuck, flat[stuck].argmax(1)],
         )
+
     return chosen

@@ -49,7 +49,9 @@ class Random(Baseline):
             The next view of each episode, (B,) int64.
         """
         return best_in_window(
-            self.sphere, state, rng.random((len(state.current), self.sphere.rings, 3))
+            self.sphere,
+            state,
+            rng.random((len(state.current), self.sphere.rings, 3)),
         )
 
 
@@ -83,9 +85,14 @@ class Furthest(Baseline):
             The next view of each episode, (B,) int64.
         """
         distance = self.sphere.travel[
-            state.current[:, None, None], self.sphere.windows[state.current]
+            state.current[:, None, None],
+            self.sphere.windows[state.current],
         ]
-        return best_in_window(self.sphere, state, distance + 1e-6 * rng.random(distance.shape))
+        return best_in_window(
+            self.sphere,
+            state,
+            distance + 1e-6 * rng.random(distance.shape),
+        )
 
 
 class Unidirectional(Baseline):
@@ -109,7 +116,11 @@ class Unidirectional(Baseline):
         round_trip = ~free.any(1)
         if round_trip.any():
             window = np.zeros((len(ring), self.sphere.rings, 3))
-            chosen = np.where(round_trip, best_in_window(self.sphere, state, window), chosen)
+            chosen = np.where(
+                round_trip,
+                best_in_window(self.sphere, state, window),
+                chosen,
+            )
         return chosen
 
 
@@ -142,7 +153,12 @@ class Spread:
         for view in range(len(self.sphere)):
             seen = state.visited[:, view]
             nearest[seen] = np.minimum(nearest[seen], self.sphere.arc[view])
-        return best_view(self.sphere, state, nearest + 1e-6 * rng.random(nearest.shape), self.scope)
+        return best_view(
+            self.sphere,
+            state,
+            nearest + 1e-6 * rng.random(nearest.shape),
+            self.scope,
+        )
 
 
 @dataclass(frozen=True)
@@ -166,7 +182,10 @@ class MostVisible:
 
     def view_values(self, state: EpisodeState) -> Float:
         """Expected share less the weighted travel there, (B, V)."""
-        return visibility_of(state) - self.travel_weight * travel_from(self.sphere, state)
+        return visibility_of(state) - self.travel_weight * travel_from(
+            self.sphere,
+            state,
+        )
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Choose the view with the highest expected visible share, less its travel; ties are drawn.
@@ -179,7 +198,9 @@ class MostVisible:
             The next view of each episode, (B,) int64.
         """
         return best_view(
-            self.sphere, state, self.view_values(state) + 1e-6 * rng.random(state.visited.shape)
+            self.sphere,
+            state,
+            self.view_values(state) + 1e-6 * rng.random(state.visited.shape),
         )
 
 

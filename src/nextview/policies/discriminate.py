@@ -11,7 +11,9 @@ from nextview.policies.base import EpisodeState, best_view, check_weight, travel
 from nextview.things.memory import AZIMUTHS, RINGS, open_memory
 from nextview.types import Float, Floats, Index, Mask
 
-WEIGHT = 40.0  # of a cosine, as a log-likelihood: for one view whose noise is not known yet
+WEIGHT = (
+    40.0  # of a cosine, as a log-likelihood: for one view whose noise is not known yet
+)
 # pairs of a thing, in a resting pose, and an azimuth that are weighed: those believed most
 LEADING = 24
 
@@ -65,7 +67,10 @@ class Discriminate:
 
     @classmethod
     def from_card(
-        cls, path: Path, viewpoints: Viewpoints, classes: tuple[str, ...] | None = None
+        cls,
+        path: Path,
+        viewpoints: Viewpoints,
+        classes: tuple[str, ...] | None = None,
     ) -> "Discriminate":
         """Create the policy for the things of a memory.
 
@@ -98,22 +103,31 @@ class Discriminate:
             The next view of each episode, (B,) int64.
         """
         values = self.view_values(state)
-        return best_view(self.viewpoints, state, values + 1e-9 * rng.random(values.shape))
+        return best_view(
+            self.viewpoints,
+            state,
+            values + 1e-9 * rng.random(values.shape),
+        )
 
     def view_values(self, state: EpisodeState) -> Float:
         if state.joint is None:
             raise PolicyError(
                 "this policy needs the belief in things and azimuths together: models made by learn"
             )
+
         here = (
             self.viewpoints.azimuth[state.current]
             if state.places is None
             else azimuth_of(state.places[:, -1])
         )
         worth = [
-            self._worth(joint, azimuth) for joint, azimuth in zip(state.joint, here, strict=True)
+            self._worth(joint, azimuth)
+            for joint, azimuth in zip(state.joint, here, strict=True)
         ]
-        return np.stack(worth) - self.travel_weight * travel_from(self.viewpoints, state)
+        return np.stack(worth) - self.travel_weight * travel_from(
+            self.viewpoints,
+            state,
+        )
 
     def _worth(self, joint: Float, here: float) -> Float:
         """Return the expected log-belief in the true class after each view, (V,).
@@ -141,7 +155,9 @@ class Discriminate:
 
     def _remembered(self, azimuth: Index, here: float) -> tuple[Index, Index]:
         """Return ring, (V,), and azimuth bin, (n, V), of the nearest remembered views."""
-        ahead = np.rint((self.viewpoints.azimuth - here) / (2 * np.pi) * AZIMUTHS).astype(np.int64)
+        ahead = np.rint(
+            (self.viewpoints.azimuth - here) / (2 * np.pi) * AZIMUTHS
+        ).astype(np.int64)
         ring = np.abs(np.degrees(self.viewpoints.elevation)[:, None] - RINGS).argmin(1)
         return ring, (azimuth[:, None] + ahead) % AZIMUTHS
 

@@ -54,7 +54,11 @@ class DiscriminateGeometry:
         """
         values = self.view_values(state)
         values = np.where(np.isnan(values), -np.inf, values)
-        return best_view(self.viewpoints, state, values + 1e-9 * rng.random(values.shape))
+        return best_view(
+            self.viewpoints,
+            state,
+            values + 1e-9 * rng.random(values.shape),
+        )
 
     def view_values(self, state: EpisodeState) -> Float:
         """Expected information of each free view, nats, less what its way counts, (B, V)."""

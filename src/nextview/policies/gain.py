@@ -57,7 +57,9 @@ def ordered(inputs: Sequence[str]) -> tuple[str, ...]:
     """Sort inputs in the order of ``features``, each once; maps follow the place."""
     *before, azimuth_bin = INPUTS
     return tuple(
-        name for name in (*before, *maps_of(inputs), azimuth_bin, VISIBILITY) if name in inputs
+        name
+        for name in (*before, *maps_of(inputs), azimuth_bin, VISIBILITY)
+        if name in inputs
     )
 
 
@@ -82,7 +84,10 @@ def origin(sphere: ViewSphere, state: EpisodeState, frame: CellFrame) -> Index:
         return state.current
     azimuth_bin = _most_believed(state.belief, _bin_belief(sphere, state)).argmax(1)
     n = sphere.azimuths
-    return sphere.ring[state.current] * n + (sphere.azimuth_index[state.current] - azimuth_bin) % n
+    return (
+        sphere.ring[state.current] * n
+        + (sphere.azimuth_index[state.current] - azimuth_bin) % n
+    )
 
 
 def _bin_belief(sphere: ViewSphere, state: EpisodeState) -> Float:
@@ -100,7 +105,10 @@ def _most_believed(belief: Float, azimuth_bins: Float) -> Float:
 
 
 def features(
-    sphere: ViewSphere, state: EpisodeState, inputs: Sequence[str], frame: CellFrame = "camera"
+    sphere: ViewSphere,
+    state: EpisodeState,
+    inputs: Sequence[str],
+    frame: CellFrame = "camera",
 ) -> Float:
     """Compute the input of the gain network from the state of episodes.
 
@@ -124,7 +132,9 @@ def features(
         parts += _facets(state.belief)
     if "view" in inputs:
         alone = np.exp(
-            (state.evidence.logits - state.evidence.logits.max(1, keepdims=True)).astype(np.float64)
+            (
+                state.evidence.logits - state.evidence.logits.max(1, keepdims=True)
+            ).astype(np.float64)
         )
         parts += _facets(alone / alone.sum(1, keepdims=True))
     if "place" in inputs:
@@ -143,12 +153,15 @@ def features(
             _most_believed(state.belief, azimuth_bins),
             (state.belief[:, :, None] * azimuth_bins).sum(1),
         ):
-            parts.append(np.take_along_axis(believed, (np.arange(n) + ahead[:, None]) % n, 1))
+            parts.append(
+                np.take_along_axis(believed, (np.arange(n) + ahead[:, None]) % n, 1)
+            )
     if VISIBILITY in inputs:
         parts.append(visibility_of(state)[rows[:, None], cells_from(sphere)[start]])
 
     return np.concatenate(
-        [np.asarray(part, np.float64).reshape(len(rows), -1) for part in parts], 1
+        [np.asarray(part, np.float64).reshape(len(rows), -1) for part in parts],
+        1,
     )
 
 
@@ -159,7 +172,10 @@ def _facets(belief: Float) -> list[Float]:
 
 
 def mirrored_features(
-    sphere: ViewSphere, classes: int, inputs: Sequence[str], frame: CellFrame = "camera"
+    sphere: ViewSphere,
+    classes: int,
+    inputs: Sequence[str],
+    frame: CellFrame = "camera",
 ) -> Index:
     """Return the place of each feature for the mirror image of an object.
 
@@ -179,7 +195,9 @@ def mirrored_features(
     blocks = {
         "belief": np.arange(facets),
         "view": np.arange(facets),
-        "place": np.concatenate([np.arange(sphere.rings), sphere.rings + mirrored(sphere)]),
+        "place": np.concatenate(
+            [np.arange(sphere.rings), sphere.rings + mirrored(sphere)]
+        ),
         "azimuth_bin": np.concatenate(
             [k * n + -np.arange(n) % n for k in range(2 if frame == "camera" else 3)]
         ),
@@ -191,7 +209,9 @@ def mirrored_features(
 
     chosen = [blocks[name] for name in ordered(inputs)]
     begins = np.cumsum([0, *map(len, chosen)])
-    return np.concatenate([begin + block for begin, block in zip(begins, chosen, strict=False)])
+    return np.concatenate(
+        [begin + block for begin, block in zip(begins, chosen, strict=False)]
+    )
 
 
 # The policy
@@ -231,7 +251,9 @@ class Gain:
 
     def __post_init__(self) -> None:
         maps = maps_of(self.inputs)
-        unknown = [name for name in maps if name not in maps_among(maps)]  # other needs of policies
+        unknown = [
+            name for name in maps if name not in maps_among(maps)
+        ]  # other needs of policies
         if unknown or not self.inputs:
             known = ", ".join((*INPUTS, VISIBILITY))
             other = ", ".join(unknown) or "nothing"
@@ -251,7 +273,10 @@ class Gain:
     def needs(self) -> tuple[str, ...]:
         azimuth_bins = "azimuth_bin" in self.inputs or self.frame == "object"
         others = {"azimuth_bins": azimuth_bins, VISIBILITY: VISIBILITY in self.inputs}
-        return (*maps_of(self.inputs), *(name for name, taken in others.items() if taken))
+        return (
+            *maps_of(self.inputs),
+            *(name for name, taken in others.items() if taken),
+        )
 
     def gains(self, state: EpisodeState) -> Float:
         """Return the predicted value of each view, (B, V) float64.
@@ -264,7 +289,9 @@ class Gain:
         # cells that are mirror images may tie; the first of them is taken
         cells -= 1e-9 * np.arange(len(self.sphere))
         return np.take_along_axis(
-            cells, cells_to(self.sphere)[origin(self.sphere, state, self.frame)], 1
+            cells,
+            cells_to(self.sphere)[origin(self.sphere, state, self.frame)],
+            1,
         )
 
     def view_values(self, state: EpisodeState) -> Float:
@@ -314,14 +341,23 @@ class VisibleGain:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        return (*(name for name in self.gain.needs if name != "visibility"), "visibility")
+        return (
+            *(name for name in self.gain.needs if name != "visibility"),
+            "visibility",
+        )
 
     def scores(self, state: EpisodeState) -> Float:
         """The products, (B, V); see ``ScoresViews``."""
         gains = self.gain.gains(state)
         free = state.free
-        mean = (gains * free).sum(1, keepdims=True) / np.maximum(free.sum(1, keepdims=True), 1)
-        lacking = -(state.belief * np.log(np.maximum(state.belief, 1e-300))).sum(1, keepdims=True)
+        mean = (gains * free).sum(1, keepdims=True) / np.maximum(
+            free.sum(1, keepdims=True),
+            1,
+        )
+        lacking = -(state.belief * np.log(np.maximum(state.belief, 1e-300))).sum(
+            1,
+            keepdims=True,
+        )
         return visibility_of(state) * (lacking + gains - mean)
 
     def view_values(self, state: EpisodeState) -> Float:
@@ -358,7 +394,11 @@ def _cells(weights: Path, session: OnnxFile, features: Float32) -> Float32:
 
 
 def read_gain(
-    sphere: ViewSphere, table: GainTable, scope: Scope, weights: Path, sha256: str
+    sphere: ViewSphere,
+    table: GainTable,
+    scope: Scope,
+    weights: Path,
+    sha256: str,
 ) -> Gain:
     """Open the gain policy that a card describes.
 
@@ -378,7 +418,13 @@ def read_gain(
     session = open_onnx(weights, sha256, threads=1)
     score = partial(_cells, weights, session)
     policy = Gain(
-        sphere, table.classes, score, table.inputs, table.travel_weight, scope, table.frame
+        sphere,
+        table.classes,
+        score,
+        table.inputs,
+        table.travel_weight,
+        scope,
+        table.frame,
     )
     width = len(mirrored_features(sphere, policy.classes, policy.inputs, policy.frame))
     ends = [*session.get_inputs(), *session.get_outputs()]

@@ -19,13 +19,19 @@ from nextview.types import Float, Index
 def cells_from(sphere: ViewSphere) -> Index:
     """The view that lies in each cell, seen from each view, (V, V) int64: ``[view, cell]``."""
     n = sphere.azimuths
-    return sphere.ring[None] * n + (sphere.azimuth_index[:, None] + sphere.azimuth_index[None]) % n
+    return (
+        sphere.ring[None] * n
+        + (sphere.azimuth_index[:, None] + sphere.azimuth_index[None]) % n
+    )
 
 
 def cells_to(sphere: ViewSphere) -> Index:
     """The cell in which each view lies, seen from each view, (V, V) int64: ``[view, other]``."""
     n = sphere.azimuths
-    return sphere.ring[None] * n + (sphere.azimuth_index[None] - sphere.azimuth_index[:, None]) % n
+    return (
+        sphere.ring[None] * n
+        + (sphere.azimuth_index[None] - sphere.azimuth_index[:, None]) % n
+    )
 
 
 @dataclass(frozen=True)
@@ -48,7 +54,11 @@ class FixedSequence:
 
     def __post_init__(self) -> None:
         on_it = (self.moves >= 0) & (self.moves < len(self.sphere))
-        if self.moves.ndim != 2 or len(self.moves) != self.sphere.rings or not on_it.all():
+        if (
+            self.moves.ndim != 2
+            or len(self.moves) != self.sphere.rings
+            or not on_it.all()
+        ):
             raise PolicyError(
                 f"a sequence needs moves over the sphere from each of its {self.sphere.rings} rings"
             )
@@ -86,7 +96,9 @@ class FixedSequence:
         following = self.paths[led_here.argmax(1), state.step]
         free = state.free[np.arange(len(chosen)), following]
         return np.where(
-            led_here.any(1) & (state.visited.sum(1) == state.step) & free, following, chosen
+            led_here.any(1) & (state.visited.sum(1) == state.step) & free,
+            following,
+            chosen,
         )
 
 
@@ -107,8 +119,13 @@ class FixedRing:
     needs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if not 0 <= self.ring < self.sphere.rings or not 1 <= self.steps < self.sphere.azimuths:
-            raise PolicyError(f"there is no ring {self.ring} to be walked in steps of {self.steps}")
+        if (
+            not 0 <= self.ring < self.sphere.rings
+            or not 1 <= self.steps < self.sphere.azimuths
+        ):
+            raise PolicyError(
+                f"there is no ring {self.ring} to be walked in steps of {self.steps}"
+            )
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
         """Choose the next free view of the ring; as ``Spread`` does once the ring is complete.
@@ -123,10 +140,15 @@ class FixedRing:
         n = self.sphere.azimuths
         rows = np.arange(len(state.current))
         order = np.concatenate([[0], np.arange(1, n) * self.steps, np.arange(1, n)])
-        ahead = self.ring * n + (self.sphere.azimuth_index[state.current][:, None] + order) % n
+        ahead = (
+            self.ring * n
+            + (self.sphere.azimuth_index[state.current][:, None] + order) % n
+        )
         free = state.free[rows[:, None], ahead]
         return np.where(
-            free.any(1), ahead[rows, free.argmax(1)], Spread(self.sphere).next_views(state, rng)
+            free.any(1),
+            ahead[rows, free.argmax(1)],
+            Spread(self.sphere).next_views(state, rng),
         )
 
 
@@ -178,4 +200,7 @@ class ClassTable:
 
     def _looked_up(self, state: EpisodeState) -> Float:
         values = self.values[state.belief.argmax(1), self.sphere.ring[state.current]]
-        return values[np.arange(len(values))[:, None], cells_to(self.sphere)[state.current]]
+        return values[
+            np.arange(len(values))[:, None],
+            cells_to(self.sphere)[state.current],
+        ]

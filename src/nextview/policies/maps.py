@@ -19,7 +19,9 @@ def local_peaks(maps: Floats) -> Mask:
     # short.
     padded = np.pad(maps, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
     return np.asarray(maps) >= np.lib.stride_tricks.sliding_window_view(
-        padded, (3, 3), axis=(1, 2)
+        padded,
+        (3, 3),
+        axis=(1, 2),
     ).max((-2, -1))
 
 
@@ -38,7 +40,8 @@ def sphere_peaks(values: Floats) -> Float:
     round_once = np.concatenate([values[..., -1:], values, values[..., :1]], 2)
     return (
         values
-        + (np.ptp(values, axis=(1, 2), keepdims=True) + 1) * local_peaks(round_once)[..., 1:-1]
+        + (np.ptp(values, axis=(1, 2), keepdims=True) + 1)
+        * local_peaks(round_once)[..., 1:-1]
     )
 
 
@@ -63,7 +66,11 @@ class MapPeak:
 
     def view_values(self, state: EpisodeState) -> Float:
         """The predicted map where it lies on the sphere, (B, V); NaN outside the window."""
-        return in_window(self.sphere, state, np.asarray(state.evidence.maps[self.map_name]))
+        return in_window(
+            self.sphere,
+            state,
+            np.asarray(state.evidence.maps[self.map_name]),
+        )
 
     travel_weight = 0.0
 
@@ -88,10 +95,14 @@ class MapPeak:
         maps = np.asarray(state.evidence.maps[self.map_name], np.float64)
         if maps.shape[1:] != (self.sphere.rings, 3):
             there = f"the sphere has {self.sphere.rings} rings"
-            raise PolicyError(f"the map {self.map_name!r} is {maps.shape[1:]}, but {there}")
+            raise PolicyError(
+                f"the map {self.map_name!r} is {maps.shape[1:]}, but {there}"
+            )
         return peaks_first(
             np.where(
-                np.isin(state.belief.argmax(1), self.valley_classes)[:, None, None], -maps, maps
+                np.isin(state.belief.argmax(1), self.valley_classes)[:, None, None],
+                -maps,
+                maps,
             )
         )
 
@@ -119,7 +130,10 @@ class SpherePeak:
 
     def view_values(self, state: EpisodeState) -> Float:
         """The predicted map where it lies on the sphere, (B, V)."""
-        return self._on_sphere(state, np.asarray(state.evidence.maps[self.map_name], np.float64))
+        return self._on_sphere(
+            state,
+            np.asarray(state.evidence.maps[self.map_name], np.float64),
+        )
 
     def scores(self, state: EpisodeState) -> Float:
         """Peaks before all else; see ``ScoresViews``."""

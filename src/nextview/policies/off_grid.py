@@ -16,7 +16,13 @@ from nextview.geometry.viewsphere import (
     azimuth_of,
     elevation_of,
 )
-from nextview.policies.base import EpisodeState, Policy, ScoresViews, ValuesViews, travel_from
+from nextview.policies.base import (
+    EpisodeState,
+    Policy,
+    ScoresViews,
+    ValuesViews,
+    travel_from,
+)
 from nextview.types import Float, Index
 
 
@@ -34,7 +40,11 @@ def anywhere(policy: Policy, sphere: Viewpoints) -> Policy:
     if not isinstance(grid, ViewSphere):
         return policy
     same = isinstance(sphere, ViewSphere) and sphere.same_grid(grid)
-    return policy if same and not isinstance(policy, ScoresViews) else OffGrid(policy, grid, sphere)
+    return (
+        policy
+        if same and not isinstance(policy, ScoresViews)
+        else OffGrid(policy, grid, sphere)
+    )
 
 
 @dataclass(frozen=True)
@@ -72,6 +82,7 @@ class OffGrid:
         """
         if self._on_grid(state):
             return self.policy.next_views(state, rng)
+
         turned, ahead = self._turned(state)
         if not isinstance(self.policy, ScoresViews):
             return self._nearest_to(self.policy.next_views(turned, rng), state)
@@ -81,7 +92,9 @@ class OffGrid:
         considered = free & np.isfinite(scores)
         near = np.where(free, travel_from(self.sphere, state), np.inf)
         return np.where(
-            considered.any(1), np.where(considered, scores, -np.inf).argmax(1), near.argmin(1)
+            considered.any(1),
+            np.where(considered, scores, -np.inf).argmax(1),
+            near.argmin(1),
         )
 
     def view_values(self, state: EpisodeState) -> Float:
@@ -95,15 +108,21 @@ class OffGrid:
             return self._between(self.policy.view_values(turned), ahead)
         # Travel to the views counts, not that to the grid.
         values = self._between(
-            self.policy.view_values(replace(turned, travel=np.zeros(turned.visited.shape))), ahead
+            self.policy.view_values(
+                replace(turned, travel=np.zeros(turned.visited.shape))
+            ),
+            ahead,
         )
         return values - self.policy.travel_weight * travel_from(self.sphere, state)
 
     def _on_grid(self, state: EpisodeState) -> bool:
-        if not isinstance(self.sphere, ViewSphere) or not self.sphere.same_grid(self.grid):
+        if not isinstance(self.sphere, ViewSphere) or not self.sphere.same_grid(
+            self.grid
+        ):
             return False
         return state.places is None or np.array_equal(
-            state.places[:, -1], self.sphere.directions[state.current]
+            state.places[:, -1],
+            self.sphere.directions[state.current],
         )
 
     def _turned(self, state: EpisodeState) -> tuple[EpisodeState, Float]:
@@ -111,11 +130,18 @@ class OffGrid:
         n = self.grid.azimuths
         rows = np.arange(len(state.current))[:, None]
         here = self._here(state)
-        ahead = (self.sphere.azimuth[None] - azimuth_of(here)[:, None]) / (2 * np.pi) * n % n
-        ring = np.abs(np.radians(self.grid.elevations) - elevation_of(here)[:, None]).argmin(1)
-        ring_of = np.abs(np.radians(self.grid.elevations) - self.sphere.elevation[:, None]).argmin(
-            1
+        ahead = (
+            (self.sphere.azimuth[None] - azimuth_of(here)[:, None])
+            / (2 * np.pi)
+            * n
+            % n
         )
+        ring = np.abs(
+            np.radians(self.grid.elevations) - elevation_of(here)[:, None]
+        ).argmin(1)
+        ring_of = np.abs(
+            np.radians(self.grid.elevations) - self.sphere.elevation[:, None]
+        ).argmin(1)
         cell = ring_of * n + np.floor(ahead + 0.5).astype(np.int64) % n
         visited = np.zeros((len(rows), len(self.grid)), bool)
         reachable = visited.copy()
@@ -126,14 +152,20 @@ class OffGrid:
         visited &= ~reachable  # a cell with several views may have one that is free
         current = ring * n
         visited[rows[:, 0], current] = True
-        lost = ~(reachable & ~visited).any(1)  # the only free view lies in the camera's own cell
+        lost = ~(reachable & ~visited).any(
+            1
+        )  # the only free view lies in the camera's own cell
         reachable[lost] = True
         visibility = state.visibility
         if visibility is not None:  # that of the view nearest to each cell
             near = self._grid_directions(state) @ self.sphere.directions.T
             visibility = np.take_along_axis(visibility, near.argmax(2), 1)
         turned = replace(
-            state, current=current, visited=visited, reachable=reachable, visibility=visibility
+            state,
+            current=current,
+            visited=visited,
+            reachable=reachable,
+            visibility=visibility,
         )
 
         return replace(turned, travel=None, places=None), ahead
@@ -141,21 +173,31 @@ class OffGrid:
     def _grid_directions(self, state: EpisodeState) -> Float:
         """Unit vectors towards the views of the turned grid, (B, grid, 3)."""
         azimuth = azimuth_of(self._here(state))[:, None] + self.grid.azimuth
-        elevation = np.broadcast_to(np.radians(self.grid.elevations)[self.grid.ring], azimuth.shape)
+        elevation = np.broadcast_to(
+            np.radians(self.grid.elevations)[self.grid.ring],
+            azimuth.shape,
+        )
         flat = np.cos(elevation)
-        return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], 2)
+        return np.stack(
+            [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)],
+            2,
+        )
 
     def _nearest_to(self, cells: Index, state: EpisodeState) -> Index:
         """The free view nearest to a cell of the turned grid, (B,)."""
         towards = self._grid_directions(state)[np.arange(len(cells)), cells]
         return np.where(
-            state.free, angle_between(towards[:, None], self.sphere.directions[None]), np.inf
+            state.free,
+            angle_between(towards[:, None], self.sphere.directions[None]),
+            np.inf,
         ).argmin(1)
 
     def _here(self, state: EpisodeState) -> Float:
         """Unit vectors towards the cameras, (B, 3)."""
         return (
-            self.sphere.directions[state.current] if state.places is None else state.places[:, -1]
+            self.sphere.directions[state.current]
+            if state.places is None
+            else state.places[:, -1]
         )
 
     def _between(self, values: Float, ahead: Float) -> Float:
@@ -178,10 +220,15 @@ class OffGrid:
 
         rows = np.arange(len(values))[:, None]
         found = np.zeros(ahead.shape)
-        for ring, of_ring in ((low, 1 - up), (np.minimum(low + 1, len(heights) - 1), up)):
+        for ring, of_ring in (
+            (low, 1 - up),
+            (np.minimum(low + 1, len(heights) - 1), up),
+        ):
             for step, of_step in ((left, 1 - right), (left + 1, right)):
                 share = of_ring * of_step
                 found += np.where(
-                    share > 1e-6, share * values[rows, order[ring] * n + step % n], 0.0
+                    share > 1e-6,
+                    share * values[rows, order[ring] * n + step % n],
+                    0.0,
                 )
         return found

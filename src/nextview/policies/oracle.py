@@ -44,7 +44,9 @@ class OracleValley:
         maps = np.asarray(state.evidence.maps[self.map_name], np.float64)
         valley = np.isin(self.labels[state.episodes], self.valley_classes)
         return best_in_window(
-            self.sphere, state, peaks_first(np.where(valley[:, None, None], -maps, maps))
+            self.sphere,
+            state,
+            peaks_first(np.where(valley[:, None, None], -maps, maps)),
         )
 
 
@@ -125,7 +127,10 @@ class OracleGain:
             The next view of each episode, (B,) int64.
         """
         b = len(state.current)
-        parts = np.split(np.arange(b), range(500, b, 500))  # all at once would fill the memory
+        parts = np.split(
+            np.arange(b),
+            range(500, b, 500),
+        )  # all at once would fill the memory
         gain = np.concatenate([self._gains(state, rows) for rows in parts])
         if self.scope == "global":
             return best_view(self.sphere, state, gain)
@@ -136,11 +141,17 @@ class OracleGain:
         objects = self.objects[state.episodes[rows]]
         current = state.current[rows]
         log_evidence = self.log_evidence[objects].astype(np.float64)
-        so_far = np.matmul(state.visited[rows, None].astype(np.float64), log_evidence)[:, 0]
+        so_far = np.matmul(state.visited[rows, None].astype(np.float64), log_evidence)[
+            :,
+            0,
+        ]
         if self.scope == "local":
             window = self.sphere.windows[current].reshape(len(rows), -1)
             log_evidence = log_evidence[np.arange(len(rows))[:, None], window]
         logs = self.calibration.log_belief(
-            so_far[:, None] + log_evidence, state.step + 1, self.classes
+            so_far[:, None] + log_evidence,
+            state.step + 1,
+            self.classes,
         )
+
         return of_true_class(logs, self.labels[objects])

@@ -26,7 +26,12 @@ class LearnedFrom(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _table(**fields: Any) -> type:
-    return msgspec.defstruct("Table", fields.items(), frozen=True, forbid_unknown_fields=True)
+    return msgspec.defstruct(
+        "Table",
+        fields.items(),
+        frozen=True,
+        forbid_unknown_fields=True,
+    )
 
 
 TABLES = {  # what a card's table holds, by its kind
@@ -74,11 +79,18 @@ class PolicyCard(
         Raises:
             ModelError: the card's table or the file is not valid.
         """
-        table: Any = decode_record(self.table, TABLES[self.kind], "the table", ModelError)
+        table: Any = decode_record(
+            self.table,
+            TABLES[self.kind],
+            "the table",
+            ModelError,
+        )
         found = getattr(table, "values", getattr(table, "classes", self.classes))
         classes = found if isinstance(found, int) else len(found)
         if classes != len(self.classes):
-            raise ModelError(f"the table is of {classes} classes, not {len(self.classes)}")
+            raise ModelError(
+                f"the table is of {classes} classes, not {len(self.classes)}"
+            )
 
         if isinstance(table, GainTable):
             return read_gain(sphere, table, self.scope, weights, self.sha256)
@@ -87,7 +99,11 @@ class PolicyCard(
 
         try:
             if self.kind == "fixed-sequence":
-                return FixedSequence(sphere, np.array(table.moves, np.int64), self.scope)
+                return FixedSequence(
+                    sphere,
+                    np.array(table.moves, np.int64),
+                    self.scope,
+                )
             return ClassTable(sphere, np.array(table.values, np.float64), self.scope)
         except (ValueError, OverflowError) as error:
             raise ModelError(f"{error}") from None
@@ -117,7 +133,11 @@ def read_policy_card(path: Path) -> PolicyCard:
     return card
 
 
-def read_policy(path: Path, sphere: Viewpoints, classes: Sequence[str] | None = None) -> Policy:
+def read_policy(
+    path: Path,
+    sphere: Viewpoints,
+    classes: Sequence[str] | None = None,
+) -> Policy:
     """Open the policy that a card describes.
 
     Args:
@@ -144,10 +164,14 @@ def read_policy(path: Path, sphere: Viewpoints, classes: Sequence[str] | None = 
             f"{path}: was learned for {rings} rings of {card.azimuths} views, not for this sphere"
         )
     if classes is not None and card.classes != tuple(classes):
-        raise OtherUseError(f"{path}: was learned for other classes ({', '.join(card.classes)})")
+        raise OtherUseError(
+            f"{path}: was learned for other classes ({', '.join(card.classes)})"
+        )
 
     try:
         return card.make(sphere, weights)
     except (ModelError, PolicyError) as error:
         named = str(error).startswith(f"{weights}")
-        raise PolicyError(f"{error}" if named else f"{path}: not a policy card ({error})") from None
+        raise PolicyError(
+            f"{error}" if named else f"{path}: not a policy card ({error})"
+        ) from None

@@ -21,7 +21,11 @@ from nextview.policies.discriminate import Discriminate
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.policies.gain import Gain, VisibleGain
 from nextview.policies.maps import MapPeak, SpherePeak
-from nextview.policies.policy_card import bundled_policies, read_policy, read_policy_card
+from nextview.policies.policy_card import (
+    bundled_policies,
+    read_policy,
+    read_policy_card,
+)
 from nextview.recognition.map_names import SPHERE_SUFFIX, in_order
 from nextview.recognition.model_card import DISCRIMINATE, MAPS, is_memory
 from nextview.things.memory import open_memory
@@ -80,7 +84,9 @@ def make_policy(
     if "@" in name and ":" not in name:
         plain, _, travel_weight = name.partition("@")
         return _at_travel_weight(
-            make_policy(plain, sphere, valley_classes, classes, maps), name, travel_weight
+            make_policy(plain, sphere, valley_classes, classes, maps),
+            name,
+            travel_weight,
         )
 
     if _on_grid(name, maps) and not isinstance(sphere, ViewSphere):
@@ -113,7 +119,9 @@ def make_policy(
         raise PolicyError(
             "the policy discriminate is for taught things: models ycb, or those of nextview learn"
         )
-    if name.startswith(("true-", "oracle-", "best-", "worst-")) or name.endswith("-oracle-valley"):
+    if name.startswith(("true-", "oracle-", "best-", "worst-")) or name.endswith(
+        "-oracle-valley"
+    ):
         raise PolicyError(
             f"{name} uses information that no robot has, so it runs only in nextview benchmark"
         )
@@ -175,12 +183,18 @@ def _card(name: str) -> Path | None:
 def _on_grid(name: str, maps: Collection[str]) -> bool:
     """Whether it is a policy that knows rings and neighbours."""
     return (name in POLICIES and name not in ANYWHERE) or map_policy(
-        name, None, (), maps
+        name,
+        None,
+        (),
+        maps,
     ) is not None
 
 
 def map_policy(
-    name: str, sphere: Any, valley_classes: Sequence[int], maps: Collection[str]
+    name: str,
+    sphere: Any,
+    valley_classes: Sequence[int],
+    maps: Collection[str],
 ) -> Policy | None:
     """Create the policy that climbs a predicted map.
 
@@ -207,8 +221,14 @@ def map_policy(
 
 def map_policy_names(maps: Collection[str]) -> list[str]:
     """Names of the policies that climb these maps and those of the bundled networks."""
-    windows = dict.fromkeys(name.removesuffix(SPHERE_SUFFIX) for name in in_order((*MAPS, *maps)))
-    return [f"{name}{how}" for name in windows for how in ("", "-peak", f"{SPHERE_SUFFIX}-peak")]
+    windows = dict.fromkeys(
+        name.removesuffix(SPHERE_SUFFIX) for name in in_order((*MAPS, *maps))
+    )
+    return [
+        f"{name}{how}"
+        for name in windows
+        for how in ("", "-peak", f"{SPHERE_SUFFIX}-peak")
+    ]
 
 
 def with_cards(name: str, cards: Mapping[str, Path]) -> str:
@@ -226,11 +246,17 @@ def with_cards(name: str, cards: Mapping[str, Path]) -> str:
     policy, weighted, travel_weight = name.partition("@")
     if policy in cards:
         return f"{cards[policy]}{weighted}{travel_weight}"
-    card = cards.get(policy.removeprefix(VISIBLE)) if policy.startswith(VISIBLE) else None
+    card = (
+        cards.get(policy.removeprefix(VISIBLE)) if policy.startswith(VISIBLE) else None
+    )
     return name if card is None else f"{VISIBLE}{card}{weighted}{travel_weight}"
 
 
-def _of_memory(card: Path, sphere: Viewpoints, classes: tuple[str, ...] | None) -> Policy:
+def _of_memory(
+    card: Path,
+    sphere: Viewpoints,
+    classes: tuple[str, ...] | None,
+) -> Policy:
     """Return the policy for a memory: by surfaces, or else by remembered views."""
     by_pictures = Discriminate.from_card(card, sphere, classes)
     _, memory = open_memory(card)
@@ -239,25 +265,35 @@ def _of_memory(card: Path, sphere: Viewpoints, classes: tuple[str, ...] | None) 
 
 def _at_travel_weight(policy: Policy, name: str, travel_weight: str) -> Policy:
     if not isinstance(
-        policy, Discriminate | DiscriminateGeometry | Gain | MostVisible | VisibleGain
+        policy,
+        Discriminate | DiscriminateGeometry | Gain | MostVisible | VisibleGain,
     ):
         raise PolicyError(f"{name}: this policy does not weigh travel")
     try:
         return replace(policy, travel_weight=float(travel_weight))
     except ValueError:
-        raise PolicyError(f"{name}: a travel weight is a number of at least 0") from None
+        raise PolicyError(
+            f"{name}: a travel weight is a number of at least 0"
+        ) from None
 
 
 def _import_policy(path: str, sphere: Viewpoints) -> Policy:
-    with plugin_errors(lambda said: PolicyError(f"policy {path} cannot be made ({said})")):
+    with plugin_errors(
+        lambda said: PolicyError(f"policy {path} cannot be made ({said})")
+    ):
         policy = plugin(path)(sphere)
+
     for part in ("next_views", "needs"):
         if not hasattr(policy, part):
-            raise PolicyError(f"policy {path} has no {part}; see nextview.policies.base.Policy")
+            raise PolicyError(
+                f"policy {path} has no {part}; see nextview.policies.base.Policy"
+            )
+
     if not isinstance(policy.needs, tuple | list) or not all(
         isinstance(need, str) for need in policy.needs
     ):
         raise PolicyError(
             f"policy {path}: its needs are a tuple of names, not {one_line(repr(policy.needs))}"
         )
+
     return policy

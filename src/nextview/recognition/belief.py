@@ -58,18 +58,28 @@ def reorient(azimuth_bins: Floats, azimuth: Floats) -> Floats:
 
     def turned(by: Float) -> Floats:
         source = (by.astype(np.int64) - np.arange(n)) % n
-        return np.take_along_axis(azimuth_bins, np.broadcast_to(source, azimuth_bins.shape), -1)
+        return np.take_along_axis(
+            azimuth_bins,
+            np.broadcast_to(source, azimuth_bins.shape),
+            -1,
+        )
 
     before = turned(low)
     if not (share > 1e-9).any():
         return before
     after = turned(low + 1)
     top = np.maximum(before, after)
-    mixed = top + np.log((1 - share) * np.exp(before - top) + share * np.exp(after - top))
+    mixed = top + np.log(
+        (1 - share) * np.exp(before - top) + share * np.exp(after - top)
+    )
     return np.where(share > 1e-9, mixed, before)
 
 
-def log_evidence_of(logits: Floats, azimuth_bins: Floats | None, azimuth: Floats) -> Floats:
+def log_evidence_of(
+    logits: Floats,
+    azimuth_bins: Floats | None,
+    azimuth: Floats,
+) -> Floats:
     """Combine the outputs for views into log-evidence that can be summed over views.
 
     ``Calibration.belief`` takes the sum.
@@ -88,7 +98,10 @@ def log_evidence_of(logits: Floats, azimuth_bins: Floats | None, azimuth: Floats
     """
     if azimuth_bins is None:
         return logits
-    pointing = reorient(azimuth_bins, np.broadcast_to(azimuth, logits.shape[:-1])).swapaxes(-1, -2)
+    pointing = reorient(
+        azimuth_bins,
+        np.broadcast_to(azimuth, logits.shape[:-1]),
+    ).swapaxes(-1, -2)
     return np.concatenate([logits, pointing.reshape(*logits.shape[:-1], -1)], -1)
 
 
@@ -124,13 +137,19 @@ class RiskBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     delta: float
 
     def __post_init__(self) -> None:
-        ascending = all(a < b for a, b in zip(self.thresholds, self.thresholds[1:], strict=False))
+        ascending = all(
+            a < b for a, b in zip(self.thresholds, self.thresholds[1:], strict=False)
+        )
         fits = (
             self.thresholds
             and self.bounds
             and all(len(row) == len(self.thresholds) for row in self.bounds)
         )
-        rates = all(0 <= rate <= 1 for row in self.bounds for rate in row) and 0 < self.delta < 1
+        rates = (
+            all(0 <= rate <= 1 for row in self.bounds for rate in row)
+            and 0 < self.delta < 1
+        )
+
         if not (ascending and fits and rates):
             raise ModelError(
                 "error rates that cannot be promised: they do not fit their thresholds"
@@ -171,7 +190,12 @@ LARGEST_CALIBRATION = (
 )
 
 
-class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+class Calibration(
+    msgspec.Struct,
+    frozen=True,
+    forbid_unknown_fields=True,
+    omit_defaults=True,
+):
     """How far the sum of the logits of several views can be trusted.
 
     Views of one object share their errors, so k views are not k independent pieces of evidence. The
@@ -207,9 +231,15 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         sound = LARGEST_CALIBRATION**-1 <= self.temperature <= LARGEST_CALIBRATION
         if not sound or not all(0 <= x <= LARGEST_CALIBRATION for x in numbers):
             given = f"temperature {self.temperature}, correlation {self.correlation}"
-            raise ModelError(f"no calibration: {given}, of azimuth bins {self.bin_correlation}")
-        if self.hypotheses and not (set(np.diff((-1, *self.hypotheses)).tolist()) <= {0, 1}):
-            raise ModelError("no calibration: the hypotheses are not of every class in order")
+            raise ModelError(
+                f"no calibration: {given}, of azimuth bins {self.bin_correlation}"
+            )
+        if self.hypotheses and not (
+            set(np.diff((-1, *self.hypotheses)).tolist()) <= {0, 1}
+        ):
+            raise ModelError(
+                "no calibration: the hypotheses are not of every class in order"
+            )
 
     @property
     def threshold_decay(self) -> float:
@@ -235,9 +265,13 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
             ModelError: the evidence is not finite.
         """
         if not np.isfinite(total).all():
-            raise ModelError("the recogniser returned a value that is not a finite number")
+            raise ModelError(
+                "the recogniser returned a value that is not a finite number"
+            )
         total = np.asarray(total, np.float64)
-        logs = total[..., :classes] / self.temperature_after(np.asarray(n_views)[..., None])
+        logs = total[..., :classes] / self.temperature_after(
+            np.asarray(n_views)[..., None]
+        )
         if self.bin_correlation is None or total.shape[-1] == classes:
             return logs
         pointing = self._pointing(total, n_views, classes)
@@ -250,19 +284,30 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
             # What underflows is far below the best, but still ordered.
             shares = np.add.reduceat(np.exp(agreement - top), first, -1)
             agreement = (
-                np.maximum(np.log(shares + 1e-300), np.maximum.reduceat(agreement, first, -1) - top)
+                np.maximum(
+                    np.log(shares + 1e-300),
+                    np.maximum.reduceat(agreement, first, -1) - top,
+                )
                 + top
             )
         return logs + agreement
 
     def _pointing(self, total: Floats, n_views: NDArray | int, classes: int) -> Float:
         """Log-evidence of the directions of azimuth bin 0, (..., azimuth bins, hypotheses)."""
-        correlation = self.correlation if self.bin_correlation is None else self.bin_correlation
+        correlation = (
+            self.correlation if self.bin_correlation is None else self.bin_correlation
+        )
         sums = np.asarray(total, np.float64)[..., classes:]
         pointing = sums.reshape(*sums.shape[:-1], -1, len(self.hypotheses) or classes)
         return pointing / (1 + correlation * (np.asarray(n_views)[..., None, None] - 1))
 
-    def joint(self, total: Floats, n_views: NDArray | int, classes: int, azimuth: Floats) -> Float:
+    def joint(
+        self,
+        total: Floats,
+        n_views: NDArray | int,
+        classes: int,
+        azimuth: Floats,
+    ) -> Float:
         """Return the joint belief in hypotheses and the azimuth bins from which they are seen.
 
         Args:
@@ -275,12 +320,21 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
             Belief, (..., hypotheses, azimuth bins) float64; sums to 1 over both.
         """
         total = np.asarray(total, np.float64)
-        logs = reorient(self._pointing(total, n_views, classes).swapaxes(-1, -2), azimuth)
-        of_class = total[..., :classes] / self.temperature_after(np.asarray(n_views)[..., None])
+        logs = reorient(
+            self._pointing(total, n_views, classes).swapaxes(-1, -2),
+            azimuth,
+        )
+        of_class = total[..., :classes] / self.temperature_after(
+            np.asarray(n_views)[..., None]
+        )
         logs = (
             logs
-            + (of_class[..., list(self.hypotheses)] if self.hypotheses else of_class)[..., None]
+            + (of_class[..., list(self.hypotheses)] if self.hypotheses else of_class)[
+                ...,
+                None,
+            ]
         )
+
         return _softmax(logs.reshape(*logs.shape[:-2], -1)).reshape(logs.shape)
 
     def belief(self, total: Floats, n_views: NDArray | int, classes: int) -> Float:
@@ -300,7 +354,11 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         return _softmax(self.log_belief(total, n_views, classes))
 
     def azimuth_bins(
-        self, total: Floats, n_views: NDArray | int, classes: int, azimuth: Floats
+        self,
+        total: Floats,
+        n_views: NDArray | int,
+        classes: int,
+        azimuth: Floats,
     ) -> Float | None:
         """Return the belief in the azimuth bin seen from an azimuth, given each hypothesis.
 
@@ -316,7 +374,9 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         """
         if total.shape[-1] == classes:
             return None
-        return _softmax(reorient(self._pointing(total, n_views, classes).swapaxes(-1, -2), azimuth))
+        return _softmax(
+            reorient(self._pointing(total, n_views, classes).swapaxes(-1, -2), azimuth)
+        )
 
     def threshold(self, risk: float, max_views: int) -> float:
         """Return the lowest threshold that guarantees an error rate.
@@ -341,7 +401,9 @@ class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
 # share of a class that is smaller than usual, and larger; times beyond that which none has
 RARE = 0.05
 MUCH = 2.0
-PLAIN_SUM = Calibration()  # trusts the sum of the logits as it stands, as the thesis did
+PLAIN_SUM = (
+    Calibration()
+)  # trusts the sum of the logits as it stands, as the thesis did
 
 
 class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
@@ -370,7 +432,12 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
             raise ModelError("sizes that do not fit together")
 
     @classmethod
-    def from_arrays(cls, radii: Float, log_density: Float, weight: float) -> "SizeEvidence":
+    def from_arrays(
+        cls,
+        radii: Float,
+        log_density: Float,
+        weight: float,
+    ) -> "SizeEvidence":
         """Create it from arrays.
 
         Args:
@@ -381,7 +448,11 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
         Returns:
             The evidence from size.
         """
-        return cls(tuple(radii.tolist()), tuple(map(tuple, log_density.tolist())), float(weight))
+        return cls(
+            tuple(radii.tolist()),
+            tuple(map(tuple, log_density.tolist())),
+            float(weight),
+        )
 
     @cached_property
     def _table(self) -> tuple[Float, Float]:
@@ -414,7 +485,9 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
             Whether the size rules each class out, (C,) bool.
         """
         low, high = self._usual
-        return (np.log(radius) < low - np.log(much)) | (np.log(radius) > high + np.log(much))
+        return (np.log(radius) < low - np.log(much)) | (
+            np.log(radius) > high + np.log(much)
+        )
 
     def logits(self, radii: Floats) -> Float32:
         """Return what is added to the logits, (B, C) float32; zero for NaN radii.
@@ -424,7 +497,9 @@ class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict
         at = np.log(np.where(np.isfinite(radii), radii, 1.0))
         grid, table = self._table
         densities = np.stack([np.interp(at, grid, row) for row in table], 1)
-        return np.where(np.isfinite(radii)[:, None], self.weight * densities, 0).astype(np.float32)
+        return np.where(np.isfinite(radii)[:, None], self.weight * densities, 0).astype(
+            np.float32
+        )
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,20 @@ from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import direction_of, elevation_of
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.map_names import SPHERE_SUFFIX, maps_among
-from nextview.recognition.model_card import FEATURE_NETWORK, RECOGNISER, ModelCard, find_card
+from nextview.recognition.model_card import (
+    FEATURE_NETWORK,
+    RECOGNISER,
+    ModelCard,
+    find_card,
+)
 from nextview.recognition.network_input import from_observations
-from nextview.recognition.novelty import Novelty, Quantiles, ViewScore, novelty_path, read_novelty
+from nextview.recognition.novelty import (
+    Novelty,
+    Quantiles,
+    ViewScore,
+    novelty_path,
+    read_novelty,
+)
 from nextview.recognition.protocol import Recogniser
 from nextview.recognition.runtime import RUNTIME_FAILURES, ort
 from nextview.types import Float, Float32, Floats
@@ -42,7 +53,10 @@ class OnnxFile(ort.InferenceSession):
     """
 
     def __init__(
-        self, content: bytes, options: ort.SessionOptions, opened: tuple[Path, str, int]
+        self,
+        content: bytes,
+        options: ort.SessionOptions,
+        opened: tuple[Path, str, int],
     ) -> None:
         super().__init__(content, options, providers=["CPUExecutionProvider"])
         self._opened = opened
@@ -80,7 +94,8 @@ def open_onnx(path: Path, sha256: str, threads: int = 0) -> OnnxFile:
     # The hash is of this file alone: weights that it refers to in others, of the working folder
     # say, are not found.
     options.add_session_config_entry(
-        "session.model_external_initializers_file_folder_path", str(path)
+        "session.model_external_initializers_file_folder_path",
+        str(path),
     )
     try:
         return OnnxFile(content, options, (Path(path).absolute(), sha256, threads))
@@ -91,7 +106,10 @@ def open_onnx(path: Path, sha256: str, threads: int = 0) -> OnnxFile:
 
 
 def run_onnx(
-    path: Path, session: ort.InferenceSession, names: Sequence[str], inputs: NDArray
+    path: Path,
+    session: ort.InferenceSession,
+    names: Sequence[str],
+    inputs: NDArray,
 ) -> list[NDArray]:
     """Run a network that has one input.
 
@@ -176,7 +194,11 @@ def open_weights(card: ModelCard, threads: int = 0) -> ort.InferenceSession:
         {"sphere": (None, None)} if card.output == "sphere" else {}
     )
     if card.is_recogniser:
-        bins = {BINS_OUTPUT: (len(card.classes), card.azimuth_bins)} if card.azimuth_bins else {}
+        bins = (
+            {BINS_OUTPUT: (len(card.classes), card.azimuth_bins)}
+            if card.azimuth_bins
+            else {}
+        )
         shapes = {"logits": (len(card.classes),), **bins}
 
     taken = session.get_inputs()
@@ -204,7 +226,10 @@ class NetworkRecogniser:
     def __init__(self, model: str | Path = RECOGNISER, threads: int = 0) -> None:
         self.card = find_card(model)
         if not self.card.is_recogniser:
-            raise ModelError(f"model {self.card.name} is a {self.card.kind}, not a recogniser")
+            raise ModelError(
+                f"model {self.card.name} is a {self.card.kind}, not a recogniser"
+            )
+
         self.classes = self.card.classes
         self.azimuth_bins = self.card.azimuth_bins
         self.calibration = self.card.calibration
@@ -227,20 +252,32 @@ class NetworkRecogniser:
         Views in which nothing is seen are marked, see ``Evidence.seen``.
         """
         inputs = from_observations(self.card.input, observations)
-        elevations = np.array([elevation_of(direction_of(o.pose)) for o in observations])
-        evidence = replace(
-            self.from_inputs(inputs, elevations), seen=np.array([o.seen for o in observations])
+        elevations = np.array(
+            [elevation_of(direction_of(o.pose)) for o in observations]
         )
+        evidence = replace(
+            self.from_inputs(inputs, elevations),
+            seen=np.array([o.seen for o in observations]),
+        )
+
         if isinstance(self.novelty, Novelty):
             evidence = replace(
-                evidence, novelty=[ViewScore(o, self.novelty_scores) for o in observations]
+                evidence,
+                novelty=[ViewScore(o, self.novelty_scores) for o in observations],
             )
+
         if self.card.size is None:
             return evidence
-        radii = np.array([np.nan if o.radius is None else o.radius for o in observations])
+        radii = np.array(
+            [np.nan if o.radius is None else o.radius for o in observations]
+        )
         return replace(evidence, logits=evidence.logits + self.card.size.logits(radii))
 
-    def from_inputs(self, inputs: NDArray[Any], elevations: Floats | None = None) -> Evidence:
+    def from_inputs(
+        self,
+        inputs: NDArray[Any],
+        elevations: Floats | None = None,
+    ) -> Evidence:
         """Return the evidence by shape alone from prepared inputs.
 
         Args:
@@ -257,7 +294,11 @@ class NetworkRecogniser:
         if self.azimuth_bins:
             names.append(BINS_OUTPUT)
         outputs = dict(
-            zip(names, run_onnx(self.card.path, self._session, names, inputs), strict=True)
+            zip(
+                names,
+                run_onnx(self.card.path, self._session, names, inputs),
+                strict=True,
+            )
         )
         return Evidence(outputs["logits"], azimuth_bins=outputs.get(BINS_OUTPUT))
 
@@ -282,7 +323,10 @@ class NetworkRecogniser:
         inputs = np.concatenate(
             [from_observations(self._known.card.input, [o]) for o in observations]
         )
-        return self.novelty.scores(self._known(inputs), np.array([o.exact for o in observations]))
+        return self.novelty.scores(
+            self._known(inputs),
+            np.array([o.exact for o in observations]),
+        )
 
 
 class Features:
@@ -315,9 +359,13 @@ class MapNetwork:
     def __init__(self, model: str | Path, threads: int = 0) -> None:
         self.card = find_card(model)
         if self.card.is_recogniser:
-            raise ModelError(f"model {self.card.name} is a recogniser, not a map network")
+            raise ModelError(
+                f"model {self.card.name} is a recogniser, not a map network"
+            )
         self._session = open_weights(self.card, threads)
-        rings = next(end.shape[1] for end in self._session.get_outputs() if end.name == "map")
+        rings = next(
+            end.shape[1] for end in self._session.get_outputs() if end.name == "map"
+        )
         self.rings: int | None = rings if isinstance(rings, int) else None
 
     def __call__(self, observations: Sequence[Observation]) -> dict[str, Float32]:
@@ -328,7 +376,11 @@ class MapNetwork:
         """The same from what the network takes, see ``network_input``."""
         ends = ["map", "sphere"][: len(self.card.maps)]
         return dict(
-            zip(self.card.maps, run_onnx(self.card.path, self._session, ends, inputs), strict=True)
+            zip(
+                self.card.maps,
+                run_onnx(self.card.path, self._session, ends, inputs),
+                strict=True,
+            )
         )
 
 
@@ -374,7 +426,11 @@ class Models:
             for network in self.maps.values()
             for name, values in network(observations).items()
         }
-        return replace(self.recogniser(observations), maps=maps, observations=observations)
+        return replace(
+            self.recogniser(observations),
+            maps=maps,
+            observations=observations,
+        )
 
 
 def names_of(networks: Mapping[str, MapNetwork]) -> tuple[str, ...]:
@@ -383,7 +439,9 @@ def names_of(networks: Mapping[str, MapNetwork]) -> tuple[str, ...]:
 
 
 def open_maps(
-    cards: Mapping[str, str | Path], needs: Sequence[str], threads: int = 0
+    cards: Mapping[str, str | Path],
+    needs: Sequence[str],
+    threads: int = 0,
 ) -> dict[str, MapNetwork]:
     """Open the networks that predict the maps which a policy needs.
 
@@ -400,7 +458,9 @@ def open_maps(
     """
     wanted = maps_among(needs)
     names = dict.fromkeys(name.removesuffix(SPHERE_SUFFIX) for name in wanted)
-    networks = {name: MapNetwork(cards[name], threads) for name in names if name in cards}
+    networks = {
+        name: MapNetwork(cards[name], threads) for name in names if name in cards
+    }
     missing = [name for name in wanted if name not in names_of(networks)]
     if missing:
         known = (name for card in cards.values() for name in find_card(card).maps)

@@ -10,7 +10,13 @@ import msgspec
 from msgspec.structs import replace
 
 from nextview.errors import ModelError
-from nextview.files import LARGEST_RECORD, HashText, read_record, regular_file, write_record
+from nextview.files import (
+    LARGEST_RECORD,
+    HashText,
+    read_record,
+    regular_file,
+    write_record,
+)
 from nextview.recognition.belief import PLAIN_SUM, Calibration, SizeEvidence
 from nextview.recognition.map_names import LCM, LEM, SPHERE_SUFFIX, Good
 from nextview.recognition.network_input import InputSpec
@@ -20,7 +26,9 @@ RECOGNISER = "recogniser-modelnet10"
 # the bundled network that knows no classes: what taught things are remembered by
 FEATURE_NETWORK = "features"
 MEMORY_SUFFIX = ".safetensors"
-DISCRIMINATE = "discriminate"  # the policy of a memory of things; its card is that of the memory
+DISCRIMINATE = (
+    "discriminate"  # the policy of a memory of things; its card is that of the memory
+)
 # bundled recognisers, by the name of their models
 COLLECTIONS = {"modelnet10": RECOGNISER, "ycb": "ycb"}
 # the map networks that are bundled, by the name of the map
@@ -30,9 +38,13 @@ SCHEMA = 2  # of the cards of models; those of policies have 1
 LARGEST_CARD_NUMBER = 1e9  # of a card; densities, gains and sizes are far smaller
 LARGEST_WEIGHT = 1e6  # of a cosine; what is fitted is below a hundred
 LARGEST_ORDER = 1000  # of a symmetry; what is found is below ten
-UNIT_LENGTH = 1e-3  # by which the axis of a symmetry may be too long: cards hold rounded numbers
+UNIT_LENGTH = (
+    1e-3  # by which the axis of a symmetry may be too long: cards hold rounded numbers
+)
 MOST_TAUGHT_POSES = 1000  # of a thing; what is taught has a handful
-SHORT_HASH = 16  # hexadecimal digits of the SHA-256 of a memory that its file's name holds
+SHORT_HASH = (
+    16  # hexadecimal digits of the SHA-256 of a memory that its file's name holds
+)
 
 
 class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -84,7 +96,11 @@ class Verification(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     things: Annotated[int, msgspec.Meta(ge=0)]
     usual: tuple[Annotated[float, msgspec.Meta(ge=0, le=LARGEST_WEIGHT)], ...] = ()
     excess: tuple[
-        tuple[Annotated[float, msgspec.Meta(ge=-LARGEST_WEIGHT, le=LARGEST_WEIGHT)], ...], ...
+        tuple[
+            Annotated[float, msgspec.Meta(ge=-LARGEST_WEIGHT, le=LARGEST_WEIGHT)],
+            ...,
+        ],
+        ...,
     ] = ()
 
     def __post_init__(self) -> None:
@@ -153,12 +169,16 @@ class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             0,
             len(self.things),
         ):
-            raise ModelError(f"its usual residuals are not of its {len(self.things)} things")
+            raise ModelError(
+                f"its usual residuals are not of its {len(self.things)} things"
+            )
 
     @property
     def poses(self) -> tuple[int, ...]:
         """The index of the thing of each resting pose, as in ``Memory.thing``."""
-        return tuple(index for index, thing in enumerate(self.things) for _ in range(thing.poses))
+        return tuple(
+            index for index, thing in enumerate(self.things) for _ in range(thing.poses)
+        )
 
 
 class ModelCard(
@@ -252,7 +272,9 @@ class ModelCard(
         # number of classes.
         hypotheses = self.calibration.hypotheses
         if not hypotheses or hypotheses[-1] + 1 != len(self.classes):
-            raise ModelError(f"its hypotheses are not of its {len(self.classes)} classes")
+            raise ModelError(
+                f"its hypotheses are not of its {len(self.classes)} classes"
+            )
         if self.calibration.bin_correlation is None:
             raise ModelError("a memory of things has a calibration of its azimuth bins")
 
@@ -266,7 +288,9 @@ class ModelCard(
             raise ModelError("a thing is of two classes")
 
         if any(len(row) != len(self.classes) for row in memory.usual):
-            raise ModelError(f"its usual novelty is not of its {len(self.classes)} classes")
+            raise ModelError(
+                f"its usual novelty is not of its {len(self.classes)} classes"
+            )
 
     @property
     def card_path(self) -> Path:
@@ -284,7 +308,9 @@ class ModelCard(
     @property
     def maps(self) -> tuple[str, ...]:
         """Names of the maps that a map network predicts, of the window and of the sphere."""
-        return (self.kind, self.kind + SPHERE_SUFFIX)[: 2 if self.output == "sphere" else 1]
+        return (self.kind, self.kind + SPHERE_SUFFIX)[
+            : 2 if self.output == "sphere" else 1
+        ]
 
     def valleys(self, classes: Sequence[str]) -> tuple[str, ...]:
         """Return the classes for which the valley of its map is the better view.
@@ -312,7 +338,11 @@ def read_card(path: Path) -> ModelCard:
     path = Path(path)
     card = read_record(path, ModelCard, "a model card")
     _check_numbers(path, card)
-    weights = path.with_suffix(".onnx") if card.memory is None else _memory_there(path, card.sha256)
+    weights = (
+        path.with_suffix(".onnx")
+        if card.memory is None
+        else _memory_there(path, card.sha256)
+    )
     if not weights.exists():
         raise ModelError(f"{weights}: the weights of model {card.name} are missing")
     return replace(card, path=weights)
@@ -410,7 +440,9 @@ def write_card(path: Path, card: ModelCard) -> None:
 
 def bundled_cards() -> dict[str, ModelCard]:
     """The models that ship with the package, by name."""
-    return {path.stem: read_card(path) for path in sorted(BUNDLED_MODELS.glob("*.json"))}
+    return {
+        path.stem: read_card(path) for path in sorted(BUNDLED_MODELS.glob("*.json"))
+    }
 
 
 def find_card(model: str | Path) -> ModelCard:
@@ -419,7 +451,9 @@ def find_card(model: str | Path) -> ModelCard:
     if str(model) in names:
         return read_card(BUNDLED_MODELS / f"{model}.json")
     if Path(model).suffix != ".json":
-        raise ModelError(f"no bundled model is called {str(model)!r}; there are {', '.join(names)}")
+        raise ModelError(
+            f"no bundled model is called {str(model)!r}; there are {', '.join(names)}"
+        )
     return read_card(Path(model))
 
 
@@ -460,7 +494,9 @@ def find_models(models: str | Path) -> Collection:
     networks = dict[str, list[Path]]()
     policies = dict[str, Path]()
     for path in sorted(folder.glob("*.json")):
-        has_network = path.with_suffix(".onnx").exists() and _peek(path).elevations is None
+        has_network = (
+            path.with_suffix(".onnx").exists() and _peek(path).elevations is None
+        )
         if has_network or is_memory(path):
             networks.setdefault(read_card(path).kind, []).append(path)
         else:
@@ -473,7 +509,9 @@ def find_models(models: str | Path) -> Collection:
                 f" {paths[1].name}"
             )
     if "recogniser" not in networks:
-        raise ModelError(f"{folder}: holds no card of a recogniser; nextview learn makes one")
+        raise ModelError(
+            f"{folder}: holds no card of a recogniser; nextview learn makes one"
+        )
 
     own = {kind: paths[0] for kind, paths in networks.items()}
     return _with_memory(Collection(own.pop("recogniser"), bundled | own, policies))
@@ -484,5 +522,7 @@ def _with_memory(found: Collection) -> Collection:
     if not is_memory(found.recogniser):
         return found
     return Collection(
-        found.recogniser, found.maps, {DISCRIMINATE: found.recogniser} | found.policies
+        found.recogniser,
+        found.maps,
+        {DISCRIMINATE: found.recogniser} | found.policies,
     )

@@ -38,10 +38,17 @@ class InputSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def shape(self) -> tuple[int | None, ...]:
         """Of one view's input; None where it is free."""
-        return (None, 3) if self.kind == "cloud" else (CHANNELS_OF[self.kind], self.size, self.size)
+        return (
+            (None, 3)
+            if self.kind == "cloud"
+            else (CHANNELS_OF[self.kind], self.size, self.size)
+        )
 
 
-def from_observations(spec: InputSpec, observations: Sequence[Observation]) -> NDArray[Any]:
+def from_observations(
+    spec: InputSpec,
+    observations: Sequence[Observation],
+) -> NDArray[Any]:
     """Compute the input of a network from observations.
 
     Args:
@@ -64,7 +71,8 @@ def from_observations(spec: InputSpec, observations: Sequence[Observation]) -> N
     first = observations[0]
     for other in observations[1:]:
         if other.depth.shape != first.depth.shape or not np.array_equal(
-            other.intrinsics, first.intrinsics
+            other.intrinsics,
+            first.intrinsics,
         ):
             raise ObservationError(
                 "views that are passed together must be from one camera: of one size and pinhole"
@@ -72,11 +80,19 @@ def from_observations(spec: InputSpec, observations: Sequence[Observation]) -> N
 
     array = {"geometry": "depth", "image": "picture", "cloud": "points"}[spec.kind]
     views = np.stack([getattr(o, array) for o in observations])
-    return _network_input(spec, views, np.stack([o.pose for o in observations]), first.intrinsics)
+    return _network_input(
+        spec,
+        views,
+        np.stack([o.pose for o in observations]),
+        first.intrinsics,
+    )
 
 
 def from_store(
-    spec: InputSpec, store: Any, i: int, chosen: Index | slice = slice(None)
+    spec: InputSpec,
+    store: Any,
+    i: int,
+    chosen: Index | slice = slice(None),
 ) -> NDArray[Any]:
     """Compute the input of a network from the stored views of an object.
 
@@ -89,14 +105,24 @@ def from_store(
     Returns:
         Input of the network, (B, ...).
     """
-    reads: dict[str, Any] = {"geometry": store.depth, "image": store.image, "cloud": store.points}
+    reads: dict[str, Any] = {
+        "geometry": store.depth,
+        "image": store.image,
+        "cloud": store.points,
+    }
     return _network_input(
-        spec, reads[spec.kind](i)[chosen], store.sphere.poses[chosen], store.intrinsics
+        spec,
+        reads[spec.kind](i)[chosen],
+        store.sphere.poses[chosen],
+        store.intrinsics,
     )
 
 
 def _network_input(
-    spec: InputSpec, views: NDArray[Any], poses: Float, intrinsics: Float
+    spec: InputSpec,
+    views: NDArray[Any],
+    poses: Float,
+    intrinsics: Float,
 ) -> NDArray[Any]:
     if spec.kind == "cloud":
         return cloud_input(views, poses)
@@ -133,7 +159,9 @@ def cloud_input(points: Float32, poses: Float) -> Float32:
     turned = np.stack([c * x + s * y, c * y - s * x, z], -1)
     low = turned.min((1, 2), keepdims=True)
     span = turned.max((1, 2), keepdims=True) - low
-    return np.where(span > 0, (turned - low) / np.where(span > 0, span, 1), 0).astype(np.float32)
+    return np.where(span > 0, (turned - low) / np.where(span > 0, span, 1), 0).astype(
+        np.float32
+    )
 
 
 def image_input(images: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
@@ -158,7 +186,12 @@ def image_input(images: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
     return np.rint(squares.mean((2, 4), dtype=np.float32)).astype(np.uint8)[:, None]
 
 
-def geometry_input(depth: Float32, poses: Float, intrinsics: Float, size: int) -> NDArray[np.uint8]:
+def geometry_input(
+    depth: Float32,
+    poses: Float,
+    intrinsics: Float,
+    size: int,
+) -> NDArray[np.uint8]:
     """Convert depth images to four channels in the frame of gravity and of the viewing ray.
 
     The channels do not depend on texture or lighting. "facing": cosine between the surface normal
@@ -190,15 +223,26 @@ def geometry_input(depth: Float32, poses: Float, intrinsics: Float, size: int) -
     k = h // size
     rotation = poses[:, :3, :3].astype(np.float32)
     origin = poses[:, :3, 3].astype(np.float32)
-    padded = np.pad(object_depth(depth).astype(np.float32, copy=False), ((0, 0), (1, 1), (1, 1)))
+    padded = np.pad(
+        object_depth(depth).astype(np.float32, copy=False),
+        ((0, 0), (1, 1), (1, 1)),
+    )
     z = padded[:, 1:-1:k, 1:-1:k]
     along_column = slope(padded[:, 1:-1:k, :-2:k], z, padded[:, 1:-1:k, 2::k])
     along_row = slope(padded[:, :-2:k, 1:-1:k], z, padded[:, 2::k, 1:-1:k])
     focal = intrinsics[0, 0].astype(np.float32)
     focal_y = intrinsics[1, 1].astype(np.float32)
     along_row *= focal_y / focal  # a step down the image as long as one across it
-    x = ((np.arange(0, w, k) + 0.5 - intrinsics[0, 2]) / focal).astype(np.float32)[None, None, :]
-    y = ((np.arange(0, h, k) + 0.5 - intrinsics[1, 2]) / focal_y).astype(np.float32)[None, :, None]
+    x = ((np.arange(0, w, k) + 0.5 - intrinsics[0, 2]) / focal).astype(np.float32)[
+        None,
+        None,
+        :,
+    ]
+    y = ((np.arange(0, h, k) + 0.5 - intrinsics[1, 2]) / focal_y).astype(np.float32)[
+        None,
+        :,
+        None,
+    ]
     # The surface is P = (x z, y z, z); the cross product of its derivatives, scaled, points to the
     # camera:
     through = z / focal + x * along_column + y * along_row

@@ -22,7 +22,12 @@ from nextview.files import arrays_in, checked_bytes, new_file
 from nextview.geometry.observation import Observation, SceneView
 from nextview.types import Float, Float32, Floats, Index, Mask
 
-ARRAYS = ("quantiles", "objects", "neighbours", "standard")  # in the file of a novelty score
+ARRAYS = (
+    "quantiles",
+    "objects",
+    "neighbours",
+    "standard",
+)  # in the file of a novelty score
 NEIGHBOUR = 10  # the distance to this one of the nearest known views counts
 ROUNDED = 0.01  # by how much the length of a unit vector in half precision may be off
 # novelty by the share of an outline that is hidden: the least that keeps half hidden objects known
@@ -87,12 +92,19 @@ class Quantiles:
         levels = np.linspace(0, 1, self.quantiles.shape[1])
         found = np.empty(score.shape)
         n = int(self.objects[0])
+
         for index in np.ndindex(score.shape):
             row = self.quantiles[min(int(n_views[index]), len(self.quantiles)) - 1]
-            found[index] = (1 + n * (1 - np.interp(score[index], row, levels))) / (n + 1)
+            found[index] = (1 + n * (1 - np.interp(score[index], row, levels))) / (
+                n + 1
+            )
             if self.joint and score[index] > row[-1]:
                 off = float((score[index] - row.mean()) / max(row.std(), 1e-9))
-                found[index] = min(float(found[index]), math.erfc(off / math.sqrt(2)) / 2)
+                found[index] = min(
+                    float(found[index]),
+                    math.erfc(off / math.sqrt(2)) / 2,
+                )
+
         return found
 
     def of_belief(self, log_belief: Floats, n_views: int) -> float:
@@ -106,7 +118,11 @@ class Quantiles:
             The score: the higher, the more novel.
         """
         best = int(log_belief.argmax())
-        usual = 0.0 if self.usual is None else self.usual[min(n_views, len(self.usual)) - 1, best]
+        usual = (
+            0.0
+            if self.usual is None
+            else self.usual[min(n_views, len(self.usual)) - 1, best]
+        )
         return float(-log_belief[best] - usual)
 
     def of_views(self, scores: Sequence[float]) -> float:
@@ -139,7 +155,9 @@ class Novelty(Quantiles):
 
         check_array("its neighbours", self.neighbours, np.floating, (None, None))
         if len(self.neighbours) < NEIGHBOUR:
-            raise ModelError(f"its neighbours are {len(self.neighbours)}, fewer than {NEIGHBOUR}")
+            raise ModelError(
+                f"its neighbours are {len(self.neighbours)}, fewer than {NEIGHBOUR}"
+            )
         lengths = np.linalg.norm(self.neighbours.astype(np.float32), axis=1)
         if np.abs(lengths - 1).max() > ROUNDED:
             raise ModelError("its neighbours are not unit vectors")
@@ -166,8 +184,12 @@ class Novelty(Quantiles):
                 "the novelty score was fitted to other features; run nextview fit unknown again"
             )
         nearness = np.asarray(embeddings, np.float32) @ self.neighbours.T
-        distance = -np.partition(nearness, -NEIGHBOUR, axis=1)[:, -NEIGHBOUR].astype(np.float64)
-        middle, deviation = self.standard[np.broadcast_to(exact, distance.shape).astype(int)].T
+        distance = -np.partition(nearness, -NEIGHBOUR, axis=1)[:, -NEIGHBOUR].astype(
+            np.float64
+        )
+        middle, deviation = self.standard[
+            np.broadcast_to(exact, distance.shape).astype(int)
+        ].T
         return (distance - middle) / deviation
 
     def save(self, path: Path, overwrite: bool = False) -> str:
@@ -183,7 +205,9 @@ class Novelty(Quantiles):
         arrays = {name: getattr(self, name) for name in ARRAYS} | {
             "neighbours": _in_eight_bits(self.neighbours)
         }
-        content = save({name: np.ascontiguousarray(values) for name, values in arrays.items()})
+        content = save(
+            {name: np.ascontiguousarray(values) for name, values in arrays.items()}
+        )
         with new_file(path, overwrite) as part:
             part.write_bytes(content)
         return hashlib.sha256(content).hexdigest()
@@ -218,10 +242,17 @@ def values_of(scores: Sequence[ViewScore], whole: bool = False) -> list[float]:
     """
     asked = [score for score in scores if score.judge is not None]
     if asked and (judge := asked[0].judge) is not None:
-        for score, value in zip(asked, judge([s.observation for s in asked]), strict=True):
+        for score, value in zip(
+            asked,
+            judge([s.observation for s in asked]),
+            strict=True,
+        ):
             score.value = float(value)
             score.judge = None
-    return [s.value - whole * NOVELTY_OF_HIDING * hidden_share(s.observation.scene) for s in scores]
+    return [
+        s.value - whole * NOVELTY_OF_HIDING * hidden_share(s.observation.scene)
+        for s in scores
+    ]
 
 
 def hidden_share(scene: SceneView | None) -> float:

@@ -51,9 +51,24 @@ class OwnRecogniser:
         self.name = name
         self.classes = _names_of(given, name)
         bins = getattr(given, "azimuth_bins", 0)
-        self.azimuth_bins = whole(bins, f"the number of azimuth bins of recogniser {name}")
-        self.calibration: Calibration = _attribute(given, name, "calibration", PLAIN_SUM)
-        self.novelty: Quantiles | None = _attribute(given, name, "novelty", None, Quantiles)
+        self.azimuth_bins = whole(
+            bins,
+            f"the number of azimuth bins of recogniser {name}",
+        )
+        self.calibration: Calibration = _attribute(
+            given,
+            name,
+            "calibration",
+            PLAIN_SUM,
+        )
+
+        self.novelty: Quantiles | None = _attribute(
+            given,
+            name,
+            "novelty",
+            None,
+            Quantiles,
+        )
 
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
         """What each of some views speaks for.
@@ -82,9 +97,13 @@ class OwnRecogniser:
         array = _numbers(values)
         if array.dtype.kind not in "fiu" or array.shape != shape:
             there = f"{array.dtype} of the shape {array.shape}"
-            raise ModelError(f"recogniser {self.name} gives {what} of {shape} numbers, not {there}")
+            raise ModelError(
+                f"recogniser {self.name} gives {what} of {shape} numbers, not {there}"
+            )
         if not np.isfinite(array).all():
-            raise ModelError(f"recogniser {self.name} gives {what} that are not finite numbers")
+            raise ModelError(
+                f"recogniser {self.name} gives {what} that are not finite numbers"
+            )
 
 
 class OwnJointRecogniser(OwnRecogniser):
@@ -106,7 +125,10 @@ class OwnJointRecogniser(OwnRecogniser):
         return Evidence(logits, seen=np.array([seen.seen for seen in observations]))
 
     def together(
-        self, observations: Sequence[Observation], total: Floats, counted: int
+        self,
+        observations: Sequence[Observation],
+        total: Floats,
+        counted: int,
     ) -> JointBelief:
         """What all views say together.
 
@@ -125,12 +147,18 @@ class OwnJointRecogniser(OwnRecogniser):
         belief = np.asarray(joint.belief, np.float64)
         if (belief < 0).any() or abs(belief.sum() - 1) > SUM_ERROR:
             what = "a belief is probabilities of the classes, which sum to 1"
-            raise ModelError(f"recogniser {self.name}: {what}, not to {belief.sum():.4g}")
+            raise ModelError(
+                f"recogniser {self.name}: {what}, not to {belief.sum():.4g}"
+            )
         if joint.p_value is not None and not 0 <= joint.p_value <= 1:
-            raise ModelError(f"recogniser {self.name}: a p-value is 0 to 1, not {joint.p_value}")
+            raise ModelError(
+                f"recogniser {self.name}: a p-value is 0 to 1, not {joint.p_value}"
+            )
 
         try:
-            poses = tuple(check_candidate(pose, len(self.classes)) for pose in joint.poses)
+            poses = tuple(
+                check_candidate(pose, len(self.classes)) for pose in joint.poses
+            )
         except ModelError as error:
             raise ModelError(f"recogniser {self.name}: {error}") from None
         return replace(joint, belief=belief / belief.sum(), poses=poses)
@@ -174,31 +202,45 @@ def _named(path: str) -> Any:
         raise UsageError(
             f"a recogniser of your own is named MODULE:NAME, not {one_line(repr(path))}"
         )
-    with plugin_errors(lambda said: UsageError(f"the recogniser {path} cannot be made ({said})")):
+    with plugin_errors(
+        lambda said: UsageError(f"the recogniser {path} cannot be made ({said})")
+    ):
         found = plugin(path)
         return found() if isinstance(found, type) else found
 
 
 def _names_of(given: Any, name: str) -> tuple[str, ...]:
     """The classes of a recogniser; ModelError if they are no names, or two are the same."""
-    with plugin_errors(lambda said: ModelError(f"recogniser {name} has no classes ({said})")):
+    with plugin_errors(
+        lambda said: ModelError(f"recogniser {name} has no classes ({said})")
+    ):
         classes = given.classes
         names = () if isinstance(classes, str) else tuple(classes)
     if not names or not all(isinstance(each, str) and each for each in names):
         shown = one_line(repr(classes))
-        raise ModelError(f"the classes of recogniser {name} are a tuple of names, not {shown}")
+        raise ModelError(
+            f"the classes of recogniser {name} are a tuple of names, not {shown}"
+        )
     if len(set(names)) < len(names):
         raise ModelError(f"two classes of recogniser {name} have the same name")
     return names
 
 
-def _attribute(given: Any, name: str, what: str, default: Any, kind: type | None = None) -> Any:
+def _attribute(
+    given: Any,
+    name: str,
+    what: str,
+    default: Any,
+    kind: type | None = None,
+) -> Any:
     """An attribute that need not be there; ModelError if it is not of the default's kind."""
     value = getattr(given, what, default)
     kind = kind or type(default)
     if value is not default and not isinstance(value, kind):
         shown = one_line(repr(value))
-        raise ModelError(f"{what} of recogniser {name} is a {kind.__name__}, not {shown}")
+        raise ModelError(
+            f"{what} of recogniser {name} is a {kind.__name__}, not {shown}"
+        )
     return value
 
 

@@ -55,7 +55,8 @@ class Believed:
     def entropy(self) -> Float:
         """Entropy of the belief, bits, (...)."""
         return -np.asarray(
-            (self.belief * np.log2(np.maximum(self.belief, 1e-300))).sum(-1), np.float64
+            (self.belief * np.log2(np.maximum(self.belief, 1e-300))).sum(-1),
+            np.float64,
         )
 
 
@@ -118,7 +119,9 @@ class OwnStopping(Stopping):
         """What the rule decides, checked."""
         assert self.rule is not None
         belief = believed.belief
-        with plugin_errors(lambda said: UsageError(f"the stopping rule {self.name} raised {said}")):
+        with plugin_errors(
+            lambda said: UsageError(f"the stopping rule {self.name} raised {said}")
+        ):
             said = np.asarray(self.rule(believed, self.threshold))
         if said.dtype != bool or said.shape != belief.shape[:-1]:
             wanted = f"bool of the shape {belief.shape[:-1]}, not {said.dtype} of {said.shape}"
@@ -149,7 +152,11 @@ def own_stopping(rule: Rule | str, threshold: float, max_views: int) -> Stopping
         UsageError: the rule cannot be imported, or is not a function.
     """
     found: Any = rule
-    name = rule if isinstance(rule, str) else getattr(rule, "__name__", "a rule of your own")
+    name = (
+        rule
+        if isinstance(rule, str)
+        else getattr(rule, "__name__", "a rule of your own")
+    )
 
     if isinstance(rule, str):
         if ":" not in rule:

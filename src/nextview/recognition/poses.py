@@ -131,10 +131,15 @@ def _alike(first: PoseCandidate, second: PoseCandidate) -> bool:
         return False
     shift = float(np.linalg.norm(first.place - second.place))
     between = first.pose[:3, :3].T @ second.pose[:3, :3]
-    return shift < ALIKE_SHIFT and _least_turn(between, first.symmetry or ()) < ALIKE_TURN
+    return (
+        shift < ALIKE_SHIFT and _least_turn(between, first.symmetry or ()) < ALIKE_TURN
+    )
 
 
-def uncertainty_of(candidates: Sequence[PoseCandidate], camera: float = 0.0) -> PoseUncertainty:
+def uncertainty_of(
+    candidates: Sequence[PoseCandidate],
+    camera: float = 0.0,
+) -> PoseUncertainty:
     """How far off the first of some poses of one thing may be.
 
     Args:
@@ -149,7 +154,9 @@ def uncertainty_of(candidates: Sequence[PoseCandidate], camera: float = 0.0) -> 
     shares = np.array([candidate.probability for candidate in candidates])
     shares = shares / shares.sum()
     turns = np.array([_turn_apart(first, other) for other in candidates])
-    shifts = np.array([1000 * np.linalg.norm(other.place - first.place) for other in candidates])
+    shifts = np.array(
+        [1000 * np.linalg.norm(other.place - first.place) for other in candidates]
+    )
 
     own_turns = np.array([candidate.degrees for candidate in candidates])
     own_shifts = np.array([candidate.millimetres for candidate in candidates])
@@ -200,7 +207,11 @@ def _least_turn(turn: Float, symmetries: Sequence[Any]) -> float:
 @lru_cache(maxsize=256)
 def _turns_of(symmetries: tuple[Any, ...]) -> tuple[Float, ...]:
     """All turns that follow from symmetries of a finite order, one after the other."""
-    steps = [_turn_about(one.axis, 2 * np.pi / one.order) for one in symmetries if one.order > 1]
+    steps = [
+        _turn_about(one.axis, 2 * np.pi / one.order)
+        for one in symmetries
+        if one.order > 1
+    ]
     turns = [np.eye(3)]
     for turn in turns:  # it grows
         for step in steps:
@@ -252,14 +263,25 @@ def check_candidate(candidate: Any, classes: int) -> PoseCandidate:
         raise ModelError("a pose is a matrix of (4, 4) finite numbers")
 
     turned = pose[:3, :3]
-    rigid = np.abs(turned @ turned.T - np.eye(3)).max() < RIGID and np.linalg.det(turned) > 0
+    rigid = (
+        np.abs(turned @ turned.T - np.eye(3)).max() < RIGID
+        and np.linalg.det(turned) > 0
+    )
     if not rigid or np.abs(pose[3] - (0, 0, 0, 1)).max() > RIGID:
-        raise ModelError("a pose is not a rigid motion: a rotation and a place, in metres")
+        raise ModelError(
+            "a pose is not a rigid motion: a rotation and a place, in metres"
+        )
     displacements = np.asarray(candidate.displacements, np.float64)
     if displacements.shape[1:] != (3,) or not np.isfinite(displacements).all():
-        raise ModelError("the displacements of a pose are (views, 3) finite numbers, in metres")
+        raise ModelError(
+            "the displacements of a pose are (views, 3) finite numbers, in metres"
+        )
     if not 0 <= candidate.label < classes:
-        raise ModelError(f"a pose is of class {candidate.label}, and there are {classes}")
+        raise ModelError(
+            f"a pose is of class {candidate.label}, and there are {classes}"
+        )
     if not 0 <= candidate.probability <= 1:
-        raise ModelError(f"the probability of a pose is {candidate.probability}, not 0 to 1")
+        raise ModelError(
+            f"the probability of a pose is {candidate.probability}, not 0 to 1"
+        )
     return candidate

@@ -81,7 +81,10 @@ class JudgesTogether(Protocol):
     """
 
     def together(
-        self, observations: Sequence[Observation], total: Floats, counted: int
+        self,
+        observations: Sequence[Observation],
+        total: Floats,
+        counted: int,
     ) -> JointBelief:
         """What is believed of an object.
 

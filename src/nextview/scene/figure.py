@@ -19,7 +19,16 @@ from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.object_frame import upright_axes
 from nextview.sensing.tabletop import TableTop
-from nextview.session.style import ACCENT, BLUE, FAINT, FIGURE_STYLE, GREY, INK, PAPER, PlainFigure
+from nextview.session.style import (
+    ACCENT,
+    BLUE,
+    FAINT,
+    FIGURE_STYLE,
+    GREY,
+    INK,
+    PAPER,
+    PlainFigure,
+)
 from nextview.types import Float, Floats, Mask
 
 FIGURE_HEIGHT = 5.2  # inches, of both pictures
@@ -70,9 +79,16 @@ def draw_scene(
         else OBJECT_COLOURS[k % len(OBJECT_COLOURS)]
         for k, thing in enumerate(objects)
     }
-    rc = FIGURE_STYLE | {"axes.grid": False, "figure.facecolor": PAPER, "axes.facecolor": PAPER}
+    rc = FIGURE_STYLE | {
+        "axes.grid": False,
+        "figure.facecolor": PAPER,
+        "axes.facecolor": PAPER,
+    }
     with matplotlib.rc_context(rc):
-        rows, columns = _part(top.frame, [thing.pixels.get(number) for thing in objects])
+        rows, columns = _part(
+            top.frame,
+            [thing.pixels.get(number) for thing in objects],
+        )
         aspect = (columns.stop - columns.start) / (rows.stop - rows.start)
         width = FIGURE_HEIGHT * (aspect + 1) + 3 * FIGURE_MARGIN
         height = FIGURE_HEIGHT + TOP + FIGURE_MARGIN
@@ -81,11 +97,18 @@ def draw_scene(
 
         high = FIGURE_HEIGHT / height
         left = figure.add_axes(
-            (FIGURE_MARGIN / width, FIGURE_MARGIN / height, FIGURE_HEIGHT * aspect / width, high)
+            (
+                FIGURE_MARGIN / width,
+                FIGURE_MARGIN / height,
+                FIGURE_HEIGHT * aspect / width,
+                high,
+            )
         )
         _draw_frame(left, top.frame, number, objects, colours, (rows, columns))
         start = (2 * FIGURE_MARGIN + FIGURE_HEIGHT * aspect) / width
-        right = figure.add_axes((start, FIGURE_MARGIN / height, FIGURE_HEIGHT / width, high))
+        right = figure.add_axes(
+            (start, FIGURE_MARGIN / height, FIGURE_HEIGHT / width, high)
+        )
         _draw_from_above(right, tops, objects, colours, target)
         return figure
 
@@ -108,7 +131,16 @@ def _heading(
     more = f"{title}: " if title else ""
     more += f"{frames} frame{'s' * (frames > 1)}; names in italics are not confident"
     x = FIGURE_MARGIN / width
-    figure.text(x, 1 - 0.16 / height, said, fontsize=15, weight="bold", color=BLUE, va="top")
+    figure.text(
+        x,
+        1 - 0.16 / height,
+        said,
+        fontsize=15,
+        weight="bold",
+        color=BLUE,
+        va="top",
+    )
+
     figure.text(x, 1 - 0.5 / height, more, fontsize=9.5, color=GREY, va="top")
 
 
@@ -130,7 +162,13 @@ def _draw_frame(
     part: tuple[slice, slice],
 ) -> None:
     """The frame with outlines, names, and axes of the poses."""
-    axes.imshow(grey_picture(frame), cmap="gray", vmin=0, vmax=1, interpolation="bilinear")
+    axes.imshow(
+        grey_picture(frame),
+        cmap="gray",
+        vmin=0,
+        vmax=1,
+        interpolation="bilinear",
+    )
     axes.set_xlim(part[1].start - 0.5, part[1].stop - 0.5)
     axes.set_ylim(part[0].stop - 0.5, part[0].start - 0.5)
     axes.axis("off")
@@ -159,7 +197,9 @@ def _draw_frame(
         rows, columns = np.nonzero(mask)
         x = float(columns.mean())
         y = float(rows.min()) - 4
-        while any(abs(y - b) < line and abs(x - a) < NAME_LINES * line for a, b in taken):
+        while any(
+            abs(y - b) < line and abs(x - a) < NAME_LINES * line for a, b in taken
+        ):
             y -= line
         taken.append((x, y))
         _name(axes, thing, x, y, colours, "bottom")
@@ -171,7 +211,11 @@ def grey_picture(frame: Frame) -> Floats:
         # pale, so that outlines and names can be read on it
         return 0.25 + 0.75 * frame.image / 255
     seen = frame.depth > 0
-    nearest = ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
+    nearest = ndimage.distance_transform_edt(
+        ~seen,
+        return_distances=False,
+        return_indices=True,
+    )
     depth = ndimage.median_filter(frame.depth[tuple(nearest)], 5)
     inverse = 1 / depth
     low, high = np.quantile(inverse, [0.02, 0.98])
@@ -190,19 +234,32 @@ def _draw_axes(axes: Axes, frame: Frame, thing: SceneObject) -> None:
     pose = thing.pose
     assert pose is not None
     radius = thing.result.radius or 0.05
-    ends = np.stack([thing.place, *(thing.place + AXIS_LENGTH * radius * pose[:3, :3].T)])
+    ends = np.stack(
+        [thing.place, *(thing.place + AXIS_LENGTH * radius * pose[:3, :3].T)]
+    )
     camera = frame.camera_to_world
     in_camera = (ends - camera[:3, 3]) @ camera[:3, :3]
     if (in_camera[:, 2] < 0.01).any():
         return
     at = frame.camera.project(in_camera) - 0.5
+
     for end, colour in zip(at[1:], AXIS_COLOURS, strict=True):
-        line = axes.plot(*np.stack([at[0], end]).T, color=colour, lw=1.8, solid_capstyle="round")
+        line = axes.plot(
+            *np.stack([at[0], end]).T,
+            color=colour,
+            lw=1.8,
+            solid_capstyle="round",
+        )
         line[0].set_path_effects([withStroke(linewidth=3.0, foreground="white")])
 
 
 def _name(
-    axes: Axes, thing: SceneObject, x: float, y: float, colours: dict[int, str], side: str
+    axes: Axes,
+    thing: SceneObject,
+    x: float,
+    y: float,
+    colours: dict[int, str],
+    side: str,
 ) -> None:
     """Write the name of an object, in italics where it is not confident."""
     options: dict[str, Any] = {"ha": "center", "va": side, "clip_on": True}
@@ -250,14 +307,27 @@ def _draw_from_above(
     low, high = (low + high) / 2 - side / 2, (low + high) / 2 + side / 2
 
     for thing, (corners, picture) in zip(objects, outlines, strict=True):
-        _draw_outline(axes, corners, picture, colours[thing.number], thing.name != UNKNOWN_NAME)
+        _draw_outline(
+            axes,
+            corners,
+            picture,
+            colours[thing.number],
+            thing.name != UNKNOWN_NAME,
+        )
     for thing, (corners, _) in zip(objects, outlines, strict=True):
         middle = (corners.min(0) + corners.max(0)) / 2
         _name(axes, thing, float(middle[0]), float(middle[1]), colours, "center")
     for pose in cameras:
         _draw_camera(axes, upright @ pose[:3, 3], upright @ pose[:3, 2], low, high, INK)
     if target is not None:
-        _draw_camera(axes, upright @ target[:3, 3], upright @ target[:3, 2], low, high, ACCENT)
+        _draw_camera(
+            axes,
+            upright @ target[:3, 3],
+            upright @ target[:3, 2],
+            low,
+            high,
+            ACCENT,
+        )
 
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
@@ -286,9 +356,19 @@ def seen_from_above(thing: SceneObject, upright: Float) -> tuple[Float, Mask | N
     placed = posed.vertices @ posed.pose[:3, :3].T + posed.pose[:3, 3]
     corners = placed @ upright.T
     low = corners[:, :2].min(0) - 2 * FIGURE_CELL
-    count = np.ceil((corners[:, :2].max(0) + 2 * FIGURE_CELL - low) / FIGURE_CELL).astype(int) + 1
-    at = np.stack(np.meshgrid(*(np.arange(n) for n in count), indexing="ij"), -1).reshape(-1, 2)
-    start = np.column_stack([low + at * FIGURE_CELL, np.full(len(at), corners[:, 2].max() + 1.0)])
+    count = (
+        np.ceil((corners[:, :2].max(0) + 2 * FIGURE_CELL - low) / FIGURE_CELL).astype(
+            int
+        )
+        + 1
+    )
+    at = np.stack(
+        np.meshgrid(*(np.arange(n) for n in count), indexing="ij"),
+        -1,
+    ).reshape(-1, 2)
+    start = np.column_stack(
+        [low + at * FIGURE_CELL, np.full(len(at), corners[:, 2].max() + 1.0)]
+    )
     caster = RayCaster([(corners, posed.faces)])
     away, _ = caster.cast(start, np.broadcast_to([0.0, 0.0, -1.0], start.shape))
 
@@ -296,17 +376,27 @@ def seen_from_above(thing: SceneObject, upright: Float) -> tuple[Float, Mask | N
 
 
 def _draw_outline(
-    axes: Axes, corners: Float, picture: Mask | None, colour: str, known: bool
+    axes: Axes,
+    corners: Float,
+    picture: Mask | None,
+    colour: str,
+    known: bool,
 ) -> None:
     """Draw an object as it is seen from above."""
     style = "-" if known else ":"
     if picture is None:
         face = (*matplotlib.colors.to_rgb(colour), 0.25)
         patch = Polygon(
-            corners, closed=True, facecolor=face, edgecolor=colour, linewidth=1.6, linestyle=style
+            corners,
+            closed=True,
+            facecolor=face,
+            edgecolor=colour,
+            linewidth=1.6,
+            linestyle=style,
         )
         axes.add_patch(patch)
         return
+
     low = corners.min(0) - 2 * FIGURE_CELL
     x, y = (low[k] + FIGURE_CELL * np.arange(picture.shape[k]) for k in (0, 1))
     shape = ndimage.gaussian_filter(picture.astype(float), 0.8).T
@@ -315,7 +405,12 @@ def _draw_outline(
 
 
 def _draw_camera(
-    axes: Axes, place: Float, ahead: Float, low: Float, high: Float, colour: str
+    axes: Axes,
+    place: Float,
+    ahead: Float,
+    low: Float,
+    high: Float,
+    colour: str,
 ) -> None:
     """An arrow where a camera stood, at the border if it is outside."""
     inset = 0.04 * (high - low)
@@ -334,6 +429,7 @@ def _draw_camera(
         zorder=15,
     )
     axes.add_patch(arrow)
+
     if colour == ACCENT:
         away = at - 0.03 * size * way
         axes.text(
@@ -356,5 +452,10 @@ def _scale_bar(axes: Axes, low: Float, side: float) -> None:
     start = low + 0.04 * side
     axes.plot([start[0], start[0] + length], [start[1], start[1]], color=INK, lw=1.6)
     axes.text(
-        start[0] + length / 2, start[1] + 0.012 * side, words, fontsize=8, color=INK, ha="center"
+        start[0] + length / 2,
+        start[1] + 0.012 * side,
+        words,
+        fontsize=8,
+        color=INK,
+        ha="center",
     )

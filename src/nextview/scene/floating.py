@@ -11,7 +11,9 @@ from nextview.scene.tracks import Track
 from nextview.sensing.segmentation import Plane
 from nextview.types import Float, Mask
 
-FLOATING_HEIGHT = 0.02  # metres from the plane to the lowest point of a thing that stands on it
+FLOATING_HEIGHT = (
+    0.02  # metres from the plane to the lowest point of a thing that stands on it
+)
 
 
 def floating(tracks: Sequence[Track], plane: Plane) -> list[bool]:

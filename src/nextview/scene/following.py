@@ -16,10 +16,11 @@ from nextview.sensing.object_frame import upright_axes
 from nextview.sensing.tabletop import TableTop
 from nextview.types import Float, Index, Mask
 
-SEGMENT_MARGIN = (
-    0.012  # metres around an object, seen from above, within which pixels may be its own
+# metres around an object, seen from above, within which pixels may be its own
+SEGMENT_MARGIN = 0.012
+SAME_OBJECT_SHARE = (
+    0.5  # share of a segment over an object, from which it is that object
 )
-SAME_OBJECT_SHARE = 0.5  # share of a segment over an object, from which it is that object
 SECOND = 0.2  # share of a segment over another object, from which the segment is cut
 SEGMENT_POINTS = 400  # points of a segment that are looked at
 FEWEST_TESTED = 30  # pixels in which an object should show before it is called gone
@@ -54,7 +55,9 @@ class Outline:
         if posed is not None and posed.vertices is not None:
             points = posed.vertices @ posed.pose[:3, :3].T + posed.pose[:3, 3]
         else:
-            points = np.concatenate([sighting.hull for sighting in track.thing.sightings])
+            points = np.concatenate(
+                [sighting.hull for sighting in track.thing.sightings]
+            )
         flat = points @ axes.T
         around = SEGMENT_MARGIN / 4 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1.0]])
         with suppress(QhullError):
@@ -65,11 +68,15 @@ class Outline:
     def holds(self, points: Float) -> Mask:
         """Which points, (N, 3), lie inside of it or beside it, seen from above, (N,) bool."""
         flat = points @ self.axes.T
-        return np.asarray((flat @ self.sides[:, :2].T + self.sides[:, 2] <= SEGMENT_MARGIN).all(1))
+        return np.asarray(
+            (flat @ self.sides[:, :2].T + self.sides[:, 2] <= SEGMENT_MARGIN).all(1)
+        )
 
 
 def assign(
-    segments: Sequence[Mask], tracks: Sequence[Track], top: TableTop
+    segments: Sequence[Mask],
+    tracks: Sequence[Track],
+    top: TableTop,
 ) -> tuple[dict[int, Mask], list[Mask]]:
     """Assign the segments of a frame to objects.
 
@@ -89,7 +96,10 @@ def assign(
     for segment in segments:
         points = _points(segment, top.frame)
         shares = np.array(
-            [0.0 if one is None else float(one.holds(points).mean()) for one in outlines]
+            [
+                0.0 if one is None else float(one.holds(points).mean())
+                for one in outlines
+            ]
         )
         rows = np.flatnonzero(shares >= SECOND)
         best = int(shares.argmax()) if len(shares) else -1
@@ -137,7 +147,9 @@ def _divided(
         return {int(rows[0]): segment}
 
     nearest = ndimage.distance_transform_edt(
-        label == 0, return_distances=False, return_indices=True
+        label == 0,
+        return_distances=False,
+        return_indices=True,
     )
     label = np.where(segment, label[tuple(nearest)], 0)
 
@@ -201,7 +213,9 @@ def _agreement_of_points(track: Track, frame: Frame) -> SegmentAgreement:
     in_camera = (points - now[:3, 3]) @ now[:3, :3]
     in_camera = in_camera[in_camera[:, 2] > 0.01]
     column, row = np.floor(frame.camera.project(in_camera)).astype(np.int64).T
-    inside = (row >= 0) & (row < frame.shape[0]) & (column >= 0) & (column < frame.shape[1])
+    inside = (
+        (row >= 0) & (row < frame.shape[0]) & (column >= 0) & (column < frame.shape[1])
+    )
     depth = frame.depth[row[inside], column[inside]]
     off = (depth - in_camera[inside, 2])[depth > 0]
     if not len(off):

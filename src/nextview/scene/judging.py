@@ -152,7 +152,9 @@ class Judge:
             return ()
         things = bool(recogniser.calibration.hypotheses)
         wrong = card.size.impossible(radius, THING_SIZE if things else MUCH)
-        return tuple(name for name, off in zip(self.system.classes, wrong, strict=True) if off)
+        return tuple(
+            name for name, off in zip(self.system.classes, wrong, strict=True) if off
+        )
 
     def _confident(self, result: Recognition, joint: JointBelief | None) -> bool:
         """Whether the belief is high enough, and the object fits what it is taken for."""

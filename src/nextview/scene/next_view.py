@@ -76,13 +76,23 @@ class TableGround:
         plane = tops[0].plane
         floor = float(np.median(flat[:, 2] - plane.height(corners)))
         low = flat[:, :2].min(0) - OBJECT_MARGIN
-        count = np.ceil((flat[:, :2].max(0) + OBJECT_MARGIN - low) / TABLE_CELL).astype(int) + 1
+        count = (
+            np.ceil((flat[:, :2].max(0) + OBJECT_MARGIN - low) / TABLE_CELL).astype(int)
+            + 1
+        )
         shape = (int(count[0]), int(count[1]))
-        at = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 2)
-        middle = np.column_stack([low + (at + 0.5) * TABLE_CELL, np.full(len(at), floor)])
+        at = np.stack(
+            np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"),
+            -1,
+        ).reshape(-1, 2)
+        middle = np.column_stack(
+            [low + (at + 0.5) * TABLE_CELL, np.full(len(at), floor)]
+        )
         level = middle @ axes
         # the plane may lean a little
-        points = level - plane.height(level)[:, None] * axes[2] / (plane.normal @ axes[2])
+        points = level - plane.height(level)[:, None] * axes[2] / (
+            plane.normal @ axes[2]
+        )
 
         top = np.zeros(len(points))
         in_view = np.zeros(len(points), bool)
@@ -146,12 +156,20 @@ class TableGround:
         cell = np.floor((along[..., :2] - self.low) / TABLE_CELL).astype(np.int64)
         inside = ((cell >= 0) & (cell < self.shape)).all(-1)
         index = np.where(inside, cell[..., 0] * self.shape[1] + cell[..., 1], 0)
-        beyond = np.linalg.norm(along[..., :2] - ends[:, None, :2], axis=-1) > own[:, None]
+        beyond = (
+            np.linalg.norm(along[..., :2] - ends[:, None, :2], axis=-1) > own[:, None]
+        )
         blocked = inside & beyond & (self.top[index] > along[..., 2] - floor[:, None])
         return np.asarray(~blocked.any(1))
 
 
-def _raise_over(top: Float, one: TableTop, low: Float, shape: tuple[int, int], axes: Float) -> None:
+def _raise_over(
+    top: Float,
+    one: TableTop,
+    low: Float,
+    shape: tuple[int, int],
+    axes: Float,
+) -> None:
     """Note how high what a frame shows above the plane reaches over each cell."""
     rows, columns = np.nonzero(one.above)
     few = slice(None, None, max(1, len(rows) // 20_000))
@@ -159,7 +177,11 @@ def _raise_over(top: Float, one: TableTop, low: Float, shape: tuple[int, int], a
     cell = np.floor((points @ axes[:2].T - low) / TABLE_CELL).astype(np.int64)
     inside = ((cell >= 0) & (cell < shape)).all(1)
     index = cell[inside, 0] * shape[1] + cell[inside, 1]
-    np.maximum.at(top, index, one.height[rows[few], columns[few]][inside].astype(np.float64))
+    np.maximum.at(
+        top,
+        index,
+        one.height[rows[few], columns[few]][inside].astype(np.float64),
+    )
 
 
 def _seen_in(frame: Frame, points: Float) -> tuple[Mask, Mask]:
@@ -172,7 +194,11 @@ def _seen_in(frame: Frame, points: Float) -> tuple[Mask, Mask]:
     column, row = np.floor(np.clip(at, -1e6, 1e6)).astype(np.int64).T
     inside = ahead & (row >= 0) & (row < frame.shape[0])
     inside &= (column >= 0) & (column < frame.shape[1])
-    depth = np.where(inside, frame.depth[np.where(inside, row, 0), np.where(inside, column, 0)], 0)
+    depth = np.where(
+        inside,
+        frame.depth[np.where(inside, row, 0), np.where(inside, column, 0)],
+        0,
+    )
     return inside, np.asarray(inside & (depth > away - HIDDEN_STEP))
 
 
@@ -202,7 +228,10 @@ class Candidates:
 
 
 def candidates(
-    system: System, tops: Sequence[TableTop], tracks: Sequence[Track], distance: float | None
+    system: System,
+    tops: Sequence[TableTop],
+    tracks: Sequence[Track],
+    distance: float | None,
 ) -> Candidates:
     """Views from around a scene, all at one distance from its middle.
 
@@ -213,7 +242,9 @@ def candidates(
         distance: of the cameras from the middle, metres; None: that of the last camera.
     """
     axes = upright_axes(tops[0].up)
-    hulls = np.concatenate([one.hull for track in tracks for one in track.thing.sightings])
+    hulls = np.concatenate(
+        [one.hull for track in tracks for one in track.thing.sightings]
+    )
     middle = (hulls.min(0) + hulls.max(0)) / 2
     places = np.stack([top.frame.camera_to_world[:3, 3] for top in tops])
     away = float(np.linalg.norm(places[-1] - middle)) if distance is None else distance
@@ -224,12 +255,17 @@ def candidates(
     for place in places:
         towards = (place - middle) @ axes.T
         towards = towards / np.linalg.norm(towards)
-        free &= np.array([angle_between(one, towards) > SAME_VIEW_ANGLE for one in directions])
+        free &= np.array(
+            [angle_between(one, towards) > SAME_VIEW_ANGLE for one in directions]
+        )
     return Candidates(poses, directions, free)
 
 
 def values(
-    system: System, tops: Sequence[TableTop], tracks: Sequence[Track], views: Candidates
+    system: System,
+    tops: Sequence[TableTop],
+    tracks: Sequence[Track],
+    views: Candidates,
 ) -> Float:
     """What each candidate view is expected to tell of the whole scene, nats, (V,).
 
@@ -250,7 +286,11 @@ def values(
         worth += told
 
     if ground.largest_hidden >= FEWEST_HIDDEN:
-        each = len(tracks) * np.log(max(len(system.classes), 2)) / max(len(ground.hidden), 1)
+        each = (
+            len(tracks)
+            * np.log(max(len(system.classes), 2))
+            / max(len(ground.hidden), 1)
+        )
         for row in np.flatnonzero(views.free):
             seen = ground.visible(views.poses[row, :3, 3]) & ground.hidden
             worth[row] += each * np.count_nonzero(seen)
@@ -267,7 +307,10 @@ def _information(system: System, track: Track, views: Candidates) -> Float | Non
     joint = result.views[-1].joint
     if not isinstance(recogniser, LooksAhead) or joint is None or result.unknown:
         return None
-    outlook = recogniser.outlook([one for one in track.thing.observations if one.seen], joint)
+    outlook = recogniser.outlook(
+        [one for one in track.thing.observations if one.seen],
+        joint,
+    )
     if outlook is None:
         return None
 
@@ -277,7 +320,11 @@ def _information(system: System, track: Track, views: Candidates) -> Float | Non
     return np.asarray(outlook.expect(inside).information("thing"))
 
 
-def _from_another_side(track: Track, tops: Sequence[TableTop], views: Candidates) -> Float:
+def _from_another_side(
+    track: Track,
+    tops: Sequence[TableTop],
+    views: Candidates,
+) -> Float:
     """What each view is worth by how far it is from those that an object was seen from, nats,
     (V,).
     """
@@ -308,5 +355,8 @@ def best(views: Candidates, worth: Float, here: Float) -> int | None:
     if not views.free.any():
         return None
     way = np.linalg.norm(views.poses[:, :3, 3] - here, axis=1)
-    value = worth - NEAR_TIE * float(worth[views.free].max()) * way / max(way.max(), 1e-9)
+    value = worth - NEAR_TIE * float(worth[views.free].max()) * way / max(
+        way.max(),
+        1e-9,
+    )
     return int(np.where(views.free, value, -np.inf).argmax())

@@ -109,7 +109,9 @@ class SceneObject:
     @property
     def warnings(self) -> tuple[ViewWarning, ...]:
         """What is likely to be wrong with it; usually nothing."""
-        of_views = tuple(warning for view in self.result.views for warning in view.warnings)
+        of_views = tuple(
+            warning for view in self.result.views for warning in view.warnings
+        )
         return (*of_views, FLOATING) if self.floats else of_views
 
     def __repr__(self) -> str:
@@ -119,4 +121,6 @@ class SceneObject:
             sides = " x ".join(f"{100 * side:.0f}" for side in self.size)
             return f"{self.number}: unknown, {sides} cm, {where}"
         sure = "confident" if self.confident else "not confident"
-        return f"{self.number}: {self.name}, belief {self.confidence:.3f}, {sure}, {where}"
+        return (
+            f"{self.number}: {self.name}, belief {self.confidence:.3f}, {sure}, {where}"
+        )

@@ -19,7 +19,11 @@ from scipy import ndimage
 from nextview.errors import ObservationError
 from nextview.recognition.poses import PoseCandidate
 from nextview.scene.tracks import RenderedObject, Track, render_track
-from nextview.sensing.observed_object import FEWEST_OBJECT_PIXELS, ObservedObject, Sighting
+from nextview.sensing.observed_object import (
+    FEWEST_OBJECT_PIXELS,
+    ObservedObject,
+    Sighting,
+)
 from nextview.sensing.tabletop import NEAR_TABLE, TableTop
 from nextview.types import Float, Index, Mask
 
@@ -27,11 +31,15 @@ GOOD_FIT = 0.85  # share of an object's pixels that its scan explains, from whic
 LEAST_GAIN = 0.03  # by which another parting explains more of the pixels, at least
 # the same where an unknown object is cut: any surface has small parts that some thing explains
 LEAST_OF_UNKNOWN = 0.3
-KNOWN_SHARE = 0.5  # share of an object's pixels that are explained, from which it is a known one
+KNOWN_SHARE = (
+    0.5  # share of an object's pixels that are explained, from which it is a known one
+)
 MOST_PLANE_SHARE = 0.25  # share of an object's pixels that may be the plane's
 LEAST_TRIMMED = 0.02
 SHARED = 0.5  # share of a segment that another object's scan explains, from which they may be one
-NEAR_GAP = 0.02  # metres between segments in the picture that are tried as one object, at most
+NEAR_GAP = (
+    0.02  # metres between segments in the picture that are tried as one object, at most
+)
 NEAR_STEP = 0.03  # metres between their depths there, at most
 MOST_GROUP = 5  # segments that touch and are tried as one object
 MOST_TRIES = 2  # frames in which an object's pixels are parted otherwise in vain
@@ -80,7 +88,11 @@ class Bench:
         return self.share([track]) >= GOOD_FIT
 
 
-def part(tracks: Sequence[Track], bench: Bench, before: Mapping[int, Track]) -> list[Track]:
+def part(
+    tracks: Sequence[Track],
+    bench: Bench,
+    before: Mapping[int, Track],
+) -> list[Track]:
     """Merge and cut the objects of one frame where the scans then explain more of it.
 
     Args:
@@ -96,7 +108,8 @@ def part(tracks: Sequence[Track], bench: Bench, before: Mapping[int, Track]) -> 
     tracks = _cut(tracks, bench)
     tracks = _without_rests(tracks, bench)
     return [
-        track if bench.is_good(track) else replace(track, tries=track.tries + 1) for track in tracks
+        track if bench.is_good(track) else replace(track, tries=track.tries + 1)
+        for track in tracks
     ]
 
 
@@ -133,7 +146,9 @@ def taken_over(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]
     judged = bench_judged([found[row] for row in rows], benches)
     for row, track in zip(rows, judged, strict=True):
         found[row] = track
-    return [track for row, track in enumerate(found) if row not in changed or track.frames]
+    return [
+        track for row, track in enumerate(found) if row not in changed or track.frames
+    ]
 
 
 def merged(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]:
@@ -150,14 +165,19 @@ def merged(tracks: Sequence[Track], benches: Sequence[Bench]) -> list[Track]:
     for one, other in combinations(range(len(tracks)), 2):
         if _in_each_other(tracks[one].posed, tracks[other].posed):
             with suppress(ObservationError):
-                pairs.append((one, other, _union([tracks[one], tracks[other]], benches[-1])))
+                pairs.append(
+                    (one, other, _union([tracks[one], tracks[other]], benches[-1]))
+                )
 
     judged = bench_judged([union for _, _, union in pairs], benches)
     found: dict[int, Track | None] = dict(enumerate(tracks))
     changed: set[int] = set()
     for (one, other, _), union in zip(pairs, judged, strict=True):
         before = _explained([tracks[one], tracks[other]], benches)
-        if not changed & {one, other} and _explained([union], benches) >= before - LEAST_GAIN:
+        if (
+            not changed & {one, other}
+            and _explained([union], benches) >= before - LEAST_GAIN
+        ):
             changed |= {one, other}
             found[one], found[other] = union, None
     return [track for track in found.values() if track is not None]
@@ -223,7 +243,10 @@ def _taken(loser: Track, taker: Track, bench: Bench) -> tuple[Track, Track] | No
         grown = taker.with_mask(bench.number, own, bench.top)
         if bench.top.is_thing(rest):
             smaller = loser.with_mask(bench.number, rest, bench.top)
-            return replace(smaller, result=loser.result), replace(grown, result=taker.result)
+            return replace(smaller, result=loser.result), replace(
+                grown,
+                result=taker.result,
+            )
         left = loser.without(bench.number, bench.top.up)
     except ObservationError:
         return None
@@ -236,7 +259,11 @@ def _taken(loser: Track, taker: Track, bench: Bench) -> tuple[Track, Track] | No
     return replace(loser, frames=(), again=()), replace(grown, absorbed=absorbed)
 
 
-def _trimmed(tracks: Sequence[Track], bench: Bench, before: Mapping[int, Track]) -> list[Track]:
+def _trimmed(
+    tracks: Sequence[Track],
+    bench: Bench,
+    before: Mapping[int, Track],
+) -> list[Track]:
     """Take away pixels beside the outline of what objects are most like: low ones, which the plane
     explains; and, of an object that was named before this frame, all, which may be another one's.
     """
@@ -246,7 +273,12 @@ def _trimmed(tracks: Sequence[Track], bench: Bench, before: Mapping[int, Track])
         if mask is None or bench.is_good(track):
             continue
         named = before[track.number].posed if track.number in before else None
-        rendered = render_track(track, bench.top, bench.number, named or track.likeliest)
+        rendered = render_track(
+            track,
+            bench.top,
+            bench.number,
+            named or track.likeliest,
+        )
         if rendered is None:
             continue
         kept = mask & rendered.around(mask.shape)
@@ -357,7 +389,9 @@ def _union(tracks: Sequence[Track], bench: Bench) -> Track:
     union = replace(
         first,
         again=tuple(pair for pair in again.items() if pair[0] not in frames),
-        absorbed=tuple(sorted({number for number in ended if number not in (-1, first.number)})),
+        absorbed=tuple(
+            sorted({number for number in ended if number not in (-1, first.number)})
+        ),
     )
     return union.seen_as(sightings, frames, bench.top.up)
 
@@ -382,7 +416,12 @@ def _without_rests(tracks: Sequence[Track], bench: Bench) -> list[Track]:
     for row, track in enumerate(tracks):
         mask = track.mask_in(bench.number)
         rendered = bench.render_likeliest(track)
-        if mask is None or rendered is None or track.tries >= MOST_TRIES or bench.is_good(track):
+        if (
+            mask is None
+            or rendered is None
+            or track.tries >= MOST_TRIES
+            or bench.is_good(track)
+        ):
             continue
         around = ndimage.binary_dilation(rendered.around(mask.shape), iterations=2)
         rests = bench.top.segments(mask & ~around)
@@ -414,7 +453,11 @@ def new_track(mask: Mask, bench: Bench) -> Track:
     return Track(-1, ObservedObject(up), ()).with_mask(bench.number, mask, top)
 
 
-def _better(tracks: Sequence[Track], tries: dict[int, list[Track]], bench: Bench) -> list[Track]:
+def _better(
+    tracks: Sequence[Track],
+    tries: dict[int, list[Track]],
+    bench: Bench,
+) -> list[Track]:
     """The objects, each as it is or as its parts, whichever scans explain better."""
     judged = iter(bench.judge([one for parts in tries.values() for one in parts]))
     found = []

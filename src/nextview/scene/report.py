@@ -62,7 +62,9 @@ def doubts_of(scene: Scene) -> list[str]:
 
 
 def scene_as_json(
-    scene: Scene, looks: Mapping[str, Look], left_out: Mapping[str, str]
+    scene: Scene,
+    looks: Mapping[str, Look],
+    left_out: Mapping[str, str],
 ) -> dict[str, Any]:
     """All that was found, for JSON.
 
@@ -76,7 +78,9 @@ def scene_as_json(
 
     for thing in scene.objects:
         likely = {
-            name: belief for name, belief in thing.result.beliefs.items() if belief >= LEAST_LISTED
+            name: belief
+            for name, belief in thing.result.beliefs.items()
+            if belief >= LEAST_LISTED
         }
         one: dict[str, Any] = {
             "number": thing.number,

@@ -106,7 +106,10 @@ class Scene:
         distance: float | None = None,
         reachable: Callable[[Float], bool] | None = None,
     ) -> None:
-        self.distance = None if distance is None else number(distance, "the distance", above=0)
+        self.distance = (
+            None if distance is None else number(distance, "the distance", above=0)
+        )
+
         self.reachable = reachable
         self.system = models if isinstance(models, System) else load(models)
         self.up = None if up is None else upright_axes(up)[2]
@@ -146,7 +149,9 @@ class Scene:
                 return False
             if not self._tracks:
                 return True
-            return TableGround.of(self._tops, self._tracks).largest_hidden < FEWEST_HIDDEN
+            return (
+                TableGround.of(self._tops, self._tracks).largest_hidden < FEWEST_HIDDEN
+            )
 
     @property
     def target(self) -> Float | None:
@@ -210,7 +215,9 @@ class Scene:
         from nextview.session.episode_figure import save_figure
 
         if not self._tops:
-            raise SessionError("there is nothing to draw before the first frame: update with one")
+            raise SessionError(
+                "there is nothing to draw before the first frame: update with one"
+            )
         target = None if self.done else self.target
         figure = draw_scene(self._tops, self.objects, target, title)
         if path is not None:
@@ -233,9 +240,15 @@ class Scene:
         segments = top.segments()
         bench = Bench(top, number, self._judged)
         there = [
-            track for track, one in zip(self._tracks, found, strict=True) if not one.contradicts
+            track
+            for track, one in zip(self._tracks, found, strict=True)
+            if not one.contradicts
         ]
-        lost = [track for track, one in zip(self._tracks, found, strict=True) if one.contradicts]
+        lost = [
+            track
+            for track, one in zip(self._tracks, found, strict=True)
+            if one.contradicts
+        ]
 
         own, new = assign(segments, there, top)
         shown = []
@@ -271,7 +284,9 @@ class Scene:
         number: int,
     ) -> Look:
         """Give new objects their numbers: what is lost in one place may be found in another."""
-        away = {track.result.answer: track for track in lost if track.result is not None}
+        away = {
+            track.result.answer: track for track in lost if track.result is not None
+        }
         appeared = []
         moved = []
         kept = []
@@ -279,7 +294,9 @@ class Scene:
         for track in tracks:
             if track.number < 0:
                 assert track.result is not None
-                old = away.pop(track.result.answer, None) if track.result.answer else None
+                old = (
+                    away.pop(track.result.answer, None) if track.result.answer else None
+                )
                 if old is not None:
                     track = replace(track, number=old.number)
                     moved.append(old.number)
@@ -291,7 +308,8 @@ class Scene:
             kept.append(replace(track, absorbed=()))
         in_the_air = floating(kept, top.plane)
         self._tracks = [
-            replace(track, floats=floats) for track, floats in zip(kept, in_the_air, strict=True)
+            replace(track, floats=floats)
+            for track, floats in zip(kept, in_the_air, strict=True)
         ]
 
         gone = tuple(track.number for track in lost if track.number not in moved)
@@ -310,7 +328,13 @@ class Scene:
             if first is not None and second is not None and top.touching(first, second):
                 self._touching.add((min(one, other), max(one, other)))
 
-    def _seen_again(self, track: Track, mask: Mask, top: TableTop, number: int) -> Track:
+    def _seen_again(
+        self,
+        track: Track,
+        mask: Mask,
+        top: TableTop,
+        number: int,
+    ) -> Track:
         """An object with its pixels in another frame.
 
         What is sure by some frames already, and is seen where it should be, is not judged anew.
@@ -335,7 +359,8 @@ class Scene:
         """The same objects with what each is."""
         results = self._judge([track.thing for track in tracks])
         return [
-            replace(track, result=result) for track, result in zip(tracks, results, strict=True)
+            replace(track, result=result)
+            for track, result in zip(tracks, results, strict=True)
         ]
 
 

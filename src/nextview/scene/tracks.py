@@ -21,12 +21,13 @@ from nextview.session.result import Recognition
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.types import Float, Float32, Mask
 
-RENDERED_ROWS = 120  # rows and columns in which a scan is rendered into a frame, at most
+RENDERED_ROWS = (
+    120  # rows and columns in which a scan is rendered into a frame, at most
+)
 AGREES = 0.006  # metres by which depth may be off from a scan, beside the noise
 AGREES_NOISE = 3.0  # standard deviations of the noise by which it may
-OTHER_VIEW = (
-    0.008  # metres by which a frame may show a thing displaced that was not aligned with it
-)
+# metres by which a frame may show a thing displaced that was not aligned with it
+OTHER_VIEW = 0.008
 EDGE_WIDTH = 4  # pixels around a scan's outline in which depth says nothing
 WINDOW_EDGE = 12  # pixels of a window around an outline
 
@@ -94,7 +95,12 @@ class Track:
             return None
         return self.thing.sightings[self.frames.index(number)].mask
 
-    def seen_as(self, sightings: Sequence[Sighting], frames: Sequence[int], up: Float) -> Track:
+    def seen_as(
+        self,
+        sightings: Sequence[Sighting],
+        frames: Sequence[int],
+        up: Float,
+    ) -> Track:
         """The same object by other sightings, not judged yet.
 
         Args:
@@ -142,10 +148,18 @@ class Track:
             for frame, one in zip(self.frames, self.thing.sightings, strict=True)
             if frame != number
         ]
+
         kept.append((number, sighting))
         kept.sort(key=lambda pair: pair[0])
-        track = replace(self, again=tuple(pair for pair in self.again if pair[0] != number))
-        return track.seen_as([one for _, one in kept], [frame for frame, _ in kept], top.up)
+        track = replace(
+            self,
+            again=tuple(pair for pair in self.again if pair[0] != number),
+        )
+        return track.seen_as(
+            [one for _, one in kept],
+            [frame for frame, _ in kept],
+            top.up,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +210,10 @@ class RenderedObject:
 
 
 def render_track(
-    track: Track, top: TableTop, number: int, posed: PoseCandidate | None
+    track: Track,
+    top: TableTop,
+    number: int,
+    posed: PoseCandidate | None,
 ) -> RenderedObject | None:
     """Render the scan of an object into a frame.
 
@@ -220,7 +237,9 @@ def render_track(
     frame = top.frame
     in_camera = np.linalg.inv(frame.camera_to_world) @ pose
     part = _window(
-        posed.vertices @ in_camera[:3, :3].T + in_camera[:3, 3], frame.intrinsics, frame.shape
+        posed.vertices @ in_camera[:3, :3].T + in_camera[:3, 3],
+        frame.intrinsics,
+        frame.shape,
     )
     if part is None:
         return None
@@ -271,7 +290,11 @@ def _cast(
     caster = _caster(posed.thing, _Triangles(posed.vertices, posed.faces))
     turn = in_camera[:3, :3].astype(np.float32)
     origin = (-in_camera[:3, 3] @ in_camera[:3, :3]).astype(np.float32)
-    depth, _ = caster.cast(np.zeros(1, np.int64), origin[None], (directions @ turn)[None])
+    depth, _ = caster.cast(
+        np.zeros(1, np.int64),
+        origin[None],
+        (directions @ turn)[None],
+    )
     coarse = depth.reshape(columns.shape)
     fine = np.repeat(np.repeat(coarse, step, 0), step, 1)
     height, width = len(y), len(x)

@@ -28,7 +28,9 @@ NOISE_TOLERANCE = 3.0  # standard deviations of the noise
 SMOOTH_STEP = 0.05
 # height over the largest plane, as a part of the depth, from which a point is not on it
 ABOVE_PLANE = 0.012
-FAR_BEHIND = 1.5  # times the depth in the middle of the picture: what lies farther is background
+FAR_BEHIND = (
+    1.5  # times the depth in the middle of the picture: what lies farther is background
+)
 SMALLEST_MIDDLE = 20  # grid points in the middle of the picture that tell its depth
 LEAST_DEPTH = 1e-6  # metres before a camera from which a point can be in its picture
 
@@ -103,7 +105,10 @@ class SurfaceView:
     def some(self, which: Mask) -> "SurfaceView":
         """The frame with some of its points, (N,) bool."""
         return replace(
-            self, points=self.points[which], noise=self.noise[which], standing=self.standing[which]
+            self,
+            points=self.points[which],
+            noise=self.noise[which],
+            standing=self.standing[which],
         )
 
     def with_focal_length(self, times: float) -> "SurfaceView":
@@ -140,11 +145,17 @@ class Agreement:
 
     def among(self, pairs: Mask) -> "Agreement":
         """That of some pairs of frames, (N, N)."""
-        return Agreement(np.where(pairs, self.confirmed, 0), np.where(pairs, self.contradicted, 0))
+        return Agreement(
+            np.where(pairs, self.confirmed, 0),
+            np.where(pairs, self.contradicted, 0),
+        )
 
     def of_frames(self, which: Index | Mask) -> "Agreement":
         """That of some frames with each other."""
-        return Agreement(self.confirmed[which][:, which], self.contradicted[which][:, which])
+        return Agreement(
+            self.confirmed[which][:, which],
+            self.contradicted[which][:, which],
+        )
 
     def of_each(self) -> tuple[Float, Float]:
         """Confirmed share and number of judged points of each frame, both ways, (N,) each."""
@@ -175,7 +186,9 @@ def surface_view(frame: Frame, rng: np.random.Generator) -> SurfaceView:
 
     depth = points[:, 2]
     by_noise = NOISE_TOLERANCE * noise.at(depth) * depth**2
-    pictures = {sharpness: _picture(frame, sharpness.columns) for sharpness in (ROUGH, SHARP)}
+    pictures = {
+        sharpness: _picture(frame, sharpness.columns) for sharpness in (ROUGH, SHARP)
+    }
     return SurfaceView(pictures, points, by_noise, standing)
 
 
@@ -211,14 +224,26 @@ def compare(
     there = poses if looked_up_with is None else looked_up_with
     for j, (view, pose) in enumerate(zip(views, there, strict=True)):
         seen_from = (world - pose[:3, 3]) @ pose[:3, :3] / scale
-        which, agrees, looks_through = _looked_up(view.pictures[sharpness], seen_from, tolerance)
+        which, agrees, looks_through = _looked_up(
+            view.pictures[sharpness],
+            seen_from,
+            tolerance,
+        )
         other = owner[which] != j
         confirmed[:, j] = np.bincount(owner[which], agrees & other, minlength=count)
-        contradicted[:, j] = np.bincount(owner[which], looks_through & other, minlength=count)
+        contradicted[:, j] = np.bincount(
+            owner[which],
+            looks_through & other,
+            minlength=count,
+        )
     return Agreement(confirmed, contradicted)
 
 
-def _looked_up(picture: Picture, points: Float, tolerance: Float) -> tuple[Index, Mask, Mask]:
+def _looked_up(
+    picture: Picture,
+    points: Float,
+    tolerance: Float,
+) -> tuple[Index, Mask, Mask]:
     """Return which points, (P, 3), lie in a picture, and are confirmed or contradicted."""
     height, width = picture.nearest.shape
     ahead = points[:, 2] > LEAST_DEPTH
@@ -228,7 +253,9 @@ def _looked_up(picture: Picture, points: Float, tolerance: Float) -> tuple[Index
     column, row = np.floor(np.clip(at, -1, (width, height))).astype(np.int64).T
 
     # At the border a small error of the pose leads out of the picture.
-    inside = ahead & (row >= 1) & (row < height - 1) & (column >= 1) & (column < width - 1)
+    inside = (
+        ahead & (row >= 1) & (row < height - 1) & (column >= 1) & (column < width - 1)
+    )
     which = np.flatnonzero(inside)
     row = row[which]
     column = column[which]
@@ -260,7 +287,10 @@ def _picture(frame: Frame, columns: int) -> Picture:
     intrinsics[:2] /= side
     object_near = None
     if frame.mask is not None:
-        object_near = ndimage.maximum_filter(_blockwise(frame.mask, side, np.maximum), 3)
+        object_near = ndimage.maximum_filter(
+            _blockwise(frame.mask, side, np.maximum),
+            3,
+        )
     return Picture(
         intrinsics,
         nearest=ndimage.minimum_filter(block_nearest, 3, mode="nearest"),
@@ -321,7 +351,10 @@ def _in_the_middle(grid: Float32) -> Mask:
 
 
 def _half_off_the_plane(
-    points: Float, frame: Frame, noise: Noise, rng: np.random.Generator
+    points: Float,
+    frame: Frame,
+    noise: Noise,
+    rng: np.random.Generator,
 ) -> tuple[Float, Mask]:
     """Return some points, half of them out of the largest plane if possible."""
     # The plane is searched in the camera's frame: the pose may be wrong.
@@ -332,7 +365,9 @@ def _half_off_the_plane(
         return points, np.ones(len(points), bool)
 
     z = points[:, 2]
-    above = plane.height(points) > ABOVE_PLANE * z + NOISE_TOLERANCE * noise.at(z) * z**2
+    above = (
+        plane.height(points) > ABOVE_PLANE * z + NOISE_TOLERANCE * noise.at(z) * z**2
+    )
     half = AGREEMENT_POINTS // 2
     on_it = _some(points[~above], max(half, AGREEMENT_POINTS - int(above.sum())), rng)
     off_it = _some(points[above], AGREEMENT_POINTS - min(half, len(on_it)), rng)

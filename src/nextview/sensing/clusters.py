@@ -21,9 +21,15 @@ from nextview.sensing.convex_pieces import Pieces
 from nextview.sensing.frame import Frame
 from nextview.types import Float, Index, Mask
 
-Joins = Literal["by their border", "never", "always"]  # whether things that touch are one thing
+Joins = Literal[
+    "by their border",
+    "never",
+    "always",
+]  # whether things that touch are one thing
 
-FOOTPRINT_CELL = 0.01  # side of a cell of the footprint, in distances of the camera from the object
+FOOTPRINT_CELL = (
+    0.01  # side of a cell of the footprint, in distances of the camera from the object
+)
 # share of the cells of a piece that lie over another one of the same frame, from which they are one
 OVERLAP = 0.25
 # strength of the link of two pieces that touch: what lies over each other in two frames is joined
@@ -31,9 +37,8 @@ OVERLAP = 0.25
 TOUCH = 0.45
 # share of the smaller of two clusters that a piece which joins them has at least: no leg joins two
 BRIDGE = 0.25
-LEAST_COVER = (
-    0.15  # of the area of a cell, as the camera sees it, that a piece shows over it, at least
-)
+# of the area of a cell, as the camera sees it, that a piece shows over it, at least
+LEAST_COVER = 0.15
 FEWEST_CELL_PIXELS = 2  # that show it
 # share of the cells of a piece that lie over, or beside, one of another frame, from which they are
 # one
@@ -45,7 +50,9 @@ ON_OUTLINE = 0.5  # cells up to which one outside of an outline lies on it
 OUTLINED = 25  # cells of a piece with an outline, at least
 MOST_COMPARED_CELLS = 50  # cells of a piece that are compared with those of another one
 FOOTPRINT_DIRECTIONS = 24
-SURROUNDED = 0.85  # share of the directions from what lies within a piece in which it has cells
+SURROUNDED = (
+    0.85  # share of the directions from what lies within a piece in which it has cells
+)
 TWO = 0.25  # share of the cells of an object that a part of it has which may be another thing
 # share of a thing's pixels over what is seen of the plane, at least: it may hide most of it
 OVER_PLANE = 0.1
@@ -86,7 +93,9 @@ class Footprint:
         many = np.bincount(self.piece, minlength=1)
         for piece in np.flatnonzero(many >= OUTLINED):
             with suppress(QhullError):  # all in a line
-                found[int(piece)] = ConvexHull(self.cells[self.piece == piece]).equations
+                found[int(piece)] = ConvexHull(
+                    self.cells[self.piece == piece]
+                ).equations
         return found
 
     def pixels_of(self, chosen: Mask) -> Mask:
@@ -96,7 +105,13 @@ class Footprint:
         return np.take(its_own, self.pieces.grown)
 
 
-def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Float) -> Footprint:
+def footprint(
+    frame: Frame,
+    pieces: Pieces,
+    axes: Float,
+    cell: float,
+    middle: Float,
+) -> Footprint:
     """The footprint of the pieces of a frame, seen from above, near a place.
 
     Args:
@@ -116,11 +131,15 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Fl
 
     for axis in axes[:2]:
         a, b, c = (pose[:3, :3].T @ axis / cell).astype(np.float32)
-        position = z * (a * x[columns] + b * y[rows] + c) + np.float32(axis @ pose[:3, 3] / cell)
+        position = z * (a * x[columns] + b * y[rows] + c) + np.float32(
+            axis @ pose[:3, 3] / cell
+        )
         ij.append(np.floor(position).astype(np.int64))
     there = np.floor(middle).astype(np.int64)
     i, j = ij
-    within = (np.abs(i - there[0]) <= CELLS_REACHED) & (np.abs(j - there[1]) <= CELLS_REACHED)
+    within = (np.abs(i - there[0]) <= CELLS_REACHED) & (
+        np.abs(j - there[1]) <= CELLS_REACHED
+    )
     z = z[within]
     label = label[within]
     i = i[within]
@@ -135,7 +154,9 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Fl
     count = np.bincount(key, minlength=many * len(used))
     focal = frame.intrinsics[0, 0] * frame.intrinsics[1, 1]
     area = np.bincount(key, z * z, len(count)) / focal
-    pairs = np.flatnonzero((area > LEAST_COVER * cell**2) & (count >= FEWEST_CELL_PIXELS))
+    pairs = np.flatnonzero(
+        (area > LEAST_COVER * cell**2) & (count >= FEWEST_CELL_PIXELS)
+    )
     area = area[pairs]
     at, piece = np.divmod(pairs, many)
     cells = np.stack(np.divmod(used[at], side), 1) + low
@@ -145,7 +166,8 @@ def footprint(frame: Frame, pieces: Pieces, axes: Float, cell: float, middle: Fl
 
 
 def clusters(
-    footprints: Sequence[Footprint], joins: Joins = "by their border"
+    footprints: Sequence[Footprint],
+    joins: Joins = "by their border",
 ) -> tuple[list[Index], Mask]:
     """Which pieces of some frames are of one object.
 
@@ -171,7 +193,9 @@ def clusters(
         return [np.zeros(n, np.int64) for n in sizes], np.zeros(1, bool)
 
     first = np.cumsum([0, *(len(f.pieces.stands) for f in footprints)])
-    node = np.concatenate([f.piece + start for f, start in zip(footprints, first, strict=False)])
+    node = np.concatenate(
+        [f.piece + start for f, start in zip(footprints, first, strict=False)]
+    )
     cells = np.concatenate([f.cells for f in footprints])
     near = np.abs(cells - cells[0]).max(1) <= BEYOND_REACH
     here, around = _cells_over(cells[near], node[near], int(first[-1]))
@@ -208,12 +232,18 @@ def _cells_over(cells: Index, node: Index, nodes: int) -> tuple[Float, Float]:
     at = cells - cells.min(0) + CELLS_BESIDE
     width = int(at[:, 1].max()) + 1 + CELLS_BESIDE
     place = at[:, 0] * width + at[:, 1]
-    used = np.bincount(place, minlength=(int(at[:, 0].max()) + 1 + CELLS_BESIDE) * width) > 0
+    used = (
+        np.bincount(place, minlength=(int(at[:, 0].max()) + 1 + CELLS_BESIDE) * width)
+        > 0
+    )
     number = np.where(used, np.cumsum(used) - 1, -1)
     here, around = np.zeros((2, nodes, used.sum() + 1))  # the last is that of -1
     here[node, number[place]] = 1
     steps = np.arange(-CELLS_BESIDE, CELLS_BESIDE + 1)
-    around[node[:, None], number[place[:, None] + np.add.outer(width * steps, steps).ravel()]] = 1
+    around[
+        node[:, None],
+        number[place[:, None] + np.add.outer(width * steps, steps).ravel()],
+    ] = 1
     return here[:, :-1], around[:, :-1]
 
 
@@ -240,11 +270,17 @@ def _within_outlines(footprints: Sequence[Footprint], shared: Float) -> Mask:
         for piece, outline in foot.outlines.items():
             its_node = first[k] + piece
             outer = cells[node == its_node]
-            near = np.flatnonzero(((cells >= outer.min(0)) & (cells <= outer.max(0))).all(1))
-            inside = (cells[near] @ outline[:, :2].T + outline[:, 2] <= ON_OUTLINE).all(1)
+            near = np.flatnonzero(
+                ((cells >= outer.min(0)) & (cells <= outer.max(0))).all(1)
+            )
+            inside = (cells[near] @ outline[:, :2].T + outline[:, 2] <= ON_OUTLINE).all(
+                1
+            )
             share = np.bincount(node[near], inside, minlength=first[-1]) / many
             share[its_node] = 0  # of itself all
-            for inner in np.flatnonzero((share >= WITHIN) & (shared[its_node] < LIES_OVER)):
+            for inner in np.flatnonzero(
+                (share >= WITHIN) & (shared[its_node] < LIES_OVER)
+            ):
                 own = cells[node == inner]
                 other_frame = not first[k] <= inner < first[k + 1]
                 within[inner, its_node] = _surrounds(outer, own) or (
@@ -260,7 +296,10 @@ def _surrounds(outer: Float, inner: Float) -> bool:
         (np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) + 0.5) * FOOTPRINT_DIRECTIONS
     ).astype(np.int64)
     seen = (
-        np.bincount(np.minimum(direction, FOOTPRINT_DIRECTIONS - 1), minlength=FOOTPRINT_DIRECTIONS)
+        np.bincount(
+            np.minimum(direction, FOOTPRINT_DIRECTIONS - 1),
+            minlength=FOOTPRINT_DIRECTIONS,
+        )
         > 0
     )
     return bool(seen.mean() >= SURROUNDED)
@@ -268,12 +307,20 @@ def _surrounds(outer: Float, inner: Float) -> bool:
 
 def _lie_beside(some: Float, others: Float) -> bool:
     """Whether half of some cells, (N, 2), lie on others, (M, 2), or beside them."""
-    gap = np.abs(some[:: max(1, len(some) // MOST_COMPARED_CELLS), None] - others).max(2).min(1)
+    gap = (
+        np.abs(some[:: max(1, len(some) // MOST_COMPARED_CELLS), None] - others)
+        .max(2)
+        .min(1)
+    )
     return bool((gap <= CELLS_BESIDE).mean() >= LIES_OVER)
 
 
 def _links(
-    footprints: Sequence[Footprint], shared: Float, beside: Mask, within: Mask, joins: Joins
+    footprints: Sequence[Footprint],
+    shared: Float,
+    beside: Mask,
+    within: Mask,
+    joins: Joins,
 ) -> tuple[Float, Mask, Mask]:
     """How strongly two pieces are linked, which stand apart, and which may; (N, N) each.
 
@@ -302,7 +349,11 @@ def _links(
     )
 
 
-def _joined(strength: Float, apart: Mask, size: Float) -> tuple[Index, list[tuple[int, int]]]:
+def _joined(
+    strength: Float,
+    apart: Mask,
+    size: Float,
+) -> tuple[Index, list[tuple[int, int]]]:
     """Cluster N pieces of given sizes, (N,), by their links, strong ones first.
 
     A strength, (N, N), of 0 is no link.
@@ -358,7 +409,8 @@ def central(foot: Footprint, labels: Index, plane: Float, optical_axis: Float) -
         return 0
     pixels = np.bincount(labels, foot.pixels)
     over_plane = np.bincount(
-        labels, foot.pixels * on_ground(foot.cells.astype(np.float64) + 0.5, plane)
+        labels,
+        foot.pixels * on_ground(foot.cells.astype(np.float64) + 0.5, plane),
     )
 
     cluster_of = np.zeros(len(foot.pieces.stands), np.int64)
@@ -373,7 +425,8 @@ def central(foot: Footprint, labels: Index, plane: Float, optical_axis: Float) -
 
     rows, columns = (step * np.arange(n) for n in cluster.shape)
     away = (
-        np.hypot(columns[None] - optical_axis[0], rows[:, None] - optical_axis[1]) / label.shape[1]
+        np.hypot(columns[None] - optical_axis[0], rows[:, None] - optical_axis[1])
+        / label.shape[1]
     )
     nearest_pixel = np.asarray(ndimage.minimum(away, cluster, np.arange(len(pixels))))
 
@@ -381,7 +434,11 @@ def central(foot: Footprint, labels: Index, plane: Float, optical_axis: Float) -
     return int(weight.argmax()) if weight.max() > 0 else 0
 
 
-def nearest(footprints: Sequence[Footprint], labels: Sequence[Index], point: Float) -> int:
+def nearest(
+    footprints: Sequence[Footprint],
+    labels: Sequence[Index],
+    point: Float,
+) -> int:
     """Return the cluster that is nearest to a point in most frames, seen from above.
 
     The result is 0 if there is none.

@@ -105,7 +105,9 @@ def cut(
     mask = mask | bottom
     inverse = _smooth(z, mask)
     usual = np.where(mask, z, 1).astype(np.float32)
-    error = (2 * noise.at(usual) * usual).astype(np.float32)  # as a part of the distance
+    error = (2 * noise.at(usual) * usual).astype(
+        np.float32
+    )  # as a part of the distance
     tolerance = (VALLEY + error) / usual
     found: Any
     found, count = ndimage.label(mask & ~_concave(inverse, tolerance))
@@ -118,15 +120,27 @@ def cut(
     found_near = found[tuple(nearest)]
     around = np.where((mask | (z == 0)) & close, found_near, found)
     with np.errstate(invalid="ignore"):
-        joins = mask & close & (np.abs(inverse[tuple(nearest)] - inverse) < 4 * tolerance)
+        joins = (
+            mask & close & (np.abs(inverse[tuple(nearest)] - inverse) < 4 * tolerance)
+        )
     found = np.where(joins, found_near, 0)
     low = mask & (high / usual - 2 * error < STANDS)
     stands = np.bincount(found[low], minlength=kept.sum() + 1) > LOW_PIXELS
     stands[0] = False
     shape = above[part].shape
-    kept_pixels = above[part] | _enlarged(bottom, step, shape) if bottom.any() else above[part]
-    for shown, small in ((label, found), (grown, _grown(found, mask, inverse, tolerance))):
-        np.copyto(shown[part], _enlarged(small, step, shape), where=kept_pixels, casting="unsafe")
+    kept_pixels = (
+        above[part] | _enlarged(bottom, step, shape) if bottom.any() else above[part]
+    )
+    for shown, small in (
+        (label, found),
+        (grown, _grown(found, mask, inverse, tolerance)),
+    ):
+        np.copyto(
+            shown[part],
+            _enlarged(small, step, shape),
+            where=kept_pixels,
+            casting="unsafe",
+        )
     whole = _grown(found, mask, inverse, 4 * tolerance)
     at_plane = _borders(whole, [low[a] | low[b] for a, b in NEXT]) >= LOW
     touch = _touching(whole, inverse, 2 * tolerance)
@@ -145,7 +159,11 @@ def _grown(label: Index, mask: Mask, inverse: Float32, tolerance: Float32) -> In
 
     for _ in range(GROWN):
         beside = bare[:, None] + (1, row, -1, -row)
-        off = np.where(flat[beside] > 0, np.abs(deep[beside] - deep[bare, None]), np.inf)
+        off = np.where(
+            flat[beside] > 0,
+            np.abs(deep[beside] - deep[bare, None]),
+            np.inf,
+        )
         nearest = np.arange(len(bare)), off.argmin(1)
         joins = off[nearest] < limit[bare]
         if not joins.any():
@@ -167,7 +185,11 @@ def _bottoms(depth: Float32, mask: Mask, height: Float32) -> Mask:
     label, count = ndimage.label(holes)
     if not count:
         return holes
-    middle = ndimage.median(height[holes] / depth[holes], label[holes], np.arange(1, count + 1))
+    middle = ndimage.median(
+        height[holes] / depth[holes],
+        label[holes],
+        np.arange(1, count + 1),
+    )
     return np.append(False, np.asarray(middle) > BOTTOM)[label]
 
 
@@ -176,7 +198,11 @@ def _smooth(depth: Float32, mask: Mask) -> Float32:
     weight = ndimage.uniform_filter(mask.astype(np.float32), 3, mode="constant")
     inverse = np.where(mask, 1 / np.where(mask, depth, 1), 0).astype(np.float32)
     total = ndimage.uniform_filter(inverse, 3, mode="constant")
-    return np.where(mask, total / np.maximum(weight, np.float32(1e-6)), np.float32(np.nan))
+    return np.where(
+        mask,
+        total / np.maximum(weight, np.float32(1e-6)),
+        np.float32(np.nan),
+    )
 
 
 def _concave(inverse: Float32, tolerance: Float32) -> Mask:
@@ -230,7 +256,10 @@ def _touching(label: Index, inverse: Float32, tolerance: Float32) -> Mask:
             meet[row, column] = np.abs(led[0] - led[1]) < limit
         meeting.append(meet)
     size = np.sqrt(np.bincount(label.ravel()))
-    touch = _borders(label, meeting) > np.maximum(CONTACT * np.minimum.outer(size, size), 2)
+    touch = _borders(label, meeting) > np.maximum(
+        CONTACT * np.minimum.outer(size, size),
+        2,
+    )
     touch[0] = touch[:, 0] = False
 
     return touch
@@ -238,7 +267,10 @@ def _touching(label: Index, inverse: Float32, tolerance: Float32) -> Mask:
 
 def _enclosed(label: Index) -> Mask:
     """Which pieces have most of their border to which other one, (pieces + 1, pieces + 1) bool."""
-    label = np.pad(label, 1)  # a piece has a border where the part of the picture ends, too
+    label = np.pad(
+        label,
+        1,
+    )  # a piece has a border where the part of the picture ends, too
     count = _borders(label, [np.ones(label[a].shape, bool) for a, _ in NEXT])
     inside = count > ENCLOSED * count.sum(1, keepdims=True)
     inside[0] = inside[:, 0] = False
@@ -255,7 +287,11 @@ def _hanging(label: Index, inverse: Float32, tolerance: Float32, stands: Mask) -
     n = len(stands)
     beneath = np.zeros_like(label)
     deep = np.full(inverse.shape, np.nan, np.float32)
-    for step in range(LAG, 0, -1):  # an edge is some pixels wide: the nearest comes last
+    for step in range(
+        LAG,
+        0,
+        -1,
+    ):  # an edge is some pixels wide: the nearest comes last
         shown = label[step:] > 0
         beneath[:-step][shown] = label[step:][shown]
         deep[:-step][shown] = inverse[step:][shown]
@@ -266,7 +302,10 @@ def _hanging(label: Index, inverse: Float32, tolerance: Float32, stands: Mask) -
     with np.errstate(invalid="ignore"):
         in_front = edge & (beneath > 0) & (inverse > deep - tolerance)
     length = np.bincount(label[edge], minlength=n)
-    held = np.bincount(label[in_front] * n + beneath[in_front], minlength=n * n).reshape(n, n)
+    held = np.bincount(
+        label[in_front] * n + beneath[in_front],
+        minlength=n * n,
+    ).reshape(n, n)
     hidden = np.bincount(label[edge & (beneath > 0) & ~in_front], minlength=n)
 
     holder = held.argmax(1)

@@ -49,12 +49,15 @@ DEPTH_ERROR = 0.01
 common for all pixels; they grow with the square of the distance. Of a real Kinect whose poses are
 exact a twentieth of the shifts is larger than twice that.
 """
-MENDED_DEVIATIONS = (
-    3.0  # standard deviations that noise does not explain, from which a shift is allowed for
+# standard deviations that noise does not explain, from which a shift is allowed for
+MENDED_DEVIATIONS = 3.0
+LEAST_MENDED = (
+    0.006  # parts of the distance from the camera: smaller shifts are left as they are
 )
-LEAST_MENDED = 0.006  # parts of the distance from the camera: smaller shifts are left as they are
 NOT_WORTH = 0.3  # parts of the least shift that is mended
-DISPLACEMENT_NOTICED = 2.5  # standard deviations that noise and depth errors do not explain
+DISPLACEMENT_NOTICED = (
+    2.5  # standard deviations that noise and depth errors do not explain
+)
 
 
 @dataclass(frozen=True)
@@ -95,7 +98,8 @@ class Displacement:
         common = (DEPTH_ERROR * self.distance**2) ** 2 * np.eye(3)
         return (
             self.mended
-            and _deviations(self.further, self.covariance + common) > DISPLACEMENT_NOTICED
+            and _deviations(self.further, self.covariance + common)
+            > DISPLACEMENT_NOTICED
         )
 
 
@@ -138,11 +142,21 @@ def displacement(latest: Sighting, earlier: Sequence[Sighting]) -> Displacement 
     last = -earlier[-1].shift
     starts = [np.zeros(3), last] if last.any() else [last]
     found = [_searched(surface, others, start) for start in starts]
-    best = min((one for one in found if one is not None), key=lambda one: one.cost, default=None)
+    best = min(
+        (one for one in found if one is not None),
+        key=lambda one: one.cost,
+        default=None,
+    )
     if best is None:
         return None
     lasting = bool(last.any()) and best is found[-1]
-    return Displacement(best.shift, best.shift - last, best.covariance, surface.distance, lasting)
+    return Displacement(
+        best.shift,
+        best.shift - last,
+        best.covariance,
+        surface.distance,
+        lasting,
+    )
 
 
 @dataclass(frozen=True)
@@ -161,10 +175,15 @@ class _Surface:
     @classmethod
     def of(cls, sighting: Sighting) -> _Surface:
         facets = sighting.facets
-        coarse = max(1, round(float(facets.pitch[0]) * float(sighting.frame.intrinsics[0, 0])))
+        coarse = max(
+            1,
+            round(float(facets.pitch[0]) * float(sighting.frame.intrinsics[0, 0])),
+        )
         side = int(np.ceil(np.sqrt(len(facets.rows) / FACETS)))
         if side > 1:
-            kept = (facets.rows // coarse % side == 0) & (facets.columns // coarse % side == 0)
+            kept = (facets.rows // coarse % side == 0) & (
+                facets.columns // coarse % side == 0
+            )
             facets = replace(facets.some(kept), pitch=side * facets.pitch)
         turn = sighting.frame.camera_to_world[:3, :3]
         points = facets.points
@@ -246,7 +265,11 @@ class _Fit:
     cost: float
 
 
-def _searched(latest: _Surface, earlier: Sequence[_Surface], start: Float) -> _Fit | None:
+def _searched(
+    latest: _Surface,
+    earlier: Sequence[_Surface],
+    start: Float,
+) -> _Fit | None:
     """The best shift near one; None where too little tells, it leads far away, or nothing fits."""
     expected = float(np.hypot(CAMERA_PLACE, CAMERA_AIM * latest.distance))
     looked_up = sum(len(one.sample) + len(latest.sample) for one in earlier)
@@ -288,7 +311,11 @@ def _reversed(pulls: _ShiftEquations) -> _ShiftEquations:
     return _ShiftEquations(-pulls.directions, pulls.distances, pulls.deviations)
 
 
-def _heights(latest: _Surface, earlier: Sequence[_Surface], moved: Float) -> _ShiftEquations:
+def _heights(
+    latest: _Surface,
+    earlier: Sequence[_Surface],
+    moved: Float,
+) -> _ShiftEquations:
     """How far the support plane of a frame, moved so, is below those of earlier ones."""
     plane = latest.sighting.plane
     here = latest.points.mean(0)
@@ -298,5 +325,12 @@ def _heights(latest: _Surface, earlier: Sequence[_Surface], moved: Float) -> _Sh
     foot = here - plane.height(here) * plane.normal + moved
     below = -np.array([float(other.height(foot)) for other in others])
     normals = np.array([other.normal for other in others])
-    leans = np.array([float(np.hypot(plane.lean_error, other.lean_error)) for other in others])
-    return _ShiftEquations(normals, below, latest.distance * np.hypot(PLANE_ERROR, leans))
+    leans = np.array(
+        [float(np.hypot(plane.lean_error, other.lean_error)) for other in others]
+    )
+
+    return _ShiftEquations(
+        normals,
+        below,
+        latest.distance * np.hypot(PLANE_ERROR, leans),
+    )

@@ -57,13 +57,16 @@ class VoxelGrid:
     def within(self, radius: float) -> Mask:
         """Voxels whose middle is no farther than this from that of the cube, (n, n, n) bool."""
         x, y, z = (
-            (axis - middle) ** 2 for axis, middle in zip(self.axes, self.centre, strict=True)
+            (axis - middle) ** 2
+            for axis, middle in zip(self.axes, self.centre, strict=True)
         )
         return x[:, None, None] + y[:, None] + z <= radius**2
 
     def cell_of(self, points: Floats) -> tuple[Index, Mask]:
         """Return the index of the voxel of each point, (P, 3), and whether there is one."""
-        at = np.floor((points - np.array(self.centre) + self.half) / self.pitch).astype(np.int64)
+        at = np.floor((points - np.array(self.centre) + self.half) / self.pitch).astype(
+            np.int64
+        )
         inside = ((at >= 0) & (at < self.n)).all(1)
         at = np.where(inside[:, None], at, 0)
         return (at[:, 0] * self.n + at[:, 1]) * self.n + at[:, 2], inside
@@ -97,7 +100,9 @@ class Occupancy:
         """
         return cls(
             grid,
-            np.full((grid.n,) * 3, UNSEEN) if region is None else np.where(region, UNSEEN, FREE),
+            np.full((grid.n,) * 3, UNSEEN)
+            if region is None
+            else np.where(region, UNSEEN, FREE),
         )
 
     def seen(
@@ -129,21 +134,30 @@ class Occupancy:
         cells = self.cells.copy().reshape(-1)
         # what was free before is so without being looked at again
         unseen = np.flatnonzero(cells == UNSEEN)
-        reach = np.where(depth > 0, depth, FARTHEST_SURFACE if background_free else 0).astype(
-            np.float32
+        reach = np.where(
+            depth > 0,
+            depth,
+            FARTHEST_SURFACE if background_free else 0,
+        ).astype(np.float32)
+        cells[unseen[_in_front(grid.middles[:, unseen], reach, pose, intrinsics)]] = (
+            FREE
         )
-        cells[unseen[_in_front(grid.middles[:, unseen], reach, pose, intrinsics)]] = FREE
         rows, columns = np.nonzero(depth)
         k = intrinsics
         z = depth[rows, columns]
         x = (columns + np.float32(0.5 - k[0, 2])) * (z / np.float32(k[0, 0]))
         y = (rows + np.float32(0.5 - k[1, 2])) * (z / np.float32(k[1, 1]))
         points = (
-            np.stack([x, y, z], 1).astype(np.float32) @ pose[:3, :3].T.astype(np.float32)
+            np.stack([x, y, z], 1).astype(np.float32)
+            @ pose[:3, :3].T.astype(np.float32)
             + pose[:3, 3]
         )
         at, inside = grid.cell_of(points)
-        mine = np.ones(len(at), bool) if object_mask is None else object_mask[rows, columns]
+        mine = (
+            np.ones(len(at), bool)
+            if object_mask is None
+            else object_mask[rows, columns]
+        )
         for what in (OCCLUDER, OBJECT):
             hit = at[inside & (mine == (what == OBJECT))]
             cells[hit] = np.maximum(cells[hit], what)
@@ -154,7 +168,12 @@ class Occupancy:
         return Occupancy(self.grid, np.maximum(self.cells, other.cells))
 
 
-def _in_front(points: Float32, reach: Float32, pose: Floats, intrinsics: Floats) -> Mask:
+def _in_front(
+    points: Float32,
+    reach: Float32,
+    pose: Floats,
+    intrinsics: Floats,
+) -> Mask:
     """Which points, (3, P), fall on a pixel and are nearer than its reach, (H, W)."""
     height, width = reach.shape
     to_image = (intrinsics @ pose[:3, :3].T).astype(np.float32)
@@ -163,7 +182,9 @@ def _in_front(points: Float32, reach: Float32, pose: Floats, intrinsics: Floats)
     y /= np.maximum(z, np.float32(1e-6))
     inside = (z > 1e-6) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
     pixel = np.where(inside, y, 0).astype(np.int32) * np.int32(width) + np.where(
-        inside, x, 0
+        inside,
+        x,
+        0,
     ).astype(np.int32)
     return inside & (z < reach.reshape(-1).take(pixel))
 
@@ -174,10 +195,14 @@ BLOCK = 4  # voxels along the side of the blocks that stand for parts of the obj
 UNSEEN_PART = 0.01
 """Weight of an unseen voxel of the object's unit ball, where one of the object has 1: before
 anything of the object was seen they are all there is."""
-DENSITY = 0.2  # how often unseen space is filled, per object radius: between the two bounds
+DENSITY = (
+    0.2  # how often unseen space is filled, per object radius: between the two bounds
+)
 SOLID = 1e3  # a density, per voxel, through which nothing is seen
 LINES_TOGETHER = 400  # lines that are drawn at once
-LOW_POINTS = 0.02  # share of a frame's points that may lie below the height of the table: noise
+LOW_POINTS = (
+    0.02  # share of a frame's points that may lie below the height of the table: noise
+)
 
 
 @dataclass(frozen=True)
@@ -218,23 +243,35 @@ class SeenScene:
     def seen(self, view: SceneView) -> Self:
         """With what one more frame says."""
         occupancy = self.occupancy.seen(
-            view.depth, view.pose, view.intrinsics, view.target, view.background_free
+            view.depth,
+            view.pose,
+            view.intrinsics,
+            view.target,
+            view.background_free,
         )
+
         rows, columns = np.nonzero(view.depth[::2, ::2])
         depth = view.depth[::2, ::2][rows, columns]
         ahead = np.stack([2 * columns + 0.5, 2 * rows + 0.5, np.ones(len(rows))])
         heights = (
-            view.pose[2, :3] @ np.linalg.inv(view.intrinsics) @ ahead * depth + view.pose[2, 3]
+            view.pose[2, :3] @ np.linalg.inv(view.intrinsics) @ ahead * depth
+            + view.pose[2, 3]
         )
         near = heights[np.abs(heights) <= 1.2]
         return type(self)(
             occupancy,
-            min(self.floor, float(np.quantile(near, LOW_POINTS)) if len(near) else np.inf),
+            min(
+                self.floor,
+                float(np.quantile(near, LOW_POINTS)) if len(near) else np.inf,
+            ),
         )
 
     def and_also(self, other: "SeenScene") -> Self:
         """As if all frames of both had been seen, of one grid."""
-        return type(self)(self.occupancy.and_also(other.occupancy), min(self.floor, other.floor))
+        return type(self)(
+            self.occupancy.and_also(other.occupancy),
+            min(self.floor, other.floor),
+        )
 
 
 @dataclass(frozen=True)
@@ -273,7 +310,10 @@ def expected_visibility(
     Returns:
         Shares of the object whose line of sight is clear of other things.
     """
-    lines = sight_lines(seen.occupancy.grid, np.asarray(positions, np.float64).tobytes())
+    lines = sight_lines(
+        seen.occupancy.grid,
+        np.asarray(positions, np.float64).tobytes(),
+    )
     return lines.visibility(seen, density, unseen_part)
 
 
@@ -312,7 +352,10 @@ class SightLines:
     def blocks(self) -> Index:
         """The block of each of these (Q,), as an index of all blocks."""
         m = self.grid.n // BLOCK
-        return np.ravel_multi_index(tuple(np.stack(self.own.nonzero()) // BLOCK), (m, m, m))
+        return np.ravel_multi_index(
+            tuple(np.stack(self.own.nonzero()) // BLOCK),
+            (m, m, m),
+        )
 
     @cached_property
     def parts(self) -> Index:
@@ -322,7 +365,9 @@ class SightLines:
     @cached_property
     def passed(self) -> "csr_array":
         """How often the line from each part to each camera is in each voxel, (P * V, n^3)."""
-        from scipy.sparse import csr_array  # slow to import, and few sessions are about scenes
+        from scipy.sparse import (
+            csr_array,
+        )  # slow to import, and few sessions are about scenes
 
         grid = self.grid
         m = self.grid.n // BLOCK
@@ -335,18 +380,22 @@ class SightLines:
         voxels = []
         steps = []
         for some in np.array_split(
-            np.arange(len(start)), -(-len(start) * len(eyes) // LINES_TOGETHER)
+            np.arange(len(start)),
+            -(-len(start) * len(eyes) // LINES_TOGETHER),
         ):
             ahead = (towards[some] / length[some, :, None])[:, :, None]
             at = np.floor(start[some, None, None] + along[:, None] * ahead)
-            inside = (along < length[some, :, None]) & ((at >= 0) & (at < grid.n)).all(3)
+            inside = (along < length[some, :, None]) & ((at >= 0) & (at < grid.n)).all(
+                3
+            )
             x, y, z = at[inside].astype(np.int32).T
             voxels.append((x * grid.n + y) * grid.n + z)
             steps.append(inside.sum(2).reshape(-1))
         found = np.concatenate(voxels)
         ends = np.concatenate([[0], *steps]).cumsum()
         return csr_array(
-            (np.ones(len(found), np.float32), found, ends), shape=(len(ends) - 1, grid.n**3)
+            (np.ones(len(found), np.float32), found, ends),
+            shape=(len(ends) - 1, grid.n**3),
         )
 
     @cached_property
@@ -356,7 +405,12 @@ class SightLines:
         found.reshape(-1)[self.passed.indices] = True
         return found
 
-    def visibility(self, seen: SeenScene, density: float, unseen_part: float) -> Visibility:
+    def visibility(
+        self,
+        seen: SeenScene,
+        density: float,
+        unseen_part: float,
+    ) -> Visibility:
         """Return the expected visibility; see ``expected_visibility``.
 
         Args:

@@ -19,8 +19,12 @@ from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.types import Float, Float32, Floats, Index, Mask
 
-CLOSE_ENOUGH = 1.5  # standard deviations of noise that a window may deviate from its plane
-STEEPEST_ERROR = 0.1  # error of the slope (tangent) that noise may leave: six degrees of the normal
+CLOSE_ENOUGH = (
+    1.5  # standard deviations of noise that a window may deviate from its plane
+)
+STEEPEST_ERROR = (
+    0.1  # error of the slope (tangent) that noise may leave: six degrees of the normal
+)
 LEAST_NOISE = 2e-4  # relative noise of depth that even the best frame is taken to have
 # slope towards the ray beyond which neighbouring pixels are taken for two surfaces
 STEEPEST_FACET = np.tan(np.radians(85.0))
@@ -97,7 +101,9 @@ def estimate_noise(depth: Float32, usable: Mask) -> Noise:
 def _sigma(second: Floats) -> float:
     """Standard deviation of the noise from the sizes of second differences."""
     middle = (len(second) - 1) // 2, len(second) // 2
-    median = np.partition(second, middle)[list(middle)].mean()  # there is no NaN to look for
+    median = np.partition(second, middle)[
+        list(middle)
+    ].mean()  # there is no NaN to look for
     return float(median) / (0.6745 * np.sqrt(6))
 
 
@@ -127,7 +133,11 @@ class Facets:
     def some(self, which: slice | Mask | Index) -> "Facets":
         """Those of some of the pixels."""
         return Facets(
-            self.planes[which], self.rays[which], self.rows[which], self.columns[which], self.pitch
+            self.planes[which],
+            self.rays[which],
+            self.rows[which],
+            self.columns[which],
+            self.pitch,
         )
 
 
@@ -211,7 +221,9 @@ def fit_facets(
         usable = drop_flying(depth, usable, noise, 1 / focal.mean())
         near = ndimage.maximum_filter(usable, 5, mode="constant")
         closed = ~ndimage.maximum_filter(~near, 5, mode="constant", cval=0)
-        wanted = usable | (closed & (mask | (depth == 0)))  # what was not measured, or dropped, too
+        wanted = usable | (
+            closed & (mask | (depth == 0))
+        )  # what was not measured, or dropped, too
     if not usable.any():
         none = np.zeros(0, np.int64)
         return Facets(np.zeros((0, 3)), np.zeros((0, 3)), none, none, coarse / focal)
@@ -219,12 +231,20 @@ def fit_facets(
     inverse = np.where(usable, 1 / np.where(usable, depth, 1), 0).astype(np.float64)
     weight = usable.astype(np.float64)
     middle = np.array([x.mean(), y.mean(), inverse.sum() / weight.sum()])
-    sums = _moments(weight, x - middle[0], y - middle[1], np.where(usable, inverse - middle[2], 0))
+    sums = _moments(
+        weight,
+        x - middle[0],
+        y - middle[1],
+        np.where(usable, inverse - middle[2], 0),
+    )
     pitch = coarse / focal
     if coarse > 1:
         sums = _blocks(sums, coarse)
         wanted = _blocks(wanted[None].astype(np.float64), coarse)[0] >= coarse**2 / 2
-        x, y = ((v[0] + coarse * np.arange(-(-len(v) // coarse)) * (v[1] - v[0])) for v in (x, y))
+        x, y = (
+            (v[0] + coarse * np.arange(-(-len(v) // coarse)) * (v[1] - v[0]))
+            for v in (x, y)
+        )
         x = x + (coarse - 1) / 2 / focal[0]
         y = y + (coarse - 1) / 2 / focal[1]
     rows, columns = np.divmod(np.flatnonzero(wanted), wanted.shape[1])
@@ -241,7 +261,11 @@ def fit_facets(
     # Back from coordinates about the middle:
     planes[:, 2] += middle[2] - planes[:, 0] * middle[0] - planes[:, 1] * middle[1]
     rays = np.stack([x[columns], y[rows], np.ones(len(rows))], 1)
-    towards = np.einsum("ni,ni->n", planes, rays)  # inverse depth; NaN where there is no plane
+    towards = np.einsum(
+        "ni,ni->n",
+        planes,
+        rays,
+    )  # inverse depth; NaN where there is no plane
     good = np.isfinite(towards) & (towards > 0.2 * middle[2])
     half = (coarse - 1) // 2
     rows = corner[0] + coarse * rows + half
@@ -250,7 +274,11 @@ def fit_facets(
     return facets if good.all() else facets.some(np.flatnonzero(good))
 
 
-def _typical_noise(depth: Float32, usable: Mask, frame_noise: Noise | None) -> tuple[float, int]:
+def _typical_noise(
+    depth: Float32,
+    usable: Mask,
+    frame_noise: Noise | None,
+) -> tuple[float, int]:
     """Return the noise at the object's median depth, and its grain."""
     few = slice(None, None, max(1, len(depth) // ROWS_MEASURED))
     typical = float(np.median(depth[usable]))
@@ -317,7 +345,14 @@ def _fit(sums: Float, radius: int, enough: float) -> Float:
     means = ndimage.uniform_filter(sums, (1, side, side), mode="constant")
     n = means[0] * side**2
     x, y, xx, xy, yy, q, xq, yq, qq = means[1:] / np.maximum(means[0], 1e-9)
-    for square, a, b in ((xx, x, x), (xy, x, y), (yy, y, y), (xq, x, q), (yq, y, q), (qq, q, q)):
+    for square, a, b in (
+        (xx, x, x),
+        (xy, x, y),
+        (yy, y, y),
+        (xq, x, q),
+        (yq, y, q),
+        (qq, q, q),
+    ):
         square -= a * b
     # pixels in one line have no plane: a level one
     ridge = 1e-5 * max(float(xx.max()), float(yy.max())) + 1e-30
@@ -326,9 +361,14 @@ def _fit(sums: Float, radius: int, enough: float) -> Float:
     determinant = xx * yy - xy * xy
     along_x = (xq * yy - yq * xy) / determinant
     along_y = (yq * xx - xq * xy) / determinant
-    variance = np.maximum(qq - along_x * xq - along_y * yq, 0) * n / np.maximum(n - 3, 1)
+    variance = (
+        np.maximum(qq - along_x * xq - along_y * yq, 0) * n / np.maximum(n - 3, 1)
+    )
     variance[n < enough] = np.inf
-    return np.stack([along_x, along_y, q - along_x * x - along_y * y, variance], -1).reshape(-1, 4)
+    return np.stack(
+        [along_x, along_y, q - along_x * x - along_y * y, variance],
+        -1,
+    ).reshape(-1, 4)
 
 
 def _choose(
@@ -357,7 +397,9 @@ def _choose(
     left = np.arange(len(rows))
     for radius in radii:
         windows = _fit(
-            sums, max(1, radius // step), 4 if radius == radii[-1] else 0.3 * (2 * radius + 1) ** 2
+            sums,
+            max(1, radius // step),
+            4 if radius == radii[-1] else 0.3 * (2 * radius + 1) ** 2,
         )
         guess = windows[rows[left] * w + columns[left]]
         good = guess[:, 3] < (CLOSE_ENOUGH * noise) ** 2
@@ -366,7 +408,13 @@ def _choose(
         found[left[good]] = guess[good, :3]
         left = left[~good]
     found[left] = _nearest_window(
-        windows, (h, w), rows[left], columns[left], here[left], own[left], radii[-1] // step
+        windows,
+        (h, w),
+        rows[left],
+        columns[left],
+        here[left],
+        own[left],
+        radii[-1] // step,
     )
     return found
 
@@ -382,19 +430,28 @@ def _nearest_window(
 ) -> Float:
     """Return the best-fitting plane of windows at and beside each cell, (N, 3), or NaN."""
     steps = (-max(1, reach), 0, max(1, reach))
-    down = np.stack([np.clip(rows + step, 0, shape[0] - 1) * shape[1] for step in steps])
+    down = np.stack(
+        [np.clip(rows + step, 0, shape[0] - 1) * shape[1] for step in steps]
+    )
+
     right = np.stack([np.clip(columns + step, 0, shape[1] - 1) for step in steps])
     window = (down[:, None] + right).reshape(len(steps) ** 2, -1)
     guess = windows[window]
     cost = guess[..., 3] + np.nan_to_num(_deviation(guess, here, own)) ** 2 / 4
     best = cost.argmin(0)
     every = np.arange(len(rows))
-    return np.where(np.isfinite(cost[best, every])[:, None], guess[best, every, :3], np.nan)
+    return np.where(
+        np.isfinite(cost[best, every])[:, None],
+        guess[best, every, :3],
+        np.nan,
+    )
 
 
 def _deviation(planes: Float, here: Float, own: Float) -> Float:
     """Return the distance of planes from the cells' own inverse depth, (N,), or NaN."""
-    return planes[..., 0] * here[:, 0] + planes[..., 1] * here[:, 1] + planes[..., 2] - own
+    return (
+        planes[..., 0] * here[:, 0] + planes[..., 1] * here[:, 1] + planes[..., 2] - own
+    )
 
 
 def virtual_pose(pose: Float) -> Float:
@@ -402,7 +459,9 @@ def virtual_pose(pose: Float) -> Float:
     position = pose[:3, 3]
     outward = position / np.linalg.norm(position) if position.any() else -pose[:3, 2]
     right = np.array([-outward[1], outward[0], 0.0])
-    if np.hypot(right[0], right[1]) < 1e-6:  # straight above: keep the camera's own right
+    if (
+        np.hypot(right[0], right[1]) < 1e-6
+    ):  # straight above: keep the camera's own right
         right = pose[:3, 0] - (pose[:3, 0] @ outward) * outward
     right /= np.linalg.norm(right)
     virtual = np.eye(4)
@@ -411,7 +470,12 @@ def virtual_pose(pose: Float) -> Float:
     return virtual
 
 
-def look_again(facets: Facets, pose: Float, radius: float, size: int) -> tuple[Float32, Index]:
+def look_again(
+    facets: Facets,
+    pose: Float,
+    radius: float,
+    size: int,
+) -> tuple[Float32, Index]:
     """Render facets from the virtual pose.
 
     Each facet is drawn where the virtual camera sees it. A pixel shows the nearest surface, at the
@@ -450,7 +514,9 @@ def look_again(facets: Facets, pose: Float, radius: float, size: int) -> tuple[F
         + 0.05
     )
     # The first column and row whose centres it covers:
-    left, top = (np.clip(np.ceil(at - half - 0.5), -size, size).astype(np.int64) for at in (x, y))
+    left, top = (
+        np.clip(np.ceil(at - half - 0.5), -size, size).astype(np.int64) for at in (x, y)
+    )
     layer = (z[front] / SURFACE_LAYER).astype(np.int64) << 48 | front
     best = np.full(size * size, np.iinfo(np.int64).max)
     covered = range(int(2 * half.max()) + 1) if len(front) else range(0)

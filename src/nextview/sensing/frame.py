@@ -16,11 +16,19 @@ from nextview.types import Float, Float32, Floats, Index, Mask
 
 Part = tuple[slice, slice]  # rows and columns of a picture
 WHOLE = slice(None), slice(None)
-FARTHEST_DEPTH = 65.0  # metres: float depth beyond is nothing; uint16 millimetres reach as far
+FARTHEST_DEPTH = (
+    65.0  # metres: float depth beyond is nothing; uint16 millimetres reach as far
+)
 # metres; a depth image beyond is of another unit: inches are 39 times as many
 LARGEST_MEDIAN = 20.0
 NEAREST_MEDIAN = 0.01  # metres; no depth camera measures nearer
-ASPECTS = (4 / 3, 16 / 9, 16 / 10, 512 / 424, 640 / 576)  # width over height of whole pictures
+ASPECTS = (
+    4 / 3,
+    16 / 9,
+    16 / 10,
+    512 / 424,
+    640 / 576,
+)  # width over height of whole pictures
 CAMERA_AXES = {
     "opencv": np.eye(3),
     "opengl": np.diag([1.0, -1.0, -1.0]),
@@ -102,13 +110,22 @@ class Frame:
                     "no pixel of the mask has a depth: a mask of another image, or empty"
                 )
             object.__setattr__(
-                self, "mask", mask.copy() if source is None else filled_mask(mask, source)
+                self,
+                "mask",
+                mask.copy() if source is None else filled_mask(mask, source),
             )
         if self.image is not None:
             image = array_of(self.image, "the image")
-            if image.dtype != np.uint8 or image.shape not in (depth.shape, (*depth.shape, 3)):
-                wanted = f"(H, W) or (H, W, 3) uint8 registered to the depth, {depth.shape}"
-                raise ObservationError(f"an image is {wanted}, not {image.shape} {image.dtype}")
+            if image.dtype != np.uint8 or image.shape not in (
+                depth.shape,
+                (*depth.shape, 3),
+            ):
+                wanted = (
+                    f"(H, W) or (H, W, 3) uint8 registered to the depth, {depth.shape}"
+                )
+                raise ObservationError(
+                    f"an image is {wanted}, not {image.shape} {image.dtype}"
+                )
             if image.ndim == 3:
                 object.__setattr__(self, "colour", image.copy())
                 image = np.rint(image @ LUMA).astype(np.uint8)
@@ -176,7 +193,12 @@ class Frame:
         z = self.depth[rows, columns].astype(np.float64)
         return np.stack([x[columns], y[rows], np.ones(len(z))], 1) * z[:, None]
 
-    def along(self, direction: Float, offset: float = 0.0, part: Part = WHOLE) -> Float32:
+    def along(
+        self,
+        direction: Float,
+        offset: float = 0.0,
+        part: Part = WHOLE,
+    ) -> Float32:
         """Return ``direction @ position + offset`` of what every pixel shows.
 
         Args:
@@ -206,7 +228,11 @@ def within(shown: NDArray[np.float32 | np.bool_], margin: int = 0) -> Part:
     """
     at = [np.flatnonzero(shown.any(1 - axis)) for axis in (0, 1)]
     low, high = zip(*((k[0], k[-1] + 1) if len(k) else (0, 0) for k in at), strict=True)
-    return spans(np.array(low) - margin, np.array(high) + margin * bool(high[0]), shown.shape)
+    return spans(
+        np.array(low) - margin,
+        np.array(high) + margin * bool(high[0]),
+        shown.shape,
+    )
 
 
 def holes_of(shown: Mask) -> Mask:
@@ -228,7 +254,9 @@ def spans(low: Floats, high: Floats, shape: tuple[int, ...]) -> Part:
     Returns:
         Slices of the rows and columns.
     """
-    first, last = (np.clip(np.floor(at), 0, shape).astype(int).tolist() for at in (low, high))
+    first, last = (
+        np.clip(np.floor(at), 0, shape).astype(int).tolist() for at in (low, high)
+    )
     return slice(first[0], last[0]), slice(first[1], last[1])
 
 
@@ -236,19 +264,24 @@ def _metres(depth: NDArray) -> Float32:
     if depth.ndim != 2 or min(depth.shape) < 2:
         raise ObservationError(f"a depth image is (H, W), not {depth.shape}")
     if depth.dtype == np.uint16:
-        metres = np.where(depth == np.iinfo(np.uint16).max, 0, depth) * np.float32(0.001)
+        metres = np.where(depth == np.iinfo(np.uint16).max, 0, depth) * np.float32(
+            0.001
+        )
     elif np.issubdtype(depth.dtype, np.floating):
         metres = depth.astype(np.float32)
         # no NaN passes a comparison
         metres = np.where((metres > 0) & (metres < np.inf), metres, np.float32(0))
     else:
-        raise ObservationError(f"depth is float metres or uint16 millimetres, not {depth.dtype}")
+        raise ObservationError(
+            f"depth is float metres or uint16 millimetres, not {depth.dtype}"
+        )
     seen = metres[::4, ::4]
     middle = float(np.median(seen[seen > 0])) if (seen > 0).any() else 0.0
     wrong = ""
     if middle > FARTHEST_DEPTH:
         wrong = (
-            "where metres are expected: millimetres? Divide them by 1000, or hand them in as uint16"
+            "where metres are expected: millimetres? Divide them "
+            "by 1000, or hand them in as uint16"
         )
     elif middle > LARGEST_MEDIAN:
         wrong = "m, and no depth camera measures so far: is it in inches or feet?"
@@ -270,20 +303,28 @@ def _matrix(values: ArrayLike, what: str, shape: tuple[int, int]) -> Float:
             if matrix.shape != shape
             else "with NaN, infinity or what no camera has"
         )
-        raise ObservationError(f"{what} is a {shape} matrix of finite numbers, not one {given}")
+        raise ObservationError(
+            f"{what} is a {shape} matrix of finite numbers, not one {given}"
+        )
     return matrix
 
 
 def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> Float:
     k = _matrix(intrinsics, "the matrix of intrinsics", (3, 3))
-    if not np.array_equal(k[2], [0, 0, 1]) or k[1, 0] != 0 or abs(k[0, 1]) > 1e-3 * abs(k[0, 0]):
+    if (
+        not np.array_equal(k[2], [0, 0, 1])
+        or k[1, 0] != 0
+        or abs(k[0, 1]) > 1e-3 * abs(k[0, 0])
+    ):
         raise ObservationError(
             "intrinsics are [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: transposed, or with a skew?"
         )
     k[0, 1] = 0
     height, width = shape
     if not (k[0, 0] > 0 and k[1, 1] > 0):
-        raise ObservationError("the focal lengths have to be positive: an image that is flipped?")
+        raise ObservationError(
+            "the focal lengths have to be positive: an image that is flipped?"
+        )
     focal = min(k[0, 0], k[1, 1])
     if focal < 0.1 * max(shape):
         short = f"a focal length of {focal:.3g} is too short for an image of {width} x {height}"
@@ -312,7 +353,9 @@ def check_pose(pose: ArrayLike) -> Float:
     """Copy a rigid pose, (4, 4); ObservationError names the likely mistake."""
     pose = _matrix(pose, "the pose", (4, 4))
     if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
-        sentence = f"the last row of a pose is 0, 0, 0, 1, not {np.round(pose[3], 3).tolist()}"
+        sentence = (
+            f"the last row of a pose is 0, 0, 0, 1, not {np.round(pose[3], 3).tolist()}"
+        )
         if np.allclose(pose[:, 3], [0, 0, 0, 1], atol=1e-6):
             sentence += ": transposed?"
         raise ObservationError(sentence)
@@ -322,7 +365,9 @@ def check_pose(pose: ArrayLike) -> Float:
     scale = np.sqrt(np.trace(gram) / 3)
     if not np.allclose(gram, np.eye(3), atol=1e-3):
         scaled = scale > 0 and np.allclose(gram / scale**2, np.eye(3), atol=1e-3)
-        what = f"its rotation is scaled by {scale:.3g}" if scaled else "no rotation matrix"
+        what = (
+            f"its rotation is scaled by {scale:.3g}" if scaled else "no rotation matrix"
+        )
         raise ObservationError(f"the pose is not rigid: {what}")
     if np.linalg.det(rotation) < 0:
         raise ObservationError(

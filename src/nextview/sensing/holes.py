@@ -9,10 +9,18 @@ import numpy as np
 from nextview.types import Float32, Index, Mask
 
 LONGEST_PERIOD = 8  # pixels after which gaps come again, at most
-FEWEST_GAPS = 0.01  # so many gaps begin in a row or a column for each measured pixel, at least
-SAME_STEP = 0.35  # share of the gaps after which another one begins one period later, at least
-DISTINCT = 2.0  # times as often as after some other distance: random gaps begin anywhere
-ONE_SURFACE = 0.015  # part by which inverse depth may change from pixel to pixel on one surface
+FEWEST_GAPS = (
+    0.01  # so many gaps begin in a row or a column for each measured pixel, at least
+)
+SAME_STEP = (
+    0.35  # share of the gaps after which another one begins one period later, at least
+)
+DISTINCT = (
+    2.0  # times as often as after some other distance: random gaps begin anywhere
+)
+ONE_SURFACE = (
+    0.015  # part by which inverse depth may change from pixel to pixel on one surface
+)
 PASSES = 2  # first between two measured pixels, then between rows or columns that were filled
 
 
@@ -51,7 +59,9 @@ def filled_mask(mask: Mask, source: Index) -> Mask:
         mask: (H, W) bool.
         source: of each pixel, from ``fill_regular_gaps``.
     """
-    added = mask.ravel()[source] & (source != np.arange(source.size).reshape(source.shape))
+    added = mask.ravel()[source] & (
+        source != np.arange(source.size).reshape(source.shape)
+    )
     # A mask from a colour image has no gaps: it knows better where the object ends.
     has_gaps = np.count_nonzero(added & ~mask) > np.count_nonzero(added & mask)
     return mask | added if has_gaps else mask.copy()
@@ -113,7 +123,8 @@ def _gaps(inverse: Float32, widest: int, along_rows: bool) -> tuple[Index, ...]:
     place = place[None, :] if along_rows else place[:, None]
     last = np.maximum.accumulate(np.where(measured, place, -size), axis)
     ahead = np.flip(
-        np.minimum.accumulate(np.flip(np.where(measured, place, 2 * size), axis), axis), axis
+        np.minimum.accumulate(np.flip(np.where(measured, place, 2 * size), axis), axis),
+        axis,
     )
     hole = np.flatnonzero(~measured & (ahead - last <= widest + 1))
 

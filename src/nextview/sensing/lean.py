@@ -15,7 +15,9 @@ DEPTH_LEAN = np.radians(2.0)
 the camera sees it: of fifty frames of a real Kinect whose poses are exact, half lean by 1.3 degrees
 or more, and a tenth by 2.7.
 """
-FRAME_LEAN = np.radians(0.5)  # by how much the pose of a single frame leans it, beside its noise
+FRAME_LEAN = np.radians(
+    0.5
+)  # by how much the pose of a single frame leans it, beside its noise
 UNKNOWN_LEAN = np.radians(30.0)  # deviation of a lean of which nothing is known
 LEAN_NOTICED = 3.0  # standard deviations that errors do not explain
 LEAST_LEAN = np.radians(1.0)  # below which it does not matter
@@ -57,7 +59,9 @@ def lean_of(planes: Sequence[Plane], cameras: Sequence[Float], axes: Float) -> L
         axes: rows x, y and z (up), (3, 3).
     """
     leans = np.array([axes[:2] @ plane.normal for plane in planes])
-    weights = 1 / (FRAME_LEAN**2 + np.array([plane.lean_error for plane in planes]) ** 2)
+    weights = 1 / (
+        FRAME_LEAN**2 + np.array([plane.lean_error for plane in planes]) ** 2
+    )
     ahead = np.array([axes[:2] @ pose[:3, 2] for pose in cameras])
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
 

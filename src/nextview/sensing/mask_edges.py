@@ -47,10 +47,17 @@ def trimmed(depth: Float32, mask: Mask, noise: Noise, high: Mask | None = None) 
         return mask
     found = inside
     if high is not None:
-        far = z - minimum_filter(np.where(own, z, np.inf), 3, mode="constant", cval=np.inf) > step
+        far = (
+            z
+            - minimum_filter(np.where(own, z, np.inf), 3, mode="constant", cval=np.inf)
+            > step
+        )
         near = own & high[part] & ~far
         # behind a step in depth, but wider than the edge of a mask: a handle beside its mug
-        wide = binary_erosion(np.pad(near, 1), np.ones((3, 3), bool), EDGE_ERROR // 2)[1:-1, 1:-1]
+        wide = binary_erosion(np.pad(near, 1), np.ones((3, 3), bool), EDGE_ERROR // 2)[
+            1:-1,
+            1:-1,
+        ]
         part_of, count = label(near | inside)
         reached = np.zeros(count + 1, bool)
         reached[part_of[inside | wide]] = True

@@ -81,7 +81,9 @@ class Box:
     def __post_init__(self) -> None:
         for corner in ("low", "high"):
             object.__setattr__(
-                self, corner, three(getattr(self, corner), f"the {corner} corner of a box")
+                self,
+                corner,
+                three(getattr(self, corner), f"the {corner} corner of a box"),
             )
         if not (self.low < self.high).all():
             raise UsageError(
@@ -176,11 +178,18 @@ def enclose(points: Float, axes: Float, floor: float | None) -> ObjectFrame:
     low = upright.min(0)
     high = upright.max(0)
     if not (high - low).max() > 1e-6 * max(np.abs(upright).max(), 1e-9):
-        raise ObservationError("what is seen of the object is in one place, it has no size")
+        raise ObservationError(
+            "what is seen of the object is in one place, it has no size"
+        )
+
     bottom = low[2] if floor is None else min(floor, high[2])
     centre = np.array([*smallest_circle(upright[:, :2])[0], (bottom + high[2]) / 2])
     radius = np.sqrt(((upright - centre) ** 2).sum(1).max())
-    return ObjectFrame(centre @ axes, max(float(radius), float(high[2] - bottom) / 2), axes)
+    return ObjectFrame(
+        centre @ axes,
+        max(float(radius), float(high[2] - bottom) / 2),
+        axes,
+    )
 
 
 def smallest_circle(points: Float) -> tuple[Float, float]:
@@ -200,10 +209,19 @@ def smallest_circle(points: Float) -> tuple[Float, float]:
             return centre, radius
         corners = np.vstack([corners, points[farthest]])
         fits = []
-        for chosen in map(np.array, chain(combinations(corners, 2), combinations(corners, 3))):
-            edges = chosen[1:] - chosen[0]  # equally far from all, or the middle of those in line:
-            middle = chosen[0] + np.linalg.lstsq(edges, (edges**2).sum(1) / 2, rcond=None)[0]
-            fits.append((np.linalg.norm(corners - middle, axis=1).max(), chosen, middle))
+        for chosen in map(
+            np.array,
+            chain(combinations(corners, 2), combinations(corners, 3)),
+        ):
+            edges = (
+                chosen[1:] - chosen[0]
+            )  # equally far from all, or the middle of those in line:
+            middle = (
+                chosen[0] + np.linalg.lstsq(edges, (edges**2).sum(1) / 2, rcond=None)[0]
+            )
+            fits.append(
+                (np.linalg.norm(corners - middle, axis=1).max(), chosen, middle)
+            )
         reach, corners, centre = min(fits, key=lambda fit: fit[0])
         if reach <= radius:
             return centre, radius  # rounding: no better circle is to be had

@@ -34,7 +34,12 @@ from nextview.sensing.lean import lean_of
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, ObjectFrame, enclose, three, upright_axes
 from nextview.sensing.outliers import without_outliers
-from nextview.sensing.plausibility import ViewWarning, check_frame, check_observation, check_views
+from nextview.sensing.plausibility import (
+    ViewWarning,
+    check_frame,
+    check_observation,
+    check_views,
+)
 from nextview.sensing.segmentation import Plane, Samples, find_plane, sample
 from nextview.sensing.sighting import Sighting
 from nextview.sensing.walls import before_walls, find_walls
@@ -49,12 +54,13 @@ FEWEST_OBJECT_PIXELS = 60  # pixels that an object has to have in a frame
 NEAREST_POINT = 0.01
 # share of an object's pixels in an earlier frame that has to change before they are looked at again
 MENDED_SHARE = 0.03
-LEAST_VIEW_PART = (
-    0.1  # of the most pixels that a frame shows of an object: others say too little of its size
-)
+# of the most pixels that a frame shows of an object: others say too little of its size
+LEAST_VIEW_PART = 0.1
 # the novelty score has to be so much lower for an object to be joined or taken apart otherwise
 LESS_NOVEL = 1.0
-SIZE_CHANGE = 2.0  # factor by which the radius may change where an object is looked at anew
+SIZE_CHANGE = (
+    2.0  # factor by which the radius may change where an object is looked at anew
+)
 # object radii that a pixel of the scene may show: half a voxel of ``expected_visibility``
 FINEST_PITCH = 1 / 32
 # change of the centre or the radius, in object radii, below which the object frame is left as it is
@@ -149,6 +155,7 @@ class ObservedObject:
             raise UsageError(
                 "an object is asked for by a point, by a box or by its known frame: by one of them"
             )
+
         self.point = None if point is None else three(point, "a point")
         self.up = None if up is None else upright_axes(up)[2]
         self.box = box
@@ -157,14 +164,17 @@ class ObservedObject:
         self.denoise = denoise
         self.life_size = life_size
         self.state = ObjectState(
-            np.random.default_rng(0) if rng is None else deepcopy(rng), self.known
+            np.random.default_rng(0) if rng is None else deepcopy(rng),
+            self.known,
         )
 
     @property
     def object_frame(self) -> ObjectFrame:
         """Where the object is, as far as it is known; ObservationError before the first frame."""
         if self.state.frame is None:
-            raise ObservationError("no frame was added yet, so nothing is known of the object")
+            raise ObservationError(
+                "no frame was added yet, so nothing is known of the object"
+            )
         return self.state.frame
 
     @property
@@ -206,13 +216,19 @@ class ObservedObject:
         for joins in self.other_joins():
             other = copy(self)
             other.state = ObjectState(
-                self.state.rng, self.known, revision=self.revision + 1, joins=joins
+                self.state.rng,
+                self.known,
+                revision=self.revision + 1,
+                joins=joins,
             )
             with suppress(ObservationError):
                 for sighting in self.sightings:
                     other.add(sighting.told)
                 if 1 / SIZE_CHANGE < other.object_frame.radius / radius < SIZE_CHANGE:
-                    found.append((novelty(other.observations) + LESS_NOVEL, other.state))
+                    found.append(
+                        (novelty(other.observations) + LESS_NOVEL, other.state)
+                    )
+
         self.state = min(found, key=lambda pair: pair[0])[1]
 
     def other_joins(self) -> list[clusters.Joins]:
@@ -224,14 +240,17 @@ class ObservedObject:
         ]
         found: list[clusters.Joins] = []
 
-        for joins in (j for j in get_args(clusters.Joins) if old and j != self.state.joins):
+        for joins in (
+            j for j in get_args(clusters.Joins) if old and j != self.state.joins
+        ):
             labels, _ = clusters.clusters([foot for foot, _ in old], joins)
             votes = np.concatenate(
                 [label[was] for label, (_, was) in zip(labels, old, strict=True)]
             )
             target = np.bincount(votes, minlength=1).argmax()
             if any(
-                _changed(*pair, label == target) for pair, label in zip(old, labels, strict=True)
+                _changed(*pair, label == target)
+                for pair, label in zip(old, labels, strict=True)
             ):
                 found.append(joins)
         return found
@@ -242,12 +261,20 @@ class ObservedObject:
         self._refuse(frame, last)
 
         noise = noise_of(frame)
-        seen = frame.depth > 0 if frame.mask is None else (frame.depth > 0) & ~frame.mask
+        seen = (
+            frame.depth > 0 if frame.mask is None else (frame.depth > 0) & ~frame.mask
+        )
         # Where no plane is looked for nothing else needs them.
         samples = sample(frame, seen, noise) if self.support else None
         plane, up, rng = self._support(frame, samples)
 
-        sightings, cell, two = self._find(frame, upright_axes(up), plane, samples, noise)
+        sightings, cell, two = self._find(
+            frame,
+            upright_axes(up),
+            plane,
+            samples,
+            noise,
+        )
         displaced = None if two else self._displaced(sightings)
         if displaced is not None and displaced.mended:
             sightings[-1] = sightings[-1].shifted(-displaced.shift)
@@ -286,7 +313,10 @@ class ObservedObject:
         Raises:
             ObservationError: no support plane is seen.
         """
-        plane, _, _ = self._support(frame, sample(frame, frame.depth > 0, noise_of(frame)))
+        plane, _, _ = self._support(
+            frame,
+            sample(frame, frame.depth > 0, noise_of(frame)),
+        )
         if plane is None:
             raise ObservationError(NO_SUPPORT)
         return plane
@@ -319,13 +349,17 @@ class ObservedObject:
         )
 
     def _seen_as(
-        self, sightings: Sequence[Sighting], up: Float
+        self,
+        sightings: Sequence[Sighting],
+        up: Float,
     ) -> tuple[ObjectFrame, list[Observation], int]:
         """The object frame by some sightings, an observation of each, and the new revision."""
         before = self.state
         first = sightings[0].frame.camera_to_world
         ahead = first[:3, 2]
-        front = -ahead if abs(ahead @ up) < 0.99 else first[:3, 1]  # from above: the bottom
+        front = (
+            -ahead if abs(ahead @ up) < 0.99 else first[:3, 1]
+        )  # from above: the bottom
         axes = upright_axes(up, front) if before.frame is None else before.frame.axes
 
         latest = self._estimate(sightings, axes)
@@ -334,7 +368,9 @@ class ObservedObject:
         known = zip(before.sightings, before.observations, strict=True)
         kept = {id(old): seen for old, seen in known if latest is before.frame}
         made = [kept.get(id(one)) or self._observe(one, latest) for one in sightings]
-        changed = any(new is not old for new, old in zip(made, before.observations, strict=False))
+        changed = any(
+            new is not old for new, old in zip(made, before.observations, strict=False)
+        )
         return latest, made, before.revision + changed
 
     def _refuse(self, frame: Frame, last: Frame | None) -> None:
@@ -354,7 +390,9 @@ class ObservedObject:
         plausibility.refuse_far(frame, last, target, radius)
 
     def _support(
-        self, frame: Frame, samples: Samples | None
+        self,
+        frame: Frame,
+        samples: Samples | None,
     ) -> tuple[Plane | None, Float, np.random.Generator]:
         """Return the support plane, if it is seen, the direction up, (3,), and the generator."""
         before = self.state
@@ -367,7 +405,11 @@ class ObservedObject:
         if samples is not None:
             earlier = [s.plane for s in before.sightings if s.plane is not None]
             if earlier:
-                plane = segmentation.find_again(earlier[0], samples, self._near(samples))
+                plane = segmentation.find_again(
+                    earlier[0],
+                    samples,
+                    self._near(samples),
+                )
             else:
                 rng = deepcopy(rng)
                 plane = self._plane(frame, samples, up, rng)
@@ -413,7 +455,9 @@ class ObservedObject:
     def _check_lean(self, sightings: Sequence[Sighting]) -> list[ViewWarning]:
         """See ``plausibility.check_lean``; of the plane that the object stands on."""
         shown = [sighting for sighting in sightings if sighting.plane is not None]
-        if self.up is None or len(shown) < 2:  # of one frame it may be an error of its depth
+        if (
+            self.up is None or len(shown) < 2
+        ):  # of one frame it may be an error of its depth
             return []
         planes = [sighting.plane for sighting in shown if sighting.plane is not None]
         poses = [sighting.frame.camera_to_world for sighting in shown]
@@ -428,7 +472,11 @@ class ObservedObject:
         return np.asarray(away < known.radius)
 
     def _plane(
-        self, frame: Frame, samples: Samples, up: Float | None, rng: np.random.Generator
+        self,
+        frame: Frame,
+        samples: Samples,
+        up: Float | None,
+        rng: np.random.Generator,
     ) -> Plane | None:
         """The support plane of the first frame."""
         every = samples
@@ -437,7 +485,11 @@ class ObservedObject:
         plane = find_plane(samples, rng, up, self._above())
         share = 0.0 if plane is None else float(plane.holds(samples).mean())
         # A fit that rises over the point, above which no plane was tried, cuts through a surface.
-        cuts = plane is not None and self.point is not None and plane.height(self.point) < 0
+        cuts = (
+            plane is not None
+            and self.point is not None
+            and plane.height(self.point) < 0
+        )
         if self.point is not None and up is not None and (cuts or share < 1 / 3):
             # The point may lie on the plane, or a little below.
             higher = self.point + (2 * np.median(samples.tolerance) + BELOW) * up
@@ -454,11 +506,22 @@ class ObservedObject:
                 if largest is None
                 else segmentation.mistake_in_pose(largest, frame.camera_to_world, up)
             )
-            if largest is not None and mistake and largest.holds(every).mean() > 2 * share:
+            if (
+                largest is not None
+                and mistake
+                and largest.holds(every).mean() > 2 * share
+            ):
                 raise ObservationError(
                     f"the largest plane in view is not level: {mistake} Or up is another direction"
                 )
-        if segmentation.lies_better_as_range(frame, plane, samples, rng, up, self._above()):
+        if segmentation.lies_better_as_range(
+            frame,
+            plane,
+            samples,
+            rng,
+            up,
+            self._above(),
+        ):
             raise ObservationError(
                 "the depth is measured along the rays, a range: give it along the optical axis"
             )
@@ -466,7 +529,11 @@ class ObservedObject:
             return plane
         plane = self._under_the_object(frame, every, plane)
         asked = None if frame.mask is not None else self.point
-        return None if support.is_named(every, plane, _target_in(frame, every, asked)) else plane
+        return (
+            None
+            if support.is_named(every, plane, _target_in(frame, every, asked))
+            else plane
+        )
 
     def _under_the_object(self, frame: Frame, samples: Samples, plane: Plane) -> Plane:
         """Return the level plane of the first frame on which the object stands."""
@@ -477,7 +544,11 @@ class ObservedObject:
             rows, columns = np.nonzero(frame.mask & (frame.depth > 0))
             few = slice(None, None, max(1, len(rows) // MASK_POINTS))
             return (
-                support.under_points(samples, planes, frame.positions(rows[few], columns[few]))
+                support.under_points(
+                    samples,
+                    planes,
+                    frame.positions(rows[few], columns[few]),
+                )
                 or plane
             )
 
@@ -485,7 +556,12 @@ class ObservedObject:
         of_walls = np.zeros(len(samples.points), bool)
         for wall in walls:
             of_walls |= wall.height(samples.points) < samples.tolerance
-        return support.aimed_at(samples, planes, of_walls, _target_in(frame, samples, self.point))
+        return support.aimed_at(
+            samples,
+            planes,
+            of_walls,
+            _target_in(frame, samples, self.point),
+        )
 
     def _above(self) -> Float | None:
         """A point that is known to be above the support plane."""
@@ -500,7 +576,12 @@ class ObservedObject:
         )
 
     def _find(
-        self, frame: Frame, axes: Float, plane: Plane | None, samples: Samples | None, noise: Noise
+        self,
+        frame: Frame,
+        axes: Float,
+        plane: Plane | None,
+        samples: Samples | None,
+        noise: Noise,
     ) -> FoundSightings:
         if frame.mask is not None:
             mask = frame.mask
@@ -516,13 +597,19 @@ class ObservedObject:
                     part = within(mask)
                     above[part] &= segmentation.above_plane(frame, plane, noise, part)
                 # a plane may lie above what is hidden or flat
-                mask = above if 2 * np.count_nonzero(above) > np.count_nonzero(mask) else mask
+                mask = (
+                    above
+                    if 2 * np.count_nonzero(above) > np.count_nonzero(mask)
+                    else mask
+                )
         elif self.known is not None:
             if self.box is not None:
                 mask = segmentation.inside_box(frame, self.box)
             else:
                 mask = segmentation.inside_sphere(
-                    frame, self.known.centre, 1.02 * self.known.radius
+                    frame,
+                    self.known.centre,
+                    1.02 * self.known.radius,
                 )
             if plane is not None:
                 mask &= segmentation.above_plane(frame, plane, noise)
@@ -585,7 +672,13 @@ class ObservedObject:
         above &= free
         ground = base.extent(samples) @ axes[:2].T
         if not cell:
-            cell = clusters.FOOTPRINT_CELL * self._distance(frame, axes, above, ground, noise)
+            cell = clusters.FOOTPRINT_CELL * self._distance(
+                frame,
+                axes,
+                above,
+                ground,
+                noise,
+            )
 
         pieces = cut(frame.depth, above, height, noise, free if walls else None)
         middle = axes[:2] @ (_ahead(frame) if place is None else place)
@@ -596,9 +689,17 @@ class ObservedObject:
         labels, two = clusters.clusters(footprints, self.state.joins)
 
         target = self._target(
-            labels, footprints, ground / cell, axes[:2] / cell, frame.intrinsics[:2, 2]
+            labels,
+            footprints,
+            ground / cell,
+            axes[:2] / cell,
+            frame.intrinsics[:2, 2],
         )
-        for now, s in zip(labels, (s for s in earlier if s.footprint is not None), strict=False):
+        for now, s in zip(
+            labels,
+            (s for s in earlier if s.footprint is not None),
+            strict=False,
+        ):
             was = int(np.bincount(now[s.chosen], minlength=1).argmax())
             # another side of the object
             if was and not any(was in label and target in label for label in labels):
@@ -607,7 +708,9 @@ class ObservedObject:
 
         chosen = labels[-1] == target
         mask = foot.pixels_of(chosen)
-        if (labels[-1][~chosen] > 0).any():  # cells at the border may hold pixels of a neighbour
+        if (
+            labels[-1][~chosen] > 0
+        ).any():  # cells at the border may hold pixels of a neighbour
             mask = trimmed(frame.depth, mask, noise, height > STANDS * frame.depth)
         if target == 0 or np.count_nonzero(mask) < FEWEST_OBJECT_PIXELS:
             where = "of the object known so far" if earlier else "on the support plane"
@@ -616,11 +719,20 @@ class ObservedObject:
             )
 
         sightings = self._reconsidered(labels[:-1], target)
-        latest = replace(self.sighting_of(frame, mask, plane, noise), footprint=foot, chosen=chosen)
+        latest = replace(
+            self.sighting_of(frame, mask, plane, noise),
+            footprint=foot,
+            chosen=chosen,
+        )
         return [*sightings, latest], cell, bool(two[target])
 
     def _distance(
-        self, frame: Frame, axes: Float, above: Mask, ground: Float, noise: Noise
+        self,
+        frame: Frame,
+        axes: Float,
+        above: Mask,
+        ground: Float,
+        noise: Noise,
     ) -> float:
         """Return the distance from the camera to the object, metres."""
         camera = frame.camera_to_world[:3, 3]
@@ -654,9 +766,17 @@ class ObservedObject:
                     # what was taken for the object was what hid it
                     with suppress(ObservationError):
                         mended = self.sighting_of(
-                            s.frame, s.footprint.pixels_of(now), s.plane, s.noise
+                            s.frame,
+                            s.footprint.pixels_of(now),
+                            s.plane,
+                            s.noise,
                         )
-                    s = replace(mended, footprint=s.footprint, chosen=now, shift=s.shift)
+                    s = replace(
+                        mended,
+                        footprint=s.footprint,
+                        chosen=now,
+                        shift=s.shift,
+                    )
             sightings.append(s)
         return sightings
 
@@ -679,7 +799,11 @@ class ObservedObject:
             asked = to_cells @ self.point
             here = labels[-1]
             target = clusters.nearest(footprints, labels, asked)
-            return target if target in here else clusters.nearest(footprints[-1:], [here], asked)
+            return (
+                target
+                if target in here
+                else clusters.nearest(footprints[-1:], [here], asked)
+            )
 
         before = [s.chosen for s in self.sightings if s.chosen is not None]
         votes = np.concatenate(
@@ -690,23 +814,35 @@ class ObservedObject:
         if count.any():
             target = int(count.argmax())
             here = labels[-1]
-            if target not in here:  # what was found was a part: the whole stands in the same place
+            if (
+                target not in here
+            ):  # what was found was a part: the whole stands in the same place
                 off = np.linalg.norm(
-                    footprints[-1].cells + 0.5 - to_cells @ self.object_frame.centre, axis=1
+                    footprints[-1].cells + 0.5 - to_cells @ self.object_frame.centre,
+                    axis=1,
                 )
                 there = here[
-                    (off < self.object_frame.radius * np.linalg.norm(to_cells[0])) & (here > 0)
+                    (off < self.object_frame.radius * np.linalg.norm(to_cells[0]))
+                    & (here > 0)
                 ]
                 target = int(np.bincount(there).argmax()) if len(there) else 0
             return target
         if self.sightings:
             return clusters.nearest(
-                footprints[-1:], labels[-1:], to_cells @ self.object_frame.centre
+                footprints[-1:],
+                labels[-1:],
+                to_cells @ self.object_frame.centre,
             )
 
         return clusters.central(footprints[-1], labels[-1], ground, optical_axis)
 
-    def sighting_of(self, frame: Frame, mask: Mask, plane: Plane | None, noise: Noise) -> Sighting:
+    def sighting_of(
+        self,
+        frame: Frame,
+        mask: Mask,
+        plane: Plane | None,
+        noise: Noise,
+    ) -> Sighting:
         """What the pixels of the object show of it.
 
         Args:
@@ -725,7 +861,13 @@ class ObservedObject:
         corner = (part[0].start, part[1].start)
         coarse = max(1, max(mask[part].shape) // SIZE)
         facets = fit_facets(
-            frame.depth[part], mask[part], frame.intrinsics, corner, self.denoise, coarse, noise
+            frame.depth[part],
+            mask[part],
+            frame.intrinsics,
+            corner,
+            self.denoise,
+            coarse,
+            noise,
         )
         if self.denoise and len(facets.planes):
             facets = without_outliers(facets, noise, coarse)
@@ -758,7 +900,12 @@ class ObservedObject:
         here = points.mean(0)
         if planes:  # their height along up, where the object is: they may lean a little
             floor = float(
-                np.median([axes[2] @ here - p.height(here) / (p.normal @ axes[2]) for p in planes])
+                np.median(
+                    [
+                        axes[2] @ here - p.height(here) / (p.normal @ axes[2])
+                        for p in planes
+                    ]
+                )
             )
 
         return enclose(points, axes, floor)
@@ -783,7 +930,9 @@ class ObservedObject:
 
 
 def _resampled(
-    picture: NDArray[np.uint8] | None, facets: Facets, facet: Index
+    picture: NDArray[np.uint8] | None,
+    facets: Facets,
+    facet: Index,
 ) -> NDArray[np.uint8] | None:
     """The picture of a frame, (H, W) or (H, W, 3), at the facets that a camera sees, (S, S)."""
     if picture is None:
@@ -798,12 +947,23 @@ def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
     """Return all that a frame shows, in the object frame and object radii."""
     k = sighting.frame.intrinsics.copy()
     step = max(
-        1, int(FINEST_PITCH * min(k[0, 0], k[1, 1]) / max(float(np.linalg.norm(pose[:3, 3])), 1.0))
+        1,
+        int(
+            FINEST_PITCH
+            * min(k[0, 0], k[1, 1])
+            / max(float(np.linalg.norm(pose[:3, 3])), 1.0)
+        ),
     )
+
     k[:2] /= step
     k[:2, 2] += 0.5 - (step // 2 + 0.5) / step
     few = (slice(step // 2, None, step),) * 2
-    return SceneView(sighting.frame.depth[few] / np.float32(radius), sighting.mask[few], pose, k)
+    return SceneView(
+        sighting.frame.depth[few] / np.float32(radius),
+        sighting.mask[few],
+        pose,
+        k,
+    )
 
 
 def _target_in(frame: Frame, samples: Samples, place: Float | None) -> support.Target:
@@ -825,7 +985,8 @@ def _ahead(frame: Frame) -> Float:
     down = height // AHEAD + 1
     across = width // AHEAD + 1
     depth = frame.depth[
-        height // 2 - down : height // 2 + down, width // 2 - across : width // 2 + across
+        height // 2 - down : height // 2 + down,
+        width // 2 - across : width // 2 + across,
     ]
     if not depth.any():
         depth = frame.depth

@@ -13,11 +13,17 @@ from scipy import ndimage
 from nextview.sensing.facets import Facets, Noise, count_beside
 from nextview.types import Float, Index, Mask
 
-NEIGHBOUR_WINDOW = 2  # pixels to each side among which the neighbours of a point are looked for
-FEWEST_NEIGHBOURS = 5  # of 24: at the tip of a thing that is two pixels thin there are as many
+NEIGHBOUR_WINDOW = (
+    2  # pixels to each side among which the neighbours of a point are looked for
+)
+FEWEST_NEIGHBOURS = (
+    5  # of 24: at the tip of a thing that is two pixels thin there are as many
+)
 STEEPEST_SLOPE = 4.0  # of a surface towards the ray, between neighbours
 NOISE_GAP = 4.0  # standard deviations of depth that neighbours may differ by
-SMALLEST_GROUP = 0.01  # share of all points that a group away from the others has at least
+SMALLEST_GROUP = (
+    0.01  # share of all points that a group away from the others has at least
+)
 GAP_PIXELS = 6  # pixels that two groups are apart
 # share of the nearest and the farthest points left out, by the noise as a part of the size
 TRIMMED_BY_NOISE = 0.1
@@ -43,11 +49,15 @@ def without_outliers(facets: Facets, noise: Noise, coarse: int) -> Facets:
     # between neighbouring points of a surface that faces the camera
     spacing = float(facets.pitch.mean()) * depth
     error = NOISE_GAP * noise.at(depth) * depth**2 / coarse
-    kept = np.flatnonzero(_enough_neighbours(rows, columns, depth, STEEPEST_SLOPE * spacing, error))
+    kept = np.flatnonzero(
+        _enough_neighbours(rows, columns, depth, STEEPEST_SLOPE * spacing, error)
+    )
     if not len(kept):
         return facets
 
-    step = GAP_PIXELS * float(facets.pitch.mean()) + float(np.median(error[kept] / depth[kept]))
+    step = GAP_PIXELS * float(facets.pitch.mean()) + float(
+        np.median(error[kept] / depth[kept])
+    )
     layer = (np.log(depth[kept] / depth[kept].min()) / step).astype(np.int64)
     group = _groups(rows[kept] // GAP_PIXELS, columns[kept] // GAP_PIXELS, layer)
     share = np.bincount(group) / len(kept)
@@ -67,13 +77,20 @@ def _within_its_depths(points: Float, error: Float) -> Mask:
         return np.zeros(0, bool)
     depth = points[:, 2]
     size = float(max(np.ptp(points[:, 0]), np.ptp(points[:, 1])))
-    share = min(MOST_OUTLIERS, TRIMMED_BY_NOISE * float(np.median(error)) / max(size, 1e-9))
+    share = min(
+        MOST_OUTLIERS,
+        TRIMMED_BY_NOISE * float(np.median(error)) / max(size, 1e-9),
+    )
     nearest, farthest = np.quantile(depth, [share, 1 - share])
     return np.asarray((depth >= nearest) & (depth <= farthest))
 
 
 def _enough_neighbours(
-    rows: Index, columns: Index, depth: Float, slope: Float, error: Float
+    rows: Index,
+    columns: Index,
+    depth: Float,
+    slope: Float,
+    error: Float,
 ) -> Mask:
     """Which pixels, (N,), have FEWEST_NEIGHBOURS around them that are as deep.
 

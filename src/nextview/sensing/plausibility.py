@@ -17,7 +17,9 @@ FEWEST_DEPTHS = 20  # pixels with a depth below which nothing is seen
 # how far from the origin a surface may be, object radii: centre and radius are estimates
 OUTERMOST = 1.15
 INNERMOST = 0.4  # how far from the origin the outermost of what is seen has to be
-CONTRADICTION = 0.2  # views contradict if one misses this share of the surface that the other saw
+CONTRADICTION = (
+    0.2  # views contradict if one misses this share of the surface that the other saw
+)
 # how far a principal point is from the middle of an uncropped picture, at most, half sides of it
 OFF_CENTRE = 0.25
 # metres: few depth cameras measure farther, and nothing fills a picture from there
@@ -46,14 +48,20 @@ MOST_AGREES = 0.8
 """Share of the surface on which two frames agree: from which their depth scale is right, and
 that names another one.
 """
-FEWEST_SHARED = 50  # points on which two frames have to agree or not before a depth scale is named
+FEWEST_SHARED = (
+    50  # points on which two frames have to agree or not before a depth scale is named
+)
 # metres from the origin of the world, within which robots work; where positions in millimetres
 # begin
 FAR_ORIGIN = 30.0
-FARTHEST_MILLIMETRES = 20_000.0  # from the world's origin within which a robot's camera is
+FARTHEST_MILLIMETRES = (
+    20_000.0  # from the world's origin within which a robot's camera is
+)
 SAME_HEIGHT = 0.1  # part of a height up to which another one is the same
 SAME_STEPS = 0.03  # the same, of heights that tell the steps of the depth
-ORDER_OF_SIZE = np.sqrt(10)  # factor from which a radius is nearer to ten times than to once
+ORDER_OF_SIZE = np.sqrt(
+    10
+)  # factor from which a radius is nearer to ten times than to once
 
 
 @dataclass(frozen=True)
@@ -76,7 +84,12 @@ class ViewWarning:
     holds: bool = True
 
 
-def refuse_far(frame: Frame, last: Frame | None, target: Float | None, radius: float) -> None:
+def refuse_far(
+    frame: Frame,
+    last: Frame | None,
+    target: Float | None,
+    radius: float,
+) -> None:
     """Refuse a camera that is much farther away than anything that it sees.
 
     Args:
@@ -99,7 +112,11 @@ def refuse_far(frame: Frame, last: Frame | None, target: Float | None, radius: f
                 f" {reach:.1f} m"
             )
             raise ObservationError(f"{what}: is the pose in millimetres?")
-    distance = 0.0 if target is None or frame.mask is not None else np.linalg.norm(target - camera)
+    distance = (
+        0.0
+        if target is None or frame.mask is not None
+        else np.linalg.norm(target - camera)
+    )
     if distance - radius > TOO_FAR * farthest:
         what = (
             f"the target is {distance:.0f} m away, and nothing in the frame is farther than"
@@ -159,7 +176,10 @@ def check_steps(frame: Frame, height: float, up: Float) -> list[ViewWarning]:
 
 
 def refuse_depth_scale(
-    frame: Frame, last: Frame | None, target: Float | None, radius: float
+    frame: Frame,
+    last: Frame | None,
+    target: Float | None,
+    radius: float,
 ) -> None:
     """Refuse depth that is several times too large.
 
@@ -183,9 +203,16 @@ def refuse_depth_scale(
         times = _times_too_large(frame, last)
     if not times:
         return
-    steps = f"its steps look like {1 / times:.3g} mm" if frame.counted else "is it in another unit?"
+    steps = (
+        f"its steps look like {1 / times:.3g} mm"
+        if frame.counted
+        else "is it in another unit?"
+    )
+
     hint = (
-        ", and uint16 is taken for millimetres: hand it in as float metres" if frame.counted else ""
+        ", and uint16 is taken for millimetres: hand it in as float metres"
+        if frame.counted
+        else ""
     )
     raise ObservationError(f"the depth is {times:g} times too large: {steps}{hint}")
 
@@ -224,7 +251,11 @@ def _times_too_large(frame: Frame, last: Frame) -> float:
     found = {times: _agreeing(last, frame, 1 / times) for times in TIMES_TOO_LARGE}
     best = max(found, key=lambda times: found[times][0])
     confirmed, share = found[best]
-    return best if share > MOST_AGREES and confirmed > 2 * max(as_given, FEWEST_SHARED) else 0.0
+    return (
+        best
+        if share > MOST_AGREES and confirmed > 2 * max(as_given, FEWEST_SHARED)
+        else 0.0
+    )
 
 
 def _agreeing(first: Frame, second: Frame, scale: float) -> tuple[int, float]:
@@ -271,7 +302,8 @@ def check_frame(frame: Frame) -> list[ViewWarning]:
     if middle > FAR_DEPTH:
         found.append(
             ViewWarning(
-                "unit", f"the depth has a median of {middle:.0f} m: is it in inches or feet?"
+                "unit",
+                f"the depth has a median of {middle:.0f} m: is it in inches or feet?",
             )
         )
     origin = float(np.linalg.norm(frame.camera_to_world[:3, 3]))
@@ -299,11 +331,13 @@ def check_point(aside: Float, radius: float) -> list[ViewWarning]:
     if distance <= FARTHEST_POINT_ASIDE * radius:
         return []
     message = (
-        f"the thing nearest to the point is {distance:.2g} m away from it, of {radius:.2g} m radius"
+        f"the thing nearest to the point is {distance:.2g} m "
+        f"away from it, of {radius:.2g} m radius"
     )
     return [
         ViewWarning(
-            "point", f"{message}: is the point of another world, or what stands there out of view?"
+            "point",
+            f"{message}: is the point of another world, or what stands there out of view?",
         )
     ]
 
@@ -374,13 +408,20 @@ def check_pose_moved(frame: Frame, last: Frame) -> list[ViewWarning]:
         or np.abs(frame.camera_to_world - last.camera_to_world).max() > STILL
     ):
         return []
+
     now, then = (f.depth[::4, ::4] for f in (frame, last))
     both = (now > 0) & (then > 0)
-    if not both.any() or np.mean(np.abs(now - then)[both] > CHANGED * now[both]) <= CHANGED_SHARE:
+
+    if (
+        not both.any()
+        or np.mean(np.abs(now - then)[both] > CHANGED * now[both]) <= CHANGED_SHARE
+    ):
         return []
+
     return [
         ViewWarning(
-            "stale pose", "the picture changed, the pose did not: an old pose, or a moved object?"
+            "stale pose",
+            "the picture changed, the pose did not: an old pose, or a moved object?",
         )
     ]
 
@@ -406,7 +447,8 @@ def check_observation(observation: Observation) -> list[ViewWarning]:
 def _surface(observation: Observation, seen: Index) -> Float:
     """Some of the surface that pixels, by index, show, (N, 3), camera frame."""
     rows, columns = np.divmod(
-        seen[:: max(1, len(seen) // PIXELS_SAMPLED)], observation.depth.shape[1]
+        seen[:: max(1, len(seen) // PIXELS_SAMPLED)],
+        observation.depth.shape[1],
     )
     camera = PinholeCamera.of(observation.intrinsics, observation.depth.shape)
     z = observation.depth[rows, columns].astype(np.float64)
@@ -443,7 +485,8 @@ def _diagnose(points: Float, pose: Float) -> tuple[str, str]:
         turned[:3, :3] = pose[:3, :3] @ CAMERA_AXES[name]
         if _plausible(points, turned):
             wrong = (
-                f"the camera's axes are {said}, OpenCV's (x right, y down, z forward) are expected"
+                f"the camera's axes are {said}, OpenCV's (x right, "
+                "y down, z forward) are expected"
             )
             return f"{name} axes", f"the view looks away from the object: {wrong}"
     if _plausible(points, np.asarray(np.linalg.inv(pose), np.float64)):
@@ -463,7 +506,10 @@ def _diagnose(points: Float, pose: Float) -> tuple[str, str]:
                 f"depth and the camera's distance of {distance:.2g} do not fit, by a factor of"
                 f" {scale:.2g}"
             )
-            return "scale", f"{unfit}: is one in metres? Both are expected in object radii"
+            return (
+                "scale",
+                f"{unfit}: is one in metres? Both are expected in object radii",
+            )
     what = (
         f"the surface that is seen reaches {reach:.2g} object radii from the object's centre, more"
         " than 1"
@@ -492,7 +538,9 @@ def check_views(first: Observation, second: Observation) -> list[ViewWarning]:
         f"two views contradict each other: {share:.0%} of the surface that one saw is missing in"
         " the other: a "
     )
-    return [ViewWarning("contradiction", message + "wrong pose, or the object has moved")]
+    return [
+        ViewWarning("contradiction", message + "wrong pose, or the object has moved")
+    ]
 
 
 def _seen_through(first: Observation, second: Observation) -> float:
@@ -522,9 +570,14 @@ def _seen_through(first: Observation, second: Observation) -> float:
     height, width = depth.shape
     at = PinholeCamera.of(k, depth.shape).project(points)
     column, row = np.floor(at).astype(np.int64).T
-    margin = max(2, width // 50) if scene is None else 2  # what the object frame may be off
+    margin = (
+        max(2, width // 50) if scene is None else 2
+    )  # what the object frame may be off
     inside = (
-        (column >= margin) & (column < width - margin) & (row >= margin) & (row < height - margin)
+        (column >= margin)
+        & (column < width - margin)
+        & (row >= margin)
+        & (row < height - margin)
     )
     if not inside.any():
         return 0.0

@@ -84,7 +84,9 @@ def sample(frame: Frame, pixels: Mask, noise: Noise) -> Samples:
     """
     step = 1
     side = max(1, int(np.sqrt(np.count_nonzero(pixels) / BLOCKS_SAMPLED)))
-    if side >= LARGE_SIDE:  # every second pixel is enough: those side by side err together anyway
+    if (
+        side >= LARGE_SIDE
+    ):  # every second pixel is enough: those side by side err together anyway
         step = 2
         side //= step
     few = (slice(None, None, step), slice(None, None, step))
@@ -101,11 +103,20 @@ def sample(frame: Frame, pixels: Mask, noise: Noise) -> Samples:
     y = _block_sums(given * ray_y[::step, None], side)[rows, columns] / count
 
     pose = frame.camera_to_world
-    points = (np.stack([x, y, np.ones(len(z))], 1) * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
+    points = (np.stack([x, y, np.ones(len(z))], 1) * z[:, None]) @ pose[
+        :3,
+        :3,
+    ].T + pose[:3, 3]
     erring_together = max(1.0, (2 * noise.grain + 1) / step)  # pixels across
     # root of how many err for themselves
     alone = np.clip(np.sqrt(count) / erring_together, 1, MOST_ALONE)
-    return Samples(points, 3 * noise.at(z) * z**2 / alone + 0.003 * z, rows, columns, pose[:3, 3])
+    return Samples(
+        points,
+        3 * noise.at(z) * z**2 / alone + 0.003 * z,
+        rows,
+        columns,
+        pose[:3, 3],
+    )
 
 
 def _block_sums(values: Floats, side: int) -> Float:
@@ -183,7 +194,10 @@ def steep(samples: Samples, up: Float) -> Mask:
 
 
 def find_plane(
-    samples: Samples, rng: Generator, up: Float | None = None, above: Float | None = None
+    samples: Samples,
+    rng: Generator,
+    up: Float | None = None,
+    above: Float | None = None,
 ) -> Plane | None:
     """Find the plane with most samples by RANSAC (Fischler and Bolles 1981).
 
@@ -208,7 +222,11 @@ def find_plane(
     normals = normals[length > 0] / length[length > 0, None]
     through = a[length > 0]
     offsets = -(normals * through).sum(1)
-    turn = np.where((normals @ samples.camera + offsets if up is None else normals @ up) < 0, -1, 1)
+    turn = np.where(
+        (normals @ samples.camera + offsets if up is None else normals @ up) < 0,
+        -1,
+        1,
+    )
     normals = normals * turn[:, None]
     offsets = offsets * turn
     fits = normals @ samples.camera + offsets > 0
@@ -323,7 +341,9 @@ def lies_better_as_range(
     along = samples.points - samples.camera
     depth = along @ frame.camera_to_world[:3, 2]
     nearer = replace(
-        samples, points=samples.camera + along * (depth / np.linalg.norm(along, axis=1))[:, None]
+        samples,
+        points=samples.camera
+        + along * (depth / np.linalg.norm(along, axis=1))[:, None],
     )
     other = find_plane(nearer, deepcopy(rng), up, above)
     usual = 0.0 if plane is None else float(plane.holds(samples).mean())
@@ -400,7 +420,12 @@ def inside_box(frame: Frame, box: Box) -> Mask:
     return inside
 
 
-def inside_sphere(frame: Frame, centre: Float, radius: float, part: Part = WHOLE) -> Mask:
+def inside_sphere(
+    frame: Frame,
+    centre: Float,
+    radius: float,
+    part: Part = WHOLE,
+) -> Mask:
     """Return the pixels whose positions lie in a sphere.
 
     Args:
@@ -413,7 +438,8 @@ def inside_sphere(frame: Frame, centre: Float, radius: float, part: Part = WHOLE
         The pixels of the part, (H, W) bool.
     """
     x, y, z = (
-        frame.along(axis, float(-at), part) for axis, at in zip(np.eye(3), centre, strict=True)
+        frame.along(axis, float(-at), part)
+        for axis, at in zip(np.eye(3), centre, strict=True)
     )
     return (frame.depth[part] > 0) & (x * x + y * y + z * z < radius**2)
 
@@ -440,12 +466,16 @@ def above_plane(frame: Frame, plane: Plane, noise: Noise, part: Part = WHOLE) ->
     x = frame.rays[0][part[1]]
     y = frame.rays[1][part[0]]
     most_noise = 4 * float(noise.sigmas.max(initial=0.0))
-    steepest = float(np.abs(a) * np.abs(x).max() + np.abs(b) * np.abs(y).max() + np.abs(c))
+    steepest = float(
+        np.abs(a) * np.abs(x).max() + np.abs(b) * np.abs(y).max() + np.abs(c)
+    )
     unsure = height < least + np.float32(most_noise * steepest) * depth**2
     unsure &= high
 
     rows, columns = np.divmod(np.flatnonzero(unsure), high.shape[1])
     z = depth[rows, columns]
     rise = np.abs((a * x)[columns] + (b * y + c)[rows])
-    high[rows, columns] = height[rows, columns] > z * (4 * noise.at(z) * z * rise + 0.003)
+    high[rows, columns] = height[rows, columns] > z * (
+        4 * noise.at(z) * z * rise + 0.003
+    )
     return high

@@ -51,6 +51,7 @@ class Sighting:
             self,
             frame=self.frame.shifted(shift),
             hull=self.hull + shift,
-            plane=plane and replace(plane, offset=plane.offset - float(plane.normal @ shift)),
+            plane=plane
+            and replace(plane, offset=plane.offset - float(plane.normal @ shift)),
             shift=self.shift + shift,
         )

@@ -39,13 +39,19 @@ WELL_INSIDE = 0.85
 LARGE_PART = 0.2
 # extent of a thing, as a part of that of the plane, below which it may stand at the plane's edge
 NARROW = 0.35
-LOWEST_THING = 0.015  # height of what stands on a plane, as a part of its distance, at least
-GROUND_STEP = 0.25  # the same of a level surface: at a grazing angle its samples lie far apart
+LOWEST_THING = (
+    0.015  # height of what stands on a plane, as a part of its distance, at least
+)
+GROUND_STEP = (
+    0.25  # the same of a level surface: at a grazing angle its samples lie far apart
+)
 # tolerance of samples that tell a plane from the next one, as a part of the height between them
 TOLD_APART = 0.5
 # neighbouring samples of one surface differ by at most this part of their depth, and noise
 SURFACE_STEP = 0.04
-BOTTOM_SHARE = 0.04  # share of a mask's points that may lie lower than its bottom: noise
+BOTTOM_SHARE = (
+    0.04  # share of a mask's points that may lie lower than its bottom: noise
+)
 # height over a plane of the bottom of what stands on it, as a part of the distance
 BOTTOM_MARGIN = 0.02
 # from there, to the side, to where the plane is seen, at most, as a part of the distance
@@ -80,7 +86,9 @@ def level_planes(samples: Samples, first: Plane) -> list[Plane]:
         offset = first.offset - float(weight @ height[on] / weight.sum())
         parallel = replace(first, offset=offset)
         better = refine_plane(parallel, samples.some(_only(on, len(height))), loose=2)
-        planes.append(better if better.normal @ first.normal > PARALLEL_SUPPORTS else parallel)
+        planes.append(
+            better if better.normal @ first.normal > PARALLEL_SUPPORTS else parallel
+        )
         left &= np.abs(planes[-1].height(samples.points)) > 2 * samples.tolerance
     return sorted(planes, key=lambda plane: plane.offset)
 
@@ -108,7 +116,10 @@ def ground_of(samples: Samples, first: Plane, widest: float) -> Plane:
         is none, or where it is wider than such a thing.
     """
     surface = first.extent(samples)
-    if not len(surface) or np.linalg.norm(np.ptp(_in_plane(surface, first), axis=0)) > widest:
+    if (
+        not len(surface)
+        or np.linalg.norm(np.ptp(_in_plane(surface, first), axis=0)) > widest
+    ):
         return first
 
     away = float(np.median(np.linalg.norm(surface - samples.camera, axis=1)))
@@ -140,7 +151,10 @@ def under_points(samples: Samples, planes: list[Plane], points: Float) -> Plane 
         on = samples.points[plane.holds(samples)]
         if not len(on):
             continue
-        aside = _in_plane(on, plane)[:, None] - _in_plane(low[:: max(1, len(low) // 100)], plane)
+        aside = _in_plane(on, plane)[:, None] - _in_plane(
+            low[:: max(1, len(low) // 100)],
+            plane,
+        )
         if np.linalg.norm(aside, axis=2).min() < BOTTOM_ASIDE * away:
             return plane
     return None
@@ -168,7 +182,10 @@ class Target:
             plane: that is looked for beneath the object.
         """
         if self.place is None:
-            pixels = np.hypot(samples.rows - self.axis[0], samples.columns - self.axis[1])
+            pixels = np.hypot(
+                samples.rows - self.axis[0],
+                samples.columns - self.axis[1],
+            )
             return np.asarray(pixels / (AIM * self.width))
         aside = _in_plane(samples.points, plane) - _in_plane(self.place[None], plane)
         return np.asarray(
@@ -177,7 +194,12 @@ class Target:
         )
 
 
-def aimed_at(samples: Samples, planes: list[Plane], in_the_way: Mask, target: Target) -> Plane:
+def aimed_at(
+    samples: Samples,
+    planes: list[Plane],
+    in_the_way: Mask,
+    target: Target,
+) -> Plane:
     """The support plane of what the camera is aimed at, or of what stands at a place.
 
     From the highest plane down, the first is taken that carries something there; the lowest where
@@ -209,7 +231,9 @@ def is_named(samples: Samples, plane: Plane, target: Target) -> bool:
         plane: the level plane.
         target: the place where the object is.
     """
-    if target.place is None or plane.height(target.place) > np.median(samples.tolerance):
+    if target.place is None or plane.height(target.place) > np.median(
+        samples.tolerance
+    ):
         return False
     off = target.off(samples, plane)
     above = plane.height(samples.points) > samples.tolerance
@@ -220,7 +244,8 @@ def is_named(samples: Samples, plane: Plane, target: Target) -> bool:
     its_own = _surface_there(samples, on, off)
     away = float(np.linalg.norm(target.place - samples.camera))
     wide = (
-        np.linalg.norm(np.ptp(_in_plane(samples.points[its_own], plane), 0)) > GROUND_WIDTH * away
+        np.linalg.norm(np.ptp(_in_plane(samples.points[its_own], plane), 0))
+        > GROUND_WIDTH * away
     )
     return not (wide and _leaves_picture(samples, its_own))
 
@@ -236,7 +261,13 @@ def _surface_there(samples: Samples, on: Mask, off: Float) -> Mask:
     return np.asarray(surface == surface[np.where(large, off, np.inf).argmin()])
 
 
-def _carries(samples: Samples, plane: Plane, level: Mask, free: Mask, target: Target) -> bool:
+def _carries(
+    samples: Samples,
+    plane: Plane,
+    level: Mask,
+    free: Mask,
+    target: Target,
+) -> bool:
     """Whether a plane carries the target, and is no part of it."""
     on = plane.holds(samples) & level
     if on.sum() < 3:
@@ -251,10 +282,12 @@ def _carries(samples: Samples, plane: Plane, level: Mask, free: Mask, target: Ta
 
     nearest = samples.points[off.argmin()] if target.place is None else target.place
     away = float(np.linalg.norm(nearest - samples.camera))
-    wide = bool(np.linalg.norm(np.ptp(ground[outline.vertices], 0)) > GROUND_WIDTH * away)
-    if target.place is not None and plane.height(target.place) < (-1 if wide else 1) * np.median(
-        samples.tolerance
-    ):
+    wide = bool(
+        np.linalg.norm(np.ptp(ground[outline.vertices], 0)) > GROUND_WIDTH * away
+    )
+    if target.place is not None and plane.height(target.place) < (
+        -1 if wide else 1
+    ) * np.median(samples.tolerance):
         return False
 
     above = (plane.height(samples.points) > samples.tolerance) & free
@@ -262,7 +295,9 @@ def _carries(samples: Samples, plane: Plane, level: Mask, free: Mask, target: Ta
     if thing is None or plane.height(samples.points[thing]).max() < LOWEST_THING * away:
         return wide and _leaves_picture(samples, its_own)
     return _stands_within(samples, plane, thing, outline) and not _goes_on_below(
-        samples, plane, thing
+        samples,
+        plane,
+        thing,
     )
 
 
@@ -311,13 +346,21 @@ def _surfaces(samples: Samples, chosen: Mask, step: float = SURFACE_STEP) -> Ind
 
 def _components(count: int, links: Index, nodes: Index) -> Index:
     """The connected component of each linked node, 1 and more, (count,); 0 for other nodes."""
-    graph = coo_array((np.ones(links.shape[1], bool), (links[0], links[1])), shape=(count, count))
+    graph = coo_array(
+        (np.ones(links.shape[1], bool), (links[0], links[1])),
+        shape=(count, count),
+    )
     group = np.zeros(count, np.int64)
     group[nodes] = connected_components(graph, directed=False)[1][nodes] + 1
     return group
 
 
-def _stands_within(samples: Samples, plane: Plane, thing: Index, outline: ConvexHull) -> bool:
+def _stands_within(
+    samples: Samples,
+    plane: Plane,
+    thing: Index,
+    outline: ConvexHull,
+) -> bool:
     """Whether a thing covers a smaller part of the plane, away from its outline, or is narrow.
 
     The back of a sofa on its seat does neither.
@@ -327,7 +370,9 @@ def _stands_within(samples: Samples, plane: Plane, thing: Index, outline: Convex
     narrow = bool(np.linalg.norm(np.ptp(shown, axis=0)) < NARROW * extent)
     middle = outline.points[outline.vertices].mean(0)
     centre = middle + (np.median(shown, 0) - middle) / WELL_INSIDE
-    inside = bool((outline.equations[:, :2] @ centre + outline.equations[:, 2] <= 0).all())
+    inside = bool(
+        (outline.equations[:, :2] @ centre + outline.equations[:, 2] <= 0).all()
+    )
     try:
         area = float(ConvexHull(shown).volume) if len(shown) > 2 else 0.0
     except QhullError:
@@ -344,7 +389,10 @@ def _goes_on_below(samples: Samples, plane: Plane, thing: Index) -> bool:
     beneath = grid[samples.rows[thing] + 1, samples.columns[thing]]
     one = thing[beneath >= 0]
     other = beneath[beneath >= 0]
-    same = np.abs(depth[one] - depth[other]) < SURFACE_STEP * depth[one] + samples.tolerance[one]
+    same = (
+        np.abs(depth[one] - depth[other])
+        < SURFACE_STEP * depth[one] + samples.tolerance[one]
+    )
     on = np.abs(height[other]) < samples.tolerance[other]
     below = (height[other] < -samples.tolerance[other]) & same
     return bool(below.sum() > on.sum())

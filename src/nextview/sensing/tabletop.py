@@ -15,18 +15,34 @@ from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, upright_axes
-from nextview.sensing.observed_object import FEWEST_OBJECT_PIXELS, ObservedObject, noise_of
+from nextview.sensing.observed_object import (
+    FEWEST_OBJECT_PIXELS,
+    ObservedObject,
+    noise_of,
+)
 from nextview.sensing.segmentation import Plane, Samples, sample
 from nextview.sensing.walls import before_walls, find_walls
 from nextview.types import Float, Float32, Index, Mask
 
-LOWEST_TOP = 0.008  # metres above the plane that a thing reaches, at least: else it is a stain
-LOWEST_SHARE = 0.012  # the same as a part of its distance, where the depth is less exact
-TOP_SHARE = 0.9  # share of a thing's pixels that are below its top, flying pixels left out
-SMALLEST_AREA = 1.5e-4  # square metres that are seen of a thing, at least: of a die a little more
+LOWEST_TOP = (
+    0.008  # metres above the plane that a thing reaches, at least: else it is a stain
+)
+LOWEST_SHARE = (
+    0.012  # the same as a part of its distance, where the depth is less exact
+)
+TOP_SHARE = (
+    0.9  # share of a thing's pixels that are below its top, flying pixels left out
+)
+SMALLEST_AREA = (
+    1.5e-4  # square metres that are seen of a thing, at least: of a die a little more
+)
 THINNEST = 0.006  # metres across a thing at its thickest, at least: scraps of edges are thinner
-NEAR_TABLE = 0.015  # metres from the plane within which what is seen is likely to be the plane's
-UNEVEN_DEVIATIONS = 3.0  # deviations of the plane's own pixels above which something stands on it
+NEAR_TABLE = (
+    0.015  # metres from the plane within which what is seen is likely to be the plane's
+)
+UNEVEN_DEVIATIONS = (
+    3.0  # deviations of the plane's own pixels above which something stands on it
+)
 MEDIAN_DEVIATION = 1.4826  # of a Gaussian, by the median of what it deviates
 TOUCHING_GAP = 0.006  # metres between two things that touch, at most
 TOUCHING_STEP = 0.015  # metres between their depths where they are nearest, at most
@@ -82,7 +98,9 @@ class TableTop:
         noise = noise_of(frame)
         samples = sample(frame, frame.depth > 0, noise)
         if earlier is None:
-            plane = ObservedObject(up if frame.pose is not None else None).find_support(frame)
+            plane = ObservedObject(up if frame.pose is not None else None).find_support(
+                frame
+            )
             if widest is not None:
                 plane = support.ground_of(samples, plane, widest)
         else:
@@ -102,7 +120,11 @@ class TableTop:
         upwards = plane.normal if up is None or frame.pose is None else up
         return cls(frame, noise, plane, upwards, above, free, height)
 
-    def segments(self, pixels: Mask | None = None, joins: Joins = "by their border") -> list[Mask]:
+    def segments(
+        self,
+        pixels: Mask | None = None,
+        joins: Joins = "by their border",
+    ) -> list[Mask]:
         """Cut what is above the plane into things, by their edges and how they lie from above.
 
         Args:
@@ -123,7 +145,9 @@ class TableTop:
         cell = clusters.FOOTPRINT_CELL * away
         rows, columns = np.nonzero(above)
         few = slice(None, None, max(1, len(rows) // 1000))
-        middle = np.median(frame.positions(rows[few], columns[few]), axis=0) @ axes[:2].T
+        middle = (
+            np.median(frame.positions(rows[few], columns[few]), axis=0) @ axes[:2].T
+        )
         foot = clusters.footprint(frame, pieces, axes, cell, middle / cell)
         (labels,), _ = clusters.clusters([foot], joins)
 
@@ -132,7 +156,12 @@ class TableTop:
         for label in range(1, int(of_piece.max(initial=0)) + 1):
             mask = (of_piece == label)[pieces.grown]
             if np.count_nonzero(mask) >= FEWEST_OBJECT_PIXELS:
-                mask = trimmed(frame.depth, mask, self.noise, self.height > STANDS * frame.depth)
+                mask = trimmed(
+                    frame.depth,
+                    mask,
+                    self.noise,
+                    self.height > STANDS * frame.depth,
+                )
             if self.is_thing(mask):
                 found.append(mask)
         return sorted(found, key=lambda mask: -np.count_nonzero(mask))
@@ -144,6 +173,7 @@ class TableTop:
         count = np.count_nonzero(own)
         if count < FEWEST_OBJECT_PIXELS:
             return False
+
         away = float(np.median(self.frame.depth[part][own]))
         top = float(np.quantile(self.height[part][own], TOP_SHARE))
         focal = self.frame.intrinsics[0, 0] * self.frame.intrinsics[1, 1]
@@ -152,10 +182,16 @@ class TableTop:
             return False
         half = round(float(np.sqrt(focal)) * THINNEST / 2 / away)
         filled = ndimage.binary_closing(np.pad(mask[part], 1))
-        return bool(ndimage.binary_erosion(filled, np.ones((3, 3), bool), max(half, 1)).any())
+        return bool(
+            ndimage.binary_erosion(filled, np.ones((3, 3), bool), max(half, 1)).any()
+        )
 
     def touching(
-        self, one: Mask, other: Mask, gap: float = TOUCHING_GAP, step: float = TOUCHING_STEP
+        self,
+        one: Mask,
+        other: Mask,
+        gap: float = TOUCHING_GAP,
+        step: float = TOUCHING_STEP,
     ) -> bool:
         """Whether two things meet in the picture and in depth.
 
@@ -171,7 +207,10 @@ class TableTop:
             return False
 
         focal = float(self.frame.intrinsics[[0, 1], [0, 1]].mean())
-        reach = max(2.0, gap * focal / float(np.median(away_from_camera[away_from_camera > 0])))
+        reach = max(
+            2.0,
+            gap * focal / float(np.median(away_from_camera[away_from_camera > 0])),
+        )
         near = within(one, int(reach) + 1)
         if not other[near].any():
             return False

@@ -22,9 +22,8 @@ from nextview.types import Float, Index, Mask
 LINE_TRIALS = 150  # lines that are tried for each wall
 MOST_LINES = 6  # upright planes that are looked at, the largest first
 FEWEST_SAMPLES = 0.02  # share of all samples that lie on a wall, at least
-WIDE_WALL = (
-    1.5  # metres: an upright plane that reaches a side of the picture and is as wide is a wall
-)
+# metres: an upright plane that reaches a side of the picture and is as wide is a wall
+WIDE_WALL = 1.5
 WIDEST_OBJECT = 3.0  # metres: no object is so wide
 # share of the columns of the picture over which a narrower wall extends, from side to side
 WIDE_SHARE = 0.8
@@ -33,7 +32,9 @@ SIDE_CELLS = 1  # columns of the grid of samples that count as the side of the p
 MOST_SAMPLES_BEHIND = 0.1
 OVER_CAMERA = 0.3  # metres of a ceiling over the camera, at least
 CEILINGS_TRIED = 50  # heights
-PARALLEL_WALLS = np.cos(np.radians(25.0))  # cosine of the angle up to which two planes are parallel
+PARALLEL_WALLS = np.cos(
+    np.radians(25.0)
+)  # cosine of the angle up to which two planes are parallel
 COARSE_WIDTH = 320  # columns of the picture in which pixels are compared with walls
 # pixels of that picture across the square over which the distance from a wall is averaged
 MEAN_SIDE = 3
@@ -44,7 +45,9 @@ WALL_ERROR = 0.006
 CAMERA_BEHIND = 0.1
 # from the next wall to a sample of a wall that meets it, as a part of its distance, at most
 CORNER_GAP = 0.05
-NEAREST_TO_PLACE = 0.02  # metres that the place of an object lies before a wall, at least
+NEAREST_TO_PLACE = (
+    0.02  # metres that the place of an object lies before a wall, at least
+)
 
 
 def find_walls(
@@ -86,9 +89,15 @@ def find_walls(
         on = np.abs(upright.height(samples.points[left])) < samples.tolerance[left]
         if on.sum() < wanted:
             break
-        if _is_wall(samples, upright, left[on], up, walls, place, narrowest) and not _hides_much(
-            samples, upright, walls, on.sum()
-        ):
+        if _is_wall(
+            samples,
+            upright,
+            left[on],
+            up,
+            walls,
+            place,
+            narrowest,
+        ) and not _hides_much(samples, upright, walls, on.sum()):
             walls.append(upright)
         left = left[~on]
     return walls
@@ -108,8 +117,13 @@ def _ceiling(samples: Samples, plane: Plane, place: Float | None) -> Plane | Non
     best = int(near.sum(0).argmax())
     on = level[near[:, best]]
     weight = 1 / samples.tolerance[on] ** 2
-    ceiling = Plane(-plane.normal, float(weight @ height[on] / weight.sum()) - plane.offset)
-    if len(on) < wanted or (place is not None and ceiling.height(place) < NEAREST_TO_PLACE):
+    ceiling = Plane(
+        -plane.normal,
+        float(weight @ height[on] / weight.sum()) - plane.offset,
+    )
+    if len(on) < wanted or (
+        place is not None and ceiling.height(place) < NEAREST_TO_PLACE
+    ):
         return None
     if samples.rows[on].min() > samples.rows.min() + SIDE_CELLS:
         return None
@@ -135,7 +149,10 @@ def before_walls(frame: Frame, walls: Sequence[Plane], noise: Noise) -> Mask:
     few = (slice(None, None, step), slice(None, None, step))
     depth = frame.depth[few]
     known = (depth > 0).astype(np.float32)
-    share = np.maximum(ndimage.uniform_filter(known, MEAN_SIDE, mode="constant"), np.float32(1e-6))
+    share = np.maximum(
+        ndimage.uniform_filter(known, MEAN_SIDE, mode="constant"),
+        np.float32(1e-6),
+    )
     deviation = (noise.at(depth) * depth**2).astype(np.float32)
 
     before = known > 0
@@ -143,16 +160,29 @@ def before_walls(frame: Frame, walls: Sequence[Plane], noise: Noise) -> Mask:
         # Noise moves a point along its ray: it comes nearer to the wall by so much as the ray does.
         distance = frame.along(wall.normal, wall.offset)[few]
         camera = float(wall.normal @ frame.camera_to_world[:3, 3] + wall.offset)
-        slope = np.abs(distance - np.float32(camera)) / np.maximum(depth, np.float32(1e-6))
-        mean = ndimage.uniform_filter(distance * known, MEAN_SIDE, mode="constant") / share
+        slope = np.abs(distance - np.float32(camera)) / np.maximum(
+            depth,
+            np.float32(1e-6),
+        )
+        mean = (
+            ndimage.uniform_filter(distance * known, MEAN_SIDE, mode="constant") / share
+        )
         noise_there = deviation * slope
         error = np.float32(WALL_ERROR) * depth
-        before &= (mean > WALL_NOISE * noise_there + error) & (distance > noise_there + error)
-    return np.repeat(np.repeat(before, step, 0), step, 1)[: frame.shape[0], : frame.shape[1]]
+        before &= (mean > WALL_NOISE * noise_there + error) & (
+            distance > noise_there + error
+        )
+    return np.repeat(np.repeat(before, step, 0), step, 1)[
+        : frame.shape[0],
+        : frame.shape[1],
+    ]
 
 
 def _largest_upright_plane(
-    samples: Samples, chosen: Index, up: Float, rng: Generator
+    samples: Samples,
+    chosen: Index,
+    up: Float,
+    rng: Generator,
 ) -> Plane | None:
     """The upright plane through most of the chosen samples.
 
@@ -179,7 +209,13 @@ def _largest_upright_plane(
     return Plane(facing * plane.normal, facing * plane.offset)
 
 
-def _refined(points: Float, tolerance: Float, normal: Float, on: Mask, up: Float) -> Plane:
+def _refined(
+    points: Float,
+    tolerance: Float,
+    normal: Float,
+    on: Mask,
+    up: Float,
+) -> Plane:
     """The upright plane of least squares through some points, weighted by how exact each is."""
     weight = 1 / tolerance[on] ** 2
     centre = weight @ points[on] / weight.sum()
@@ -220,7 +256,9 @@ def _is_wall(
         at_left and at_right and len(np.unique(columns)) >= WIDE_SHARE * (last - first)
     )
     gap = CORNER_GAP * away + float(np.median(samples.tolerance[on]))
-    met = [wall for wall in walls if (np.abs(wall.height(samples.points[on])) < gap).any()]
+    met = [
+        wall for wall in walls if (np.abs(wall.height(samples.points[on])) < gap).any()
+    ]
     corners = sum(abs(wall.normal @ up) < PARALLEL_WALLS for wall in met)
     to_the_top = (
         len(met) > corners  # as high as the ceiling
@@ -233,7 +271,12 @@ def _is_wall(
     return bool(width > WIDEST_OBJECT or at_side or from_side_to_side or between_walls)
 
 
-def _hides_much(samples: Samples, upright: Plane, walls: Sequence[Plane], many: int) -> bool:
+def _hides_much(
+    samples: Samples,
+    upright: Plane,
+    walls: Sequence[Plane],
+    many: int,
+) -> bool:
     """Whether more is seen behind an upright plane than flying pixels explain.
 
     Walls that cross it are left out.

@@ -15,7 +15,12 @@ from nextview.geometry.observation import Observation, SceneView
 from nextview.geometry.viewsphere import SNAP, Viewpoints, angle_between, azimuth_of
 from nextview.policies.base import EpisodeState, Evidence, Policy
 from nextview.policies.off_grid import OffGrid
-from nextview.recognition.belief import PLAIN_SUM, Calibration, Stopping, log_evidence_of
+from nextview.recognition.belief import (
+    PLAIN_SUM,
+    Calibration,
+    Stopping,
+    log_evidence_of,
+)
 from nextview.recognition.protocol import JointBelief
 from nextview.sensing.expected_visibility import SeenScene, expected_visibility
 from nextview.types import Float, Floats, Index, Mask
@@ -101,7 +106,10 @@ class Taken:
 
 # expected share of the object that shows from each view, (B, V)
 Visible = Callable[[EpisodeState], Float]
-Constrain = Callable[[EpisodeState], EpisodeState]  # with where robots can go, and what it costs
+Constrain = Callable[
+    [EpisodeState],
+    EpisodeState,
+]  # with where robots can go, and what it costs
 # see ``protocol.JudgesTogether.together``
 Together = Callable[[Sequence[Observation], Float, int], JointBelief]
 # see ``protocol.LooksAhead.outlook``
@@ -212,12 +220,17 @@ class Episodes:
         stopped = enough & taken.counts
         if n_views >= min(self.stopping.max_views, len(self.sphere)):
             stopped[:] = True
+
         if not stopped.all():
             going = ~stopped
             state, chosen = self._move(self._state(taken, going), constrain)
             step.next_views[going] = chosen
             step = replace(step, state=state)
-        return replace(taken, step=replace(step, enough=enough, stopped=step.next_views < 0))
+
+        return replace(
+            taken,
+            step=replace(step, enough=enough, stopped=step.next_views < 0),
+        )
 
     def take(
         self,
@@ -253,7 +266,10 @@ class Episodes:
             )
         step = self.steps[-1]
         before = self.steps[-1].state
-        state, chosen = self._move(before.select(np.isin(before.episodes, self.running)), constrain)
+        state, chosen = self._move(
+            before.select(np.isin(before.episodes, self.running)),
+            constrain,
+        )
         next_views = np.full(len(step.episodes), -1)
         next_views[np.isin(step.episodes, self.running)] = chosen
         return replace(step, next_views=next_views, stopped=next_views < 0, state=state)
@@ -275,7 +291,10 @@ class Episodes:
             beliefs.insert(0, earlier.belief[rows])
             n_views.insert(0, earlier.seen[rows])
         path = np.stack(beliefs, 1)
-        return self.stopping.reached_along(path, np.maximum(np.stack(n_views, 1), 1))[:, -1]
+        return self.stopping.reached_along(path, np.maximum(np.stack(n_views, 1), 1))[
+            :,
+            -1,
+        ]
 
     def _go(self, step: Step) -> None:
         moved = step.next_views >= 0
@@ -294,10 +313,18 @@ class Episodes:
 
         if "azimuth_bins" in needs:
             azimuth_bins = self.calibration.azimuth_bins(
-                total, weighed, classes, taken.azimuth[going]
+                total,
+                weighed,
+                classes,
+                taken.azimuth[going],
             )
         if "joint" in needs:
-            joint = self.calibration.joint(total, weighed, classes, taken.azimuth[going])
+            joint = self.calibration.joint(
+                total,
+                weighed,
+                classes,
+                taken.azimuth[going],
+            )
 
         state = EpisodeState(
             step.views[going],
@@ -366,7 +393,9 @@ class Episodes:
             counted = last.step.seen[going]
             earlier = [] if last.places is None else [last.places[going]]
             if (directions is None) != (last.places is None):
-                raise UsageError("where the cameras stood is told of all views or of none")
+                raise UsageError(
+                    "where the cameras stood is told of all views or of none"
+                )
         views = self.current[now]
         azimuth = self.sphere.azimuth[self.current[now]]
         places = None
@@ -374,18 +403,30 @@ class Episodes:
             arc = angle_between(directions[:, None], self.sphere.directions[None])
             views = arc.argmin(1)
             there = arc.min(1) < SNAP
-            azimuth = np.where(there, self.sphere.azimuth[views], azimuth_of(directions))
-            place = np.where(there[:, None], self.sphere.directions[views], directions)[:, None]
+            azimuth = np.where(
+                there,
+                self.sphere.azimuth[views],
+                azimuth_of(directions),
+            )
+            place = np.where(there[:, None], self.sphere.directions[views], directions)[
+                :,
+                None,
+            ]
             places = np.concatenate([*earlier, place], 1)
             visited |= arc <= VISITED_ANGLE
         visited[np.arange(len(now)), views] = True
         said = np.asarray(
-            log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), np.float64
+            log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth),
+            np.float64,
         )
         total = before + seen[:, None] * said
         counted = counted + seen
         # Before anything is seen the total is zero, whatever it is divided by.
-        belief = self.calibration.belief(total, np.maximum(counted, 1), evidence.logits.shape[1])
+        belief = self.calibration.belief(
+            total,
+            np.maximum(counted, 1),
+            evidence.logits.shape[1],
+        )
         no = np.zeros(len(now), bool)
         nowhere = np.full(len(now), -1)
         step = Step(now, views, evidence, belief, no, no, nowhere, total, counted)
@@ -393,7 +434,12 @@ class Episodes:
             step = self._judged(step, seen, joint or (None,) * len(now))
         return Taken(step, seen, visited, azimuth, places)
 
-    def _judged(self, step: Step, seen: Mask, known: tuple[JointBelief | None, ...]) -> Step:
+    def _judged(
+        self,
+        step: Step,
+        seen: Mask,
+        known: tuple[JointBelief | None, ...],
+    ) -> Step:
         """The step with what all views so far say together, and the belief that follows.
 
         ``seen`` says in which episodes anything is seen in this view, (A,), and ``known`` what is
@@ -402,14 +448,22 @@ class Episodes:
         assert self.together is not None
         before: dict[int, JointBelief | None] = {}
         if self.steps and self.steps[-1].joint:
-            before = dict(zip(self.steps[-1].episodes.tolist(), self.steps[-1].joint, strict=True))
-        taken = self._observations(step, step.episodes, counted=True) if seen.any() else []
+            before = dict(
+                zip(self.steps[-1].episodes.tolist(), self.steps[-1].joint, strict=True)
+            )
+        taken = (
+            self._observations(step, step.episodes, counted=True) if seen.any() else []
+        )
 
         joint = list(known)
         belief = step.belief.copy()
         for row, episode in enumerate(step.episodes.tolist()):
             if joint[row] is None and seen[row]:
-                joint[row] = self.together(taken[row], step.total[row], int(step.seen[row]))
+                joint[row] = self.together(
+                    taken[row],
+                    step.total[row],
+                    int(step.seen[row]),
+                )
             elif joint[row] is None:
                 joint[row] = before.get(episode)
             found = joint[row]
@@ -425,13 +479,20 @@ class Episodes:
             return np.ones(state.visited.shape)
         positions = self.sphere.poses[:, :3, 3]
         found = []
+
         for episode, views in zip(
-            state.episodes, self._observations(last, state.episodes), strict=True
+            state.episodes,
+            self._observations(last, state.episodes),
+            strict=True,
         ):
             scenes = [seen.scene for seen in views if seen.scene is not None]
             found.append(
-                expected_visibility(self._seen_scene(int(episode), scenes), positions).expected
+                expected_visibility(
+                    self._seen_scene(int(episode), scenes),
+                    positions,
+                ).expected
             )
+
         return np.stack(found)
 
     def _seen_scene(self, episode: int, scenes: list[SceneView]) -> SeenScene:
@@ -446,7 +507,10 @@ class Episodes:
         return seen
 
     def _observations(
-        self, last: Step, episodes: Index, counted: bool = False
+        self,
+        last: Step,
+        episodes: Index,
+        counted: bool = False,
     ) -> list[list[Observation]]:
         """Return all views of some episodes, the last step included.
 
@@ -459,19 +523,28 @@ class Episodes:
             evidence = step.evidence
             if evidence.observations is None:
                 who = "this recogniser" if counted else "this policy"
-                raise UsageError(f"{who} needs the depth that was seen, and only evidence is given")
+                raise UsageError(
+                    f"{who} needs the depth that was seen, and only evidence is given"
+                )
 
             counts = np.ones(len(step.episodes), bool)
             if counted and evidence.seen is not None:
                 counts = evidence.seen
             for episode, view, is_evidence in zip(
-                step.episodes, evidence.observations, counts, strict=True
+                step.episodes,
+                evidence.observations,
+                counts,
+                strict=True,
             ):
                 if is_evidence and int(episode) in found:
                     found[int(episode)].append(view)
         return list(found.values())
 
-    def _move(self, state: EpisodeState, constrain: Constrain) -> tuple[EpisodeState, Index]:
+    def _move(
+        self,
+        state: EpisodeState,
+        constrain: Constrain,
+    ) -> tuple[EpisodeState, Index]:
         """What the policy is shown, and where it goes, -1 where no view is free."""
         state = constrain(replace(state, reachable=None, travel=self._travel(state)))
         chosen = np.full(len(state.current), -1)
@@ -513,7 +586,11 @@ class Episodes:
         if wrong.any():
             view = int(chosen[wrong][0])
             where = int(state.episodes[wrong][0])
-            why = "was visited before" if state.visited[wrong][0, view] else "cannot be reached"
+            why = (
+                "was visited before"
+                if state.visited[wrong][0, view]
+                else "cannot be reached"
+            )
             raise PolicyError(f"policy {name} chose view {view}, which {why}", where)
         return chosen
 
@@ -521,11 +598,17 @@ class Episodes:
         """What the policy answers: views of the sphere, whichever."""
         name = self._name
         with plugin_errors(
-            lambda said: PolicyError(f"policy {name} raised {said}", self._first_to_fail(state))
+            lambda said: PolicyError(
+                f"policy {name} raised {said}",
+                self._first_to_fail(state),
+            )
         ):
             chosen = np.asarray(self.policy.next_views(state, self.rng))
 
-        if chosen.shape != state.current.shape or not np.issubdtype(chosen.dtype, np.integer):
+        if chosen.shape != state.current.shape or not np.issubdtype(
+            chosen.dtype,
+            np.integer,
+        ):
             raise PolicyError(
                 f"policy {name} has to return {len(state.current)} integers, one for each episode"
             )
@@ -533,7 +616,8 @@ class Episodes:
         if (off := (chosen < 0) | (chosen >= len(self.sphere))).any():
             where = int(state.episodes[off][0])
             raise PolicyError(
-                f"policy {name} chose view {chosen[off][0]}, which is not on the sphere", where
+                f"policy {name} chose view {chosen[off][0]}, which is not on the sphere",
+                where,
             )
 
         return chosen
@@ -576,7 +660,8 @@ class Episodes:
         moved = views[:, 1:] >= 0
         legs = (views[:, :-1], views[:, 1:])
         travel, arc = (
-            (ways[legs] * moved).sum(1) for ways in (self.sphere.travel, self.sphere.arc)
+            (ways[legs] * moved).sum(1)
+            for ways in (self.sphere.travel, self.sphere.arc)
         )
         return Outcome(answer, confidence, n_views, confident, travel, arc, views)
 
@@ -592,7 +677,10 @@ def _without_unseen(evidence: Evidence) -> tuple[Evidence, Mask]:
 
     maps = {name: kept(values) for name, values in evidence.maps.items()}
     others = {name: getattr(evidence, name) for name in ("logits", "azimuth_bins")}
-    others = {name: values if values is None else kept(values) for name, values in others.items()}
+    others = {
+        name: values if values is None else kept(values)
+        for name, values in others.items()
+    }
     return replace(evidence, maps=maps, **others), seen
 
 
@@ -626,6 +714,7 @@ def run_episodes(
     episodes = Episodes(sphere, policy, starts, stopping, rng, calibration, visibility)
     while len(episodes.running):
         episodes.update(
-            observe(episodes.running, episodes.current[episodes.running]), constrain=constrain
+            observe(episodes.running, episodes.current[episodes.running]),
+            constrain=constrain,
         )
     return episodes

@@ -19,10 +19,24 @@ from nextview.errors import UsageError
 from nextview.files import new_file
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster, Triangles
-from nextview.geometry.viewsphere import Viewpoints, ViewSphere, great_circle, look_at_origin
+from nextview.geometry.viewsphere import (
+    Viewpoints,
+    ViewSphere,
+    great_circle,
+    look_at_origin,
+)
 from nextview.recognition.belief import Stopping
 from nextview.session.soft_light import SoftLight
-from nextview.session.style import ACCENT, BLUE, FAINT, FIGURE_STYLE, GREY, INK, PAPER, PlainFigure
+from nextview.session.style import (
+    ACCENT,
+    BLUE,
+    FAINT,
+    FIGURE_STYLE,
+    GREY,
+    INK,
+    PAPER,
+    PlainFigure,
+)
 from nextview.session.view import View
 from nextview.types import Float, Floats, Index, Mask
 
@@ -66,11 +80,14 @@ def save_figure(figure: Figure, path: Path) -> None:
         try:
             figure.savefig(part, dpi=120)
         except ValueError as error:
-            raise UsageError(f"{path}: the figure cannot be written ({error})") from None
+            raise UsageError(
+                f"{path}: the figure cannot be written ({error})"
+            ) from None
 
 
 @matplotlib.rc_context(
-    FIGURE_STYLE | {"axes.grid": False, "figure.facecolor": PAPER, "axes.facecolor": PAPER}
+    FIGURE_STYLE
+    | {"axes.grid": False, "figure.facecolor": PAPER, "axes.facecolor": PAPER}
 )
 def draw_episode(
     views: Sequence[View],
@@ -105,21 +122,38 @@ def draw_episode(
     light = SoftLight([view.observation for view in views])
     path = np.array([view.direction for view in views])
     seen_from = _best_side(path)
-    rows = [("", COLUMN_WIDTH), ("what it believes", 1.5), ("values of views", COLUMN_WIDTH)]
+    rows = [
+        ("", COLUMN_WIDTH),
+        ("what it believes", 1.5),
+        ("values of views", COLUMN_WIDTH),
+    ]
     rows = rows if valued else rows[:2]
     large = LARGE_PICTURE if valued else LARGE_PICTURE - 1
     width = COLUMN_GAP + len(views) * (COLUMN_WIDTH + COLUMN_GAP) + large + COLUMN_GAP
-    said, _, more = heading.rpartition(" (") if heading.endswith(")") else (heading, "", "")
+    said, _, more = (
+        heading.rpartition(" (") if heading.endswith(")") else (heading, "", "")
+    )
     said = fill(said, int(7.6 * width))
     more = fill(more[:-1], int(11 * width))
     top = 0.42 + 0.27 * said.count("\n") + 0.24 * (more.count("\n") + 1)
     height = top + sum(0.42 + high for _, high in rows) + 0.2
     figure = PlainFigure(figsize=(width, height))
     figure.text(
-        COLUMN_GAP / width, 1 - 0.2 / height, said, fontsize=16, weight="bold", color=BLUE, va="top"
+        COLUMN_GAP / width,
+        1 - 0.2 / height,
+        said,
+        fontsize=16,
+        weight="bold",
+        color=BLUE,
+        va="top",
     )
     figure.text(
-        COLUMN_GAP / width, 1 - (top - 0.08) / height, more, fontsize=10, color=GREY, va="bottom"
+        COLUMN_GAP / width,
+        1 - (top - 0.08) / height,
+        more,
+        fontsize=10,
+        color=GREY,
+        va="bottom",
     )
     shown = np.argsort(-np.max([view.belief for view in views], axis=0), kind="stable")[
         :CLASSES_SHOWN
@@ -133,24 +167,51 @@ def draw_episode(
     y = height - top
     for title, high in rows:
         y -= 0.42 + high
-        figure.text(COLUMN_GAP / width, (y + high + 0.1) / height, title, fontsize=10, color=GREY)
+        figure.text(
+            COLUMN_GAP / width,
+            (y + high + 0.1) / height,
+            title,
+            fontsize=10,
+            color=GREY,
+        )
         if title == rows[-1][0] and valued:
             _draw_scale(axes(COLUMN_GAP + 1.1, y + high + 0.08, 1.3, 0.15))
         for k, view in enumerate(views):
-            axis = axes(COLUMN_GAP + k * (COLUMN_WIDTH + COLUMN_GAP), y, COLUMN_WIDTH, high)
+            axis = axes(
+                COLUMN_GAP + k * (COLUMN_WIDTH + COLUMN_GAP),
+                y,
+                COLUMN_WIDTH,
+                high,
+            )
             if title == rows[0][0]:
                 _draw_image(axis, view, k + 1, light)
                 if caster is not None:
                     _draw_outline(axis, view, caster, displaced[k])
             elif title == rows[1][0]:
-                _draw_belief(axis, view, float(stopping.threshold_at(k + 1)), classes, shown)
+                _draw_belief(
+                    axis,
+                    view,
+                    float(stopping.threshold_at(k + 1)),
+                    classes,
+                    shown,
+                )
             else:
                 _draw_values(axis, views[: k + 1], sphere, seen_from)
     x = COLUMN_GAP + len(views) * (COLUMN_WIDTH + COLUMN_GAP)
     figure.text(
-        x / width, (height - top - 0.32) / height, "where it looked from", fontsize=10, color=GREY
+        x / width,
+        (height - top - 0.32) / height,
+        "where it looked from",
+        fontsize=10,
+        color=GREY,
     )
-    _draw_path(axes(x, y, large, height - top - 0.42 - y), path, sphere, light, seen_from)
+    _draw_path(
+        axes(x, y, large, height - top - 0.42 - y),
+        path,
+        sphere,
+        light,
+        seen_from,
+    )
     return figure
 
 
@@ -161,7 +222,9 @@ def _best_side(path: Float) -> float:
         pose = look_at_origin(np.radians(25), azimuth, FIGURE_DISTANCE)
         facing = path @ pose[:3, 3] / FIGURE_DISTANCE
         flat = path @ pose[:3, :2]
-        apart = [float(np.linalg.norm(a - b)) for a, b in itertools.combinations(flat, 2)]
+        apart = [
+            float(np.linalg.norm(a - b)) for a, b in itertools.combinations(flat, 2)
+        ]
         found.append((min([*apart, 0.6]) - ((facing - 0.8) ** 2).mean(), azimuth))
     return float(max(found)[1])
 
@@ -179,7 +242,10 @@ def _draw_image(axis: Axes, view: View, step: int, light: SoftLight) -> None:
     height, width = seen.depth.shape
     larger = seen.intrinsics * [[times], [times], [1]]
     pixels, _ = light.picture(
-        [light.surfaces[step - 1]], seen.pose, larger, (times * height, times * width)
+        [light.surfaces[step - 1]],
+        seen.pose,
+        larger,
+        (times * height, times * width),
     )
     if times == 1 and seen.image is not None:
         taken = seen.image[..., None] / 255 * (255, 250, 240)
@@ -203,13 +269,21 @@ def _draw_image(axis: Axes, view: View, step: int, light: SoftLight) -> None:
     axis.text(0.04, 0.03, "\n".join(said), va="bottom", color=ACCENT, **inside)
 
 
-def _draw_outline(axis: Axes, view: View, caster: RayCaster, displacement: Float) -> None:
+def _draw_outline(
+    axis: Axes,
+    view: View,
+    caster: RayCaster,
+    displacement: Float,
+) -> None:
     """The outline of a surface, displaced, as a view sees it, over the image of that view."""
     seen = view.observation
     height, width = axis.get_images()[0].get_size()
     shape = (int(height), int(width))
     times = shape[0] / seen.depth.shape[0]
-    rays = PinholeCamera.of(seen.intrinsics * [[times], [times], [1]], shape).rays.reshape(-1, 3)
+    rays = PinholeCamera.of(
+        seen.intrinsics * [[times], [times], [1]],
+        shape,
+    ).rays.reshape(-1, 3)
 
     along = rays @ seen.pose[:3, :3].T.astype(np.float32)
     # Seen from a camera that is displaced the other way, the surface itself is where it should be.
@@ -233,7 +307,11 @@ def without_specks(silhouette: Mask) -> Mask:
 
 
 def _draw_belief(
-    axis: Axes, view: View, threshold: float, classes: Sequence[str], shown: Index
+    axis: Axes,
+    view: View,
+    threshold: float,
+    classes: Sequence[str],
+    shown: Index,
 ) -> None:
     """Bars of the classes shown, with a mark where belief is enough."""
     best = int(view.belief.argmax())
@@ -243,10 +321,19 @@ def _draw_belief(
         share = float(view.belief[c])
         colour = BLUE if c == best else GREY
         axis.text(
-            0, row - 0.22, shorten(classes[c].replace("_", " "), 26, placeholder="…"), fontsize=10
+            0,
+            row - 0.22,
+            shorten(classes[c].replace("_", " "), 26, placeholder="…"),
+            fontsize=10,
         )
         axis.text(1, row - 0.22, f"{100 * share:.0f} %", fontsize=10, ha="right")
-        axis.plot([0.015, 0.985], [row, row], color=FAINT, linewidth=5, solid_capstyle="round")
+        axis.plot(
+            [0.015, 0.985],
+            [row, row],
+            color=FAINT,
+            linewidth=5,
+            solid_capstyle="round",
+        )
         if share >= 0.005:
             axis.plot(
                 [0.015, 0.015 + 0.97 * share],
@@ -259,11 +346,23 @@ def _draw_belief(
             axis.plot([at, at], [row - 0.14, row + 0.14], color=INK, linewidth=1.6)
     if np.isfinite(threshold):  # a rule of your own need not stop at a belief
         enough = f"enough: {100 * threshold:.0f} %"
-        axis.text(min(at + 0.02, 1), row + 0.72, enough, fontsize=8.5, color=GREY, ha="right")
+        axis.text(
+            min(at + 0.02, 1),
+            row + 0.72,
+            enough,
+            fontsize=8.5,
+            color=GREY,
+            ha="right",
+        )
     axis.set(xlim=(0, 1), ylim=(CLASSES_SHOWN - 0.2, -0.62))
 
 
-def _draw_values(axis: Axes, views: Sequence[View], sphere: Viewpoints, seen_from: float) -> None:
+def _draw_values(
+    axis: Axes,
+    views: Sequence[View],
+    sphere: Viewpoints,
+    seen_from: float,
+) -> None:
     """Draw the dome of candidate views from above, coloured by their values."""
     view = views[-1]
     turned = sphere.azimuth - seen_from - np.pi / 2
@@ -271,9 +370,13 @@ def _draw_values(axis: Axes, views: Sequence[View], sphere: Viewpoints, seen_fro
 
     values = np.full(len(sphere), np.nan) if view.values is None else view.values
     known = np.isfinite(values)
-    low, high = (values[known].min(), values[known].max()) if known.any() else (0.0, 1.0)
+    low, high = (
+        (values[known].min(), values[known].max()) if known.any() else (0.0, 1.0)
+    )
     colours = np.where(
-        known[:, None], VALUES((values - low) / (high - low or 1)), to_rgba("#ece9e3")
+        known[:, None],
+        VALUES((values - low) / (high - low or 1)),
+        to_rgba("#ece9e3"),
     )
 
     flat = np.stack([out * np.cos(turned), out * np.sin(turned)], 1)
@@ -292,13 +395,31 @@ def _draw_values(axis: Axes, views: Sequence[View], sphere: Viewpoints, seen_fro
 
     for step, past in enumerate(views, 1):
         axis.add_patch(
-            Circle(flat[past.index], 8, facecolor=BLUE if past is view else GREY, edgecolor=PAPER)
+            Circle(
+                flat[past.index],
+                8,
+                facecolor=BLUE if past is view else GREY,
+                edgecolor=PAPER,
+            )
         )
-        axis.text(flat[past.index, 0], flat[past.index, 1], str(step), fontsize=8, **NUMBER)
+        axis.text(
+            flat[past.index, 0],
+            flat[past.index, 1],
+            str(step),
+            fontsize=8,
+            **NUMBER,
+        )
 
     axis.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
     if view.next_view is None:
-        axis.text(0, 1.05, "the last view", fontsize=10, color=GREY, transform=axis.transAxes)
+        axis.text(
+            0,
+            1.05,
+            "the last view",
+            fontsize=10,
+            color=GREY,
+            transform=axis.transAxes,
+        )
         return
 
     here = flat[view.index]
@@ -322,7 +443,12 @@ def _draw_values(axis: Axes, views: Sequence[View], sphere: Viewpoints, seen_fro
         )
 
 
-def _draw_cells(axis: Axes, sphere: ViewSphere, angles: Floats, colours: Floats) -> float:
+def _draw_cells(
+    axis: Axes,
+    sphere: ViewSphere,
+    angles: Floats,
+    colours: Floats,
+) -> float:
     """Draw a coloured cell around each view of a grid.
 
     It returns how far out the cells reach, degrees from the zenith.
@@ -352,14 +478,39 @@ def _draw_cells(axis: Axes, sphere: ViewSphere, angles: Floats, colours: Floats)
 
 def _draw_scale(axis: Axes) -> None:
     """What the colours of values mean: from low to high."""
-    axis.imshow(VALUES(np.linspace(0, 1, 64))[None], aspect="auto", extent=(0.25, 0.72, 0, 1))
+    axis.imshow(
+        VALUES(np.linspace(0, 1, 64))[None],
+        aspect="auto",
+        extent=(0.25, 0.72, 0, 1),
+    )
     axis.set(xlim=(0, 1), ylim=(0, 1))
-    axis.text(0.22, 0.5, "low", fontsize=9, color=GREY, ha="right", va="center_baseline")
-    axis.text(0.75, 0.5, "high", fontsize=9, color=GREY, ha="left", va="center_baseline")
+    axis.text(
+        0.22,
+        0.5,
+        "low",
+        fontsize=9,
+        color=GREY,
+        ha="right",
+        va="center_baseline",
+    )
+
+    axis.text(
+        0.75,
+        0.5,
+        "high",
+        fontsize=9,
+        color=GREY,
+        ha="left",
+        va="center_baseline",
+    )
 
 
 def _draw_path(
-    axis: Axes, path: Float, sphere: Viewpoints, light: SoftLight, seen_from: float
+    axis: Axes,
+    path: Float,
+    sphere: Viewpoints,
+    light: SoftLight,
+    seen_from: float,
 ) -> None:
     """Draw the visible part of the object, the candidate views, and the path."""
     figure = axis.figure
@@ -370,7 +521,12 @@ def _draw_path(
     pose = look_at_origin(np.radians(25), seen_from, FIGURE_DISTANCE)
     focal = 0.5 * FIGURE_DISTANCE / 1.5 * min(shape)
     camera = PinholeCamera(
-        focal, focal, shape[1] / 2, 0.56 * shape[0], width=shape[1], height=shape[0]
+        focal,
+        focal,
+        shape[1] / 2,
+        0.56 * shape[0],
+        width=shape[1],
+        height=shape[0],
     )
     pixels, far = light.picture(light.surfaces, pose, camera.matrix, shape)
     axis.imshow(pixels, interpolation="antialiased", aspect="auto")
@@ -384,7 +540,9 @@ def _draw_path(
         flat = camera.project(inside)
         row, column = np.clip(flat[:, ::-1].astype(int), 0, np.array(shape) - 1).T
         return flat, np.where(
-            far[row, column] < inside[:, 2], 0.15, np.where(points @ pose[:3, 3] < 0, 0.45, 1.0)
+            far[row, column] < inside[:, 2],
+            0.15,
+            np.where(points @ pose[:3, 3] < 0, 0.45, 1.0),
         )
 
     def line(points: Float, colour: str, width: float) -> None:
@@ -392,24 +550,56 @@ def _draw_path(
         for share in np.unique(plain):
             part = (plain == share) | np.append(False, plain[:-1] == share)
             shown = np.where(part[:, None], flat, np.nan)
-            axis.plot(*shown.T, color=colour, linewidth=width, alpha=share, solid_capstyle="butt")
+            axis.plot(
+                *shown.T,
+                color=colour,
+                linewidth=width,
+                alpha=share,
+                solid_capstyle="butt",
+            )
 
     around = np.linspace(0, 2 * np.pi, 181)
-    for up in np.radians(sphere.elevations if isinstance(sphere, ViewSphere) else (0, 30, 60)):
-        ring = [np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), 0 * around + np.sin(up)]
+    for up in np.radians(
+        sphere.elevations if isinstance(sphere, ViewSphere) else (0, 30, 60)
+    ):
+        ring = [
+            np.cos(up) * np.cos(around),
+            np.cos(up) * np.sin(around),
+            0 * around + np.sin(up),
+        ]
         line(np.stack(ring, 1), RING, 0.9)
     for turn in np.arange(8) * np.pi / 4:  # meridians
         line(
-            great_circle(np.array([np.cos(turn), np.sin(turn), 0]), np.array([0.0, 0, 1]), 61),
+            great_circle(
+                np.array([np.cos(turn), np.sin(turn), 0]),
+                np.array([0.0, 0, 1]),
+                61,
+            ),
             RING,
             0.5,
         )
     flat, plain = place(sphere.directions)
     rims = [to_rgba(RIM, share) for share in plain]
-    axis.scatter(flat[:, 0], flat[:, 1], s=22, color=PAPER, edgecolor=rims, linewidth=1.2, zorder=3)
+    axis.scatter(
+        flat[:, 0],
+        flat[:, 1],
+        s=22,
+        color=PAPER,
+        edgecolor=rims,
+        linewidth=1.2,
+        zorder=3,
+    )
     for a, b in itertools.pairwise(path):
         line(great_circle(a, b, 61), BLUE, 2.6)
     for step, at in enumerate(place(path)[0], 1):
-        axis.scatter([at[0]], [at[1]], s=230, color=BLUE, edgecolor=PAPER, linewidth=1.5, zorder=4)
+        axis.scatter(
+            [at[0]],
+            [at[1]],
+            s=230,
+            color=BLUE,
+            edgecolor=PAPER,
+            linewidth=1.5,
+            zorder=4,
+        )
         axis.text(at[0], at[1], str(step), fontsize=10, zorder=5, **NUMBER)
     axis.set(xlim=(-0.5, shape[1] - 0.5), ylim=(shape[0] - 0.5, -0.5))

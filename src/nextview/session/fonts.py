@@ -11,7 +11,8 @@ from matplotlib.text import Text
 log = logging.getLogger(__name__)
 NO_SCRIPT = ("Last Resort", "STIX", "cm")  # fonts of boxes, and of formulas
 INSTALL = (
-    "fonts-noto on Debian and Ubuntu, fonts-noto-cjk for Chinese, Japanese and Korean, has them"
+    "fonts-noto on Debian and Ubuntu, fonts-noto-cjk for "
+    "Chinese, Japanese and Korean, has them"
 )
 
 
@@ -32,7 +33,9 @@ def fit_fonts(texts: Iterable[Text]) -> None:
         lacking |= without
     if lacking:
         log.warning(
-            "no font of this machine has %s, drawn as codes: %s", "".join(sorted(lacking)), INSTALL
+            "no font of this machine has %s, drawn as codes: %s",
+            "".join(sorted(lacking)),
+            INSTALL,
         )
 
 
@@ -57,7 +60,9 @@ def _fonts_for(missing: frozenset[str]) -> tuple[tuple[str, ...], frozenset[str]
     """Families that have these characters, as few as possible, and the characters that none has."""
     families: list[str] = []
     without = set(missing)
-    fonts = [font for font in fontManager.ttflist if not font.name.startswith(NO_SCRIPT)]
+    fonts = [
+        font for font in fontManager.ttflist if not font.name.startswith(NO_SCRIPT)
+    ]
     fonts.sort(key=_plainness)
     while without:
         # the plainest of equal ones

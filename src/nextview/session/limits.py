@@ -60,10 +60,19 @@ class Limits:
 
     def __post_init__(self) -> None:
         if self.min_height is not None:
-            number(self.min_height, "the least height of a camera, metres,", most=MOST_METRES)
+            number(
+                self.min_height,
+                "the least height of a camera, metres,",
+                most=MOST_METRES,
+            )
         if self.max_height is not None and self.max_height != np.inf:
             what = "the greatest height of a camera, metres, or infinity for none,"
-            number(self.max_height, what, most=MOST_METRES, above=self.min_height or 0.0)
+            number(
+                self.max_height,
+                what,
+                most=MOST_METRES,
+                above=self.min_height or 0.0,
+            )
         if self.clearance is not None:
             number(self.clearance, "the clearance of a camera, metres,", 0, MOST_METRES)
 
@@ -73,7 +82,10 @@ class Limits:
         return cls(min_height=-1e6, max_height=np.inf, clearance=0.0)
 
     def reasons(
-        self, poses: Float, object: "ObservedObject", surroundings: Sequence[Surroundings]
+        self,
+        poses: Float,
+        object: "ObservedObject",
+        surroundings: Sequence[Surroundings],
     ) -> NDArray[np.str_]:
         """Why each candidate is left out.
 
@@ -91,25 +103,36 @@ class Limits:
         for reason, holds in self._occupied(places, object, surroundings):
             found[holds] = reason
 
-        planes = [sighting.plane for sighting in object.sightings if sighting.plane is not None]
+        planes = [
+            sighting.plane
+            for sighting in object.sightings
+            if sighting.plane is not None
+        ]
         if not planes:
             return found
 
         height = np.median([plane.height(places) for plane in planes], axis=0)
         away = np.linalg.norm(places - object.object_frame.centre, axis=1)
         lowest = (
-            np.maximum(LOWEST_VIEW, GRAZING * away) if self.min_height is None else self.min_height
+            np.maximum(LOWEST_VIEW, GRAZING * away)
+            if self.min_height is None
+            else self.min_height
         )
         highest = self.max_height
         if highest is None:
-            stood = [sighting.frame.camera_to_world[:3, 3] for sighting in object.sightings]
+            stood = [
+                sighting.frame.camera_to_world[:3, 3] for sighting in object.sightings
+            ]
             highest = max(HIGHEST, float(np.max(planes[-1].height(np.array(stood)))))
         found[height < lowest] = TOO_LOW
         found[height > highest] = TOO_HIGH
         return found
 
     def _occupied(
-        self, places: Float, object: "ObservedObject", surroundings: Sequence[Surroundings]
+        self,
+        places: Float,
+        object: "ObservedObject",
+        surroundings: Sequence[Surroundings],
     ) -> list[tuple[str, Mask]]:
         """Return reasons by what the frames show, with their places; the last one counts most."""
         clearance = self.clearance
@@ -132,7 +155,11 @@ class Limits:
             looked_through, not_seen = shown.look_at(places, around, clearance / 2)
             free = free | looked_through
             hidden = hidden | not_seen
-        return [(BEHIND_SOMETHING, hidden & ~free), (BEHIND_WALL, walls), (TOO_NEAR, near)]
+        return [
+            (BEHIND_SOMETHING, hidden & ~free),
+            (BEHIND_WALL, walls),
+            (TOO_NEAR, near),
+        ]
 
 
 def in_words(reasons: Sequence[str]) -> str:

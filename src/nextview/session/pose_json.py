@@ -37,7 +37,9 @@ def pose_as_json(result: Recognition) -> dict[str, Any]:
         "pose_of": result.pose_of,
         "pose_frame": result.pose_frame,
         "pose_uncertainty": (
-            None if off is None else {"degrees": off.degrees, "millimetres": off.millimetres}
+            None
+            if off is None
+            else {"degrees": off.degrees, "millimetres": off.millimetres}
         ),
         "pose_candidates": candidates,
         "symmetry": axes,

@@ -52,7 +52,9 @@ def camera_poses(given: ArrayLike) -> Float:
     try:
         poses = np.asarray(given, np.float64)
     except (TypeError, ValueError):
-        raise UsageError("poses to rank are camera-to-world matrices, (V, 4, 4)") from None
+        raise UsageError(
+            "poses to rank are camera-to-world matrices, (V, 4, 4)"
+        ) from None
 
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
         raise UsageError(
@@ -97,7 +99,9 @@ def rank_views(
         UsageError: there is no such goal.
     """
     if goal not in get_args(Goal):
-        raise UsageError(f"the goal is {' or '.join(get_args(Goal))}, not {one_line(repr(goal))}")
+        raise UsageError(
+            f"the goal is {' or '.join(get_args(Goal))}, not {one_line(repr(goal))}"
+        )
     if not len(inside):
         return ()
 

@@ -58,7 +58,11 @@ class Reach:
         return there
 
     def constrain(
-        self, state: EpisodeState, sphere: Viewpoints, here: Float, poses: Poses
+        self,
+        state: EpisodeState,
+        sphere: Viewpoints,
+        here: Float,
+        poses: Poses,
     ) -> EpisodeState:
         """Add reachability and travel cost to the state of one episode.
 
@@ -83,7 +87,9 @@ class Reach:
             views = views[cost < np.inf]
             cost = cost[cost < np.inf]
             mean = cost.mean() if len(cost) else 0.0
-            unit = travel_from(sphere, state)[0, views].mean() / mean if mean > 0 else 0.0
+            unit = (
+                travel_from(sphere, state)[0, views].mean() / mean if mean > 0 else 0.0
+            )
             cells = np.full(len(sphere), np.nan)
             cells[views] = unit * cost
             state = replace(state, travel=cells[None])
@@ -102,7 +108,9 @@ def _cost(answer: Any) -> float:
     except (TypeError, ValueError):
         cost = np.nan
     if not cost >= 0:
-        raise UsageError(f"a travel cost is a number from 0 on, not {one_line(repr(answer))}")
+        raise UsageError(
+            f"a travel cost is a number from 0 on, not {one_line(repr(answer))}"
+        )
     return cost
 
 
@@ -118,7 +126,10 @@ def _truth(answer: Any) -> bool:
     return bool(answer)
 
 
-def as_reachable(given: ArrayLike | Callable[[Float], bool] | None, views: int) -> Reachable | None:
+def as_reachable(
+    given: ArrayLike | Callable[[Float], bool] | None,
+    views: int,
+) -> Reachable | None:
     """Check what a user passes as reachable.
 
     Args:
@@ -143,7 +154,8 @@ def as_reachable(given: ArrayLike | Callable[[Float], bool] | None, views: int) 
 
 
 def as_travel_cost(
-    given: ArrayLike | Callable[[Float, Float], float] | None, views: int
+    given: ArrayLike | Callable[[Float, Float], float] | None,
+    views: int,
 ) -> TravelCost | None:
     """Check what a user passes as travel cost.
 
@@ -163,7 +175,11 @@ def as_travel_cost(
     # for a way that is masked out no cost is known
     if np.ma.isMaskedArray(given) and costs.dtype.kind in "fiu":
         costs = np.ma.filled(np.ma.asarray(given, np.float64), np.inf)
-    if costs.dtype.kind not in "fiu" or costs.shape != (views, views) or not (costs >= 0).all():
+    if (
+        costs.dtype.kind not in "fiu"
+        or costs.shape != (views, views)
+        or not (costs >= 0).all()
+    ):
         raise UsageError(
             f"a travel cost is a matrix, ({views}, {views}) of numbers from 0 on, or a callable on"
             " poses"

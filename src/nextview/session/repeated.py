@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObjectState
 
 ADVICE = (
-    "this picture was handed in before, to the last bit, and counts once: does the camera hang?"
+    "this picture was handed in before, to the last bit, "
+    "and counts once: does the camera hang?"
 )
 REPEATED = ViewWarning("repeated", ADVICE)
 # difference of the third rows of two poses that differ by a turn about the vertical alone
@@ -34,11 +35,16 @@ def is_repeated(seen: Observation, earlier: Sequence[Observation]) -> bool:
         True if it does.
     """
     return any(
-        np.array_equal(one.depth, seen.depth) and _is_one_picture(one, seen) for one in earlier
+        np.array_equal(one.depth, seen.depth) and _is_one_picture(one, seen)
+        for one in earlier
     )
 
 
-def after_repeated(state: "ObjectState", frame: Frame, first: int) -> "ObjectState | None":
+def after_repeated(
+    state: "ObjectState",
+    frame: Frame,
+    first: int,
+) -> "ObjectState | None":
     """Return the state of an object after a frame that repeats an earlier one.
 
     Its true camera pose is not known, so the earlier sighting stands for it.
@@ -51,16 +57,27 @@ def after_repeated(state: "ObjectState", frame: Frame, first: int) -> "ObjectSta
     Returns:
         The state; None if the frame is no repetition.
     """
-    for sighting, seen in list(zip(state.sightings, state.observations, strict=True))[first:]:
+    for sighting, seen in list(zip(state.sightings, state.observations, strict=True))[
+        first:
+    ]:
         if frame.pose is None or not np.array_equal(sighting.frame.depth, frame.depth):
             continue
         assert state.frame is not None
-        was, now = (state.frame.pose_in_object(f.camera_to_world) for f in (sighting.told, frame))
-        if _is_one_picture(seen, replace(seen, pose=now @ np.linalg.inv(was) @ seen.pose)):
+        was, now = (
+            state.frame.pose_in_object(f.camera_to_world)
+            for f in (sighting.told, frame)
+        )
+        if _is_one_picture(
+            seen,
+            replace(seen, pose=now @ np.linalg.inv(was) @ seen.pose),
+        ):
             sightings = (*state.sightings, sighting)
             observations = (*state.observations, seen)
             return replace(
-                state, sightings=sightings, observations=observations, warnings=(REPEATED,)
+                state,
+                sightings=sightings,
+                observations=observations,
+                warnings=(REPEATED,),
             )
     return None
 
@@ -73,7 +90,10 @@ def _is_one_picture(first: Observation, second: Observation) -> bool:
     """
     if not first.seen:
         return False
-    near = angle_between(direction_of(first.pose), direction_of(second.pose)) <= VISITED_ANGLE
+    near = (
+        angle_between(direction_of(first.pose), direction_of(second.pose))
+        <= VISITED_ANGLE
+    )
     return bool(
         near
         or not np.allclose(first.pose[2], second.pose[2], atol=SAME_THIRD_ROW)

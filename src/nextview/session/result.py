@@ -82,7 +82,9 @@ class Recognition:
     @property
     def warnings(self) -> tuple[ViewWarning, ...]:
         """Likely faults of the views, each kind once, as the last view reports it."""
-        found = {warning.name: warning for view in self.views for warning in view.warnings}
+        found = {
+            warning.name: warning for view in self.views for warning in view.warnings
+        }
         return tuple(found.values())
 
     @property
@@ -200,7 +202,10 @@ class Recognition:
         each says of which thing it is. None are known where ``pose`` is None because the geometry
         is not known.
         """
-        return tuple(candidate.moved(self.poses_in.from_object) for candidate in self._joint_poses)
+        return tuple(
+            candidate.moved(self.poses_in.from_object)
+            for candidate in self._joint_poses
+        )
 
     @property
     def pose_uncertainty(self) -> PoseUncertainty | None:
@@ -214,7 +219,10 @@ class Recognition:
         if not found or joint is None:
             return None
         camera = joint.camera_error if self.pose_frame == "world" else 0.0
-        return uncertainty_of([one for one in found if one.thing == found[0].thing], camera)
+        return uncertainty_of(
+            [one for one in found if one.thing == found[0].thing],
+            camera,
+        )
 
     @property
     def symmetry(self) -> Any:
@@ -298,7 +306,9 @@ class Recognition:
         if self.answer is None:
             return []
         label = self.classes.index(self.answer)
-        return [candidate for candidate in self.pose_candidates if candidate.label == label]
+        return [
+            candidate for candidate in self.pose_candidates if candidate.label == label
+        ]
 
     @property
     def travel(self) -> float:
@@ -307,7 +317,9 @@ class Recognition:
 
     def __repr__(self) -> str:
         """One line: ``chair (belief 0.998, 2 views, 1.41 cells of travel, confident)``."""
-        views = f"{number_of(len(self.views), 'view')}, {self.travel:.2f} cells of travel"
+        views = (
+            f"{number_of(len(self.views), 'view')}, {self.travel:.2f} cells of travel"
+        )
 
         if not self.seen:
             return f"nothing is seen ({views})"

@@ -12,7 +12,10 @@ from nextview.session.view import View
 
 
 def episode_as_json(
-    result: Recognition, name: str, frames: Sequence[str] = (), indent: int | None = 1
+    result: Recognition,
+    name: str,
+    frames: Sequence[str] = (),
+    indent: int | None = 1,
 ) -> str:
     """Return all that the table shows, with complete beliefs and maps, as a JSON object.
 
@@ -33,7 +36,15 @@ def episode_as_json(
             one["frame"] = frames[step - 1]
         views.append(one)
 
-    parts = ("answer", "confidence", "beliefs", "most_like", "unknown", "novelty", "radius")
+    parts = (
+        "answer",
+        "confidence",
+        "beliefs",
+        "most_like",
+        "unknown",
+        "novelty",
+        "radius",
+    )
     whole = {"name": name} | {part: getattr(result, part) for part in parts}
     whole |= pose_as_json(result)
     whole |= {
@@ -50,7 +61,10 @@ def _view_as_json(result: Recognition, view: View) -> dict[str, Any]:
     azimuth = None
     if view.azimuth_bins is not None and view.observation.seen:
         bins = view.azimuth_bins[view.belief.argmax()]
-        azimuth = {"degrees": 360 * int(bins.argmax()) / len(bins), "belief": bins.max()}
+        azimuth = {
+            "degrees": 360 * int(bins.argmax()) / len(bins),
+            "belief": bins.max(),
+        }
 
     elevation, around = view.angles
     return {

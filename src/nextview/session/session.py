@@ -14,9 +14,20 @@ from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import ThreadpoolController
 
 from nextview.checks import number, one_line, plugin_errors, whole
-from nextview.errors import NoViewLeftError, ObservationError, PolicyError, SessionError, UsageError
+from nextview.errors import (
+    NoViewLeftError,
+    ObservationError,
+    PolicyError,
+    SessionError,
+    UsageError,
+)
 from nextview.geometry.observation import Camera, Observation
-from nextview.geometry.viewsphere import Viewpoints, angle_between, azimuth_of, direction_of
+from nextview.geometry.viewsphere import (
+    Viewpoints,
+    angle_between,
+    azimuth_of,
+    direction_of,
+)
 from nextview.policies.base import EpisodeState, Policy, SeeksPose, ValuesViews
 from nextview.policies.off_grid import anywhere
 from nextview.recognition.belief import MUCH, Stopping, log_evidence_of
@@ -31,7 +42,13 @@ from nextview.session.episode import Episodes, Step
 from nextview.session.limits import Limits, in_words
 from nextview.session.pose_frame import PoseFrame
 from nextview.session.ranked import RankedView, camera_poses, rank_views
-from nextview.session.reach import Reach, Reachable, TravelCost, as_reachable, as_travel_cost
+from nextview.session.reach import (
+    Reach,
+    Reachable,
+    TravelCost,
+    as_reachable,
+    as_travel_cost,
+)
 from nextview.session.repeated import REPEATED, after_repeated, is_repeated
 from nextview.session.result import SUSPICIOUS, Recognition
 from nextview.session.surroundings import Surroundings
@@ -42,7 +59,9 @@ from nextview.types import Float, Mask
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject
 
-THING_SIZE = 1.3  # times that the size of a taught thing is off, half hidden say, which none has
+THING_SIZE = (
+    1.3  # times that the size of a taught thing is off, half hidden say, which none has
+)
 FARTHEST_TARGET = 60.0
 """Object radii: a camera looks at a thing of 0.01 m radius from 0.6 m; in millimetres it would
 be a thousand times.
@@ -147,13 +166,17 @@ class Session:
             wanted = "what to find in frames is a nextview.sensing.ObservedObject"
             raise UsageError(f"{wanted}, not {one_line(repr(object))}")
         if number(unknown, "the share of known objects called unknown", 0) >= 1:
-            raise UsageError(f"the share of known objects called unknown is below 1, not {unknown}")
+            raise UsageError(
+                f"the share of known objects called unknown is below 1, not {unknown}"
+            )
 
         self.models = models
         self.policy = policy
         self.sphere = sphere
         self._distance = _checked_distance(distance)
-        self.object = _new_object() if object is None and distance is not None else object
+        self.object = (
+            _new_object() if object is None and distance is not None else object
+        )
         self.stopping = stopping or Stopping.of(models.recogniser.calibration)
         self.unknown = unknown
         self.views: list[View] = []
@@ -188,7 +211,9 @@ class Session:
             self.stopping,
             self._rng,
             recogniser.calibration,
-            together=recogniser.together if isinstance(recogniser, JudgesTogether) else None,
+            together=recogniser.together
+            if isinstance(recogniser, JudgesTogether)
+            else None,
             outlook=recogniser.outlook if isinstance(recogniser, LooksAhead) else None,
         )
 
@@ -235,7 +260,9 @@ class Session:
         return None if self.done else self.poses[self.view]
 
     def ranked(
-        self, poses: ArrayLike | None = None, goal: Goal = "thing"
+        self,
+        poses: ArrayLike | None = None,
+        goal: Goal = "thing",
     ) -> tuple[RankedView, ...]:
         """Candidate views, those first that are expected to tell most of which taught thing it is.
 
@@ -261,7 +288,9 @@ class Session:
 
     def _ranked(self, poses: ArrayLike | None, goal: Goal) -> tuple[RankedView, ...]:
         if not self.views:
-            raise SessionError("what views would tell is not known before the first one")
+            raise SessionError(
+                "what views would tell is not known before the first one"
+            )
         outlook = self.outlook
         if outlook is None:
             raise SessionError(
@@ -275,7 +304,11 @@ class Session:
         else:
             given = camera_poses(poses)
             left = np.arange(len(given))
-        inside = given if self.object is None else self.object.object_frame.pose_in_object(given)
+        inside = (
+            given
+            if self.object is None
+            else self.object.object_frame.pose_in_object(given)
+        )
         radius = self.views[-1].observation.radius
         assert radius is not None  # else nothing was foreseen
         return rank_views(outlook, inside, radius, given, left, goal)
@@ -289,7 +322,9 @@ class Session:
         with self._lock:
             if not self.views:
                 return None
-            found = self._episodes.outlooks(self._episodes.steps[-1], np.ones(1, bool))[0]
+            found = self._episodes.outlooks(self._episodes.steps[-1], np.ones(1, bool))[
+                0
+            ]
             return found if isinstance(found, Outlook) else None
 
     def _left(self) -> Mask:
@@ -379,7 +414,9 @@ class Session:
     @reachable.setter
     def reachable(self, given: ArrayLike | Callable[[Float], bool] | None) -> None:
         with self._lock:
-            self._set_reach(replace(self._reach, reachable=as_reachable(given, len(self.sphere))))
+            self._set_reach(
+                replace(self._reach, reachable=as_reachable(given, len(self.sphere)))
+            )
 
     @property
     def travel_cost(self) -> TravelCost | None:
@@ -392,9 +429,15 @@ class Session:
         return self._reach.cost
 
     @travel_cost.setter
-    def travel_cost(self, given: ArrayLike | Callable[[Float, Float], float] | None) -> None:
+    def travel_cost(
+        self,
+        given: ArrayLike | Callable[[Float, Float], float] | None,
+    ) -> None:
         with self._lock:
-            self._reach = replace(self._reach, cost=as_travel_cost(given, len(self.sphere)))
+            self._reach = replace(
+                self._reach,
+                cost=as_travel_cost(given, len(self.sphere)),
+            )
 
     @property
     def limits(self) -> Limits:
@@ -436,10 +479,15 @@ class Session:
             return np.full(len(self.sphere), "", "<U1")
         known = {id(shown.frame): shown for shown in self._surroundings}
         self._surroundings = [
-            known.get(id(sighting.frame)) or Surroundings.of(sighting, object.object_frame)
+            known.get(id(sighting.frame))
+            or Surroundings.of(sighting, object.object_frame)
             for sighting in object.sightings
         ]
-        return self._limits.reasons(self._poses_around(object), object, self._surroundings)
+        return self._limits.reasons(
+            self._poses_around(object),
+            object,
+            self._surroundings,
+        )
 
     def failed(self, view: int | None = None) -> None:
         """Report that the camera could not reach a view, by default the requested one.
@@ -451,14 +499,25 @@ class Session:
         with self._lock:
             if self.done:
                 raise SessionError("this session has ended; begin another one")
-            known = self.object is None or self.object.sightings or self.object.known is not None
+            known = (
+                self.object is None
+                or self.object.sightings
+                or self.object.known is not None
+            )
             if view is None and not known:
                 what = "no view was asked for yet, so none has failed"
-                raise SessionError(f"{what}: the first frame comes from wherever the camera stands")
-            view = self.view if view is None else whole(view, "a view", 0, len(self.sphere) - 1)
+                raise SessionError(
+                    f"{what}: the first frame comes from wherever the camera stands"
+                )
+            view = (
+                self.view
+                if view is None
+                else whole(view, "a view", 0, len(self.sphere) - 1)
+            )
             self._set_reach(
                 replace(
-                    self._reach, failed=self._reach.failed | (np.arange(len(self.sphere)) == view)
+                    self._reach,
+                    failed=self._reach.failed | (np.arange(len(self.sphere)) == view),
                 )
             )
 
@@ -470,14 +529,20 @@ class Session:
             step = self._episodes.next_choice(
                 lambda state: self._constrained(state, reach, self.object)
             )
-            view = replace(self.views[-1], next_view=_next_of(step), values=self._values(step))
+            view = replace(
+                self.views[-1],
+                next_view=_next_of(step),
+                values=self._values(step),
+            )
             self._episodes.keep_choice(step)
             self._reach = reach
             self.views[-1] = view
             for observer in self.observers:
                 observer(self)
         else:  # with frames it begins where the camera is
-            episodes = self._begin_nearest(reach) if self.object is None else self._episodes
+            episodes = (
+                self._begin_nearest(reach) if self.object is None else self._episodes
+            )
             self._reach = reach
             self._episodes = episodes
 
@@ -497,7 +562,9 @@ class Session:
         )
         if not there.any():
             raise SessionError("none of the candidate views can be reached")
-        return self._begin(int(np.where(there, self.sphere.arc[self.view], np.inf).argmin()))
+        return self._begin(
+            int(np.where(there, self.sphere.arc[self.view], np.inf).argmin())
+        )
 
     def _constrained(
         self,
@@ -518,7 +585,9 @@ class Session:
             )
         barred = self._reasons(object) != ""
         reach = replace(reach, failed=reach.failed | barred)
-        return reach.constrain(state, self.sphere, here, lambda: self._poses_around(object))
+        return reach.constrain(
+            state, self.sphere, here, lambda: self._poses_around(object)
+        )
 
     # What is seen
 
@@ -571,7 +640,9 @@ class Session:
 
     def _add_frame(self, frame: Frame) -> View:
         if self.object is None and self.views:
-            raise SessionError("this session has taken observations; begin another one for frames")
+            raise SessionError(
+                "this session has taken observations; begin another one for frames"
+            )
         object = self.object or _new_object()
         if len(object.sightings) != self._before + len(self.views):
             raise SessionError(
@@ -589,7 +660,10 @@ class Session:
             self._refuse_disagreement(object)
             self._check_distance(object)
             return self._take(
-                object.observations[self._before :], object.warnings, frame.camera_to_world, object
+                object.observations[self._before :],
+                object.warnings,
+                frame.camera_to_world,
+                object,
             )
         except BaseException:
             object.state = before
@@ -612,7 +686,10 @@ class Session:
             found = [ViewScore(o, recogniser.novelty_scores) for o in seen if o.seen]
             return float(np.mean(values_of(found, whole=True))) if found else np.inf
 
-        if score.of_views([novelty(object.observations[-1:])]) < SUSPICIOUS * self.unknown:
+        if (
+            score.of_views([novelty(object.observations[-1:])])
+            < SUSPICIOUS * self.unknown
+        ):
             object.reconsider(novelty)
 
     def _refuse_disagreement(self, object: ObservedObject) -> None:
@@ -622,11 +699,22 @@ class Session:
         smaller object, the frames do not fit together.
         """
         together = object.object_frame.radius
-        if self.distance is None or together < self.distance or object.known is not None:
+        if (
+            self.distance is None
+            or together < self.distance
+            or object.known is not None
+        ):
             return
+
         alone = max(_half_diagonal(sighting.hull) for sighting in object.sightings)
-        if len(object.sightings) == 1 or alone >= self.distance or together < MUCH_LARGER * alone:
+
+        if (
+            len(object.sightings) == 1
+            or alone >= self.distance
+            or together < MUCH_LARGER * alone
+        ):
             return
+
         raise ObservationError(
             f"the frames do not fit together: the object has a radius of {together:.2g} m in all of"
             f" them, and of {alone:.2g} m at most in a single one: are the poses wrong (inverse, or"
@@ -664,12 +752,17 @@ class Session:
         """Take in the last of some observations, and whichever of the others has changed."""
         last = len(observations) - 1
         earlier = observations[:last]
-        changed = [k for k, seen in enumerate(earlier) if seen is not self.views[k].observation]
+        changed = [
+            k for k, seen in enumerate(earlier) if seen is not self.views[k].observation
+        ]
         changed.append(last)
 
         found = self.models.evidence([observations[k] for k in changed])
         once = np.array(
-            [REPEATED not in (warnings if k == last else self.views[k].warnings) for k in changed]
+            [
+                REPEATED not in (warnings if k == last else self.views[k].warnings)
+                for k in changed
+            ]
         )
         found = replace(found, seen=once if found.seen is None else found.seen & once)
         evidence = {k: found.select([row]) for row, k in enumerate(changed)}
@@ -680,10 +773,16 @@ class Session:
             episodes = self._begin(self.view)
             for k, step in enumerate(self._episodes.steps):
                 # What all views said together then is not asked again: it takes time.
-                episodes.take(evidence.get(k, step.evidence), directions[k][None], step.joint)
+                episodes.take(
+                    evidence.get(k, step.evidence),
+                    directions[k][None],
+                    step.joint,
+                )
 
         reach = self._reach
-        doubtful = any(warning.holds for warning in warnings) or self._contradicted(last + 1)
+        doubtful = any(warning.holds for warning in warnings) or self._contradicted(
+            last + 1
+        )
         taken = episodes.next_step(
             evidence[last],
             directions[last][None],
@@ -723,21 +822,34 @@ class Session:
         return self.sphere.directions[view] if there else towards
 
     def _view(
-        self, step: Step, observation: Observation, direction: Float, travel: tuple[float, float]
+        self,
+        step: Step,
+        observation: Observation,
+        direction: Float,
+        travel: tuple[float, float],
     ) -> View:
         """What a step says of its view, but for what was chosen after it."""
         calibration = self._episodes.calibration
         nearest, there = self.sphere.nearest(direction)
-        azimuth = self.sphere.azimuth[[nearest]] if there else azimuth_of(direction[None])
+        azimuth = (
+            self.sphere.azimuth[[nearest]] if there else azimuth_of(direction[None])
+        )
         classes = len(self.models.classes)
         evidence = step.evidence
-        bins = calibration.azimuth_bins(step.total, np.maximum(step.seen, 1), classes, azimuth)
+        bins = calibration.azimuth_bins(
+            step.total,
+            np.maximum(step.seen, 1),
+            classes,
+            azimuth,
+        )
 
         return View(
             int(step.views[0]),
             observation,
             alone=calibration.belief(
-                log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth), 1, classes
+                log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuth),
+                1,
+                classes,
             )[0],
             belief=step.belief[0],
             maps={name: values[0] for name, values in step.evidence.maps.items()},
@@ -756,12 +868,15 @@ class Session:
         evidence = step.evidence
         if not observation.seen or (evidence.seen is not None and not evidence.seen[0]):
             return None
-        if score is not None and score.joint:  # how badly all views are explained by what is known
+        if (
+            score is not None and score.joint
+        ):  # how badly all views are explained by what is known
             calibration = self.models.recogniser.calibration
             classes = len(self.models.classes)
             seen = np.maximum(step.seen, 1)
             value = score.of_belief(
-                calibration.log_belief(step.total, seen, classes)[0], int(seen[0])
+                calibration.log_belief(step.total, seen, classes)[0],
+                int(seen[0]),
             )
             return ViewScore(observation, None, value)
         return None if evidence.novelty is None else evidence.novelty[0]
@@ -769,12 +884,20 @@ class Session:
     def _contradicted(self, n_views: int) -> bool:
         """Return whether half of the views or more contradict others."""
         return (
-            2 * sum(any(w.name == "contradiction" for w in view.warnings) for view in self.views)
+            2
+            * sum(
+                any(w.name == "contradiction" for w in view.warnings)
+                for view in self.views
+            )
             >= n_views
             > 0
         )
 
-    def _suspicious(self, steps: Sequence[Step], observations: Sequence[Observation]) -> bool:
+    def _suspicious(
+        self,
+        steps: Sequence[Step],
+        observations: Sequence[Observation],
+    ) -> bool:
         """Return whether an object is too novel for a confident answer."""
         if not self.unknown:
             return False
@@ -784,14 +907,20 @@ class Session:
         score = self.models.recogniser.novelty
         if score is None:
             return False
-        found = [self._score(step, seen) for step, seen in zip(steps, observations, strict=True)]
+        found = [
+            self._score(step, seen)
+            for step, seen in zip(steps, observations, strict=True)
+        ]
+
         return (
             score.of_views(values_of([s for s in found if s is not None]))
             < SUSPICIOUS * self.unknown
         )
 
     def _travelled(
-        self, views: Sequence[int], directions: Sequence[Float]
+        self,
+        views: Sequence[int],
+        directions: Sequence[Float],
     ) -> list[tuple[float, float]]:
         """Cells and radians on the way to each view, from the places where the camera stood."""
         sphere = self.sphere
@@ -814,18 +943,28 @@ class Session:
 
     def _values(self, step: Step) -> Float | None:
         chooser = self._chooser
-        if step.stopped[0] or step.state is None or not isinstance(self.policy, ValuesViews):
+        if (
+            step.stopped[0]
+            or step.state is None
+            or not isinstance(self.policy, ValuesViews)
+        ):
             return None
+
         assert isinstance(chooser, ValuesViews)
         name = type(self.policy).__name__
+
         with plugin_errors(
-            lambda said: PolicyError(f"policy {name}, asked what it values views at, raised {said}")
+            lambda said: PolicyError(
+                f"policy {name}, asked what it values views at, raised {said}"
+            )
         ):
             values = np.asarray(chooser.view_values(step.state), np.float64)
+
         if values.shape != (1, len(self.sphere)):
             raise PolicyError(
                 f"policy {name} values views by (B, V) numbers, here (1, {len(self.sphere)})"
             )
+
         return values[0]
 
     def run(self, camera: Camera | FrameCamera) -> Recognition:
@@ -852,7 +991,10 @@ class Session:
         """How it ended; or what is believed so far, not confident, while it goes on."""
         with self._lock:
             enough = self.done and bool(self._episodes.outcome.confident[0])
-            all_taken = len(self.views) >= min(self.stopping.max_views, len(self.sphere))
+            all_taken = len(self.views) >= min(
+                self.stopping.max_views,
+                len(self.sphere),
+            )
             result = Recognition(
                 tuple(self.views),
                 self.models.classes,
@@ -872,12 +1014,20 @@ class Session:
     def _why_stranded(self) -> str:
         """What became of the candidates that were not taken, in words."""
         taken = {view.index for view in self.views}
-        left = [why or "out of reach" for k, why in enumerate(self.left_out) if k not in taken]
+        left = [
+            why or "out of reach"
+            for k, why in enumerate(self.left_out)
+            if k not in taken
+        ]
         return in_words(left)
 
     def _impossible(self) -> tuple[str, ...]:
         """Classes whose objects have not the size of this one; none where it is not known."""
-        card = getattr(self.models.recogniser, "card", None)  # a recogniser of your own has none
+        card = getattr(
+            self.models.recogniser,
+            "card",
+            None,
+        )  # a recogniser of your own has none
         sizes = card and card.size
         radius = self.views[-1].observation.radius if self.views else None
         if sizes is None or radius is None:
@@ -885,7 +1035,9 @@ class Session:
         # a thing has one size, a class has many
         things = bool(self.models.recogniser.calibration.hypotheses)
         wrong = sizes.impossible(radius, THING_SIZE if things else MUCH)
-        return tuple(name for name, off in zip(self.models.classes, wrong, strict=True) if off)
+        return tuple(
+            name for name, off in zip(self.models.classes, wrong, strict=True) if off
+        )
 
 
 def _seen_anew(before: View, seen: View) -> View:
@@ -937,6 +1089,10 @@ def _check_needs(policy: Policy, models: Models) -> None:
             "this policy needs things of known geometry: a memory that was taught from scans"
         )
 
-    missing = [name for name in maps_among(policy.needs) if name not in models.map_names]
+    missing = [
+        name for name in maps_among(policy.needs) if name not in models.map_names
+    ]
     if missing:
-        raise SessionError(f"this policy needs the map {missing[0]!r}; load it with the models")
+        raise SessionError(
+            f"this policy needs the map {missing[0]!r}; load it with the models"
+        )

@@ -12,28 +12,44 @@ from nextview.geometry.ray_caster import RayCaster, Triangles, embree_scene
 from nextview.session.style import GROUND, WOOD, rgb
 from nextview.types import Floats
 
-TORN = 0.08  # a surface ends where depth jumps by more from pixel to pixel, object radii
+TORN = (
+    0.08  # a surface ends where depth jumps by more from pixel to pixel, object radii
+)
 # half a side of the ground that may lie in shadow, object radii, and its points along it
 SHADOW_REACH = 2.6
 SHADOW_GRID = 72
-SKY = np.random.default_rng(0).normal(size=(150, 3))  # directions of a ball, of any length
-SHADE = np.array([0.52, 0.57, 0.64])  # how much darker the ground is in full shadow: warm
+SKY = np.random.default_rng(0).normal(
+    size=(150, 3)
+)  # directions of a ball, of any length
+SHADE = np.array(
+    [0.52, 0.57, 0.64]
+)  # how much darker the ground is in full shadow: warm
 # towards the lamp, camera frame: from above, left, behind the camera
 LAMP_DIRECTION = np.array([-0.45, -0.75, -0.8])
 
 
 def surface(seen: Observation) -> Triangles:
     """A depth image as triangles, object frame."""
-    depth = seen.depth if seen.exact else np.where(seen.depth > 0, median_filter(seen.depth, 5), 0)
-    points = (PinholeCamera.of(seen.intrinsics, depth.shape).rays * depth[..., None]).reshape(-1, 3)
+    depth = (
+        seen.depth
+        if seen.exact
+        else np.where(seen.depth > 0, median_filter(seen.depth, 5), 0)
+    )
+    points = (
+        PinholeCamera.of(seen.intrinsics, depth.shape).rays * depth[..., None]
+    ).reshape(-1, 3)
     k = np.arange(depth.size).reshape(depth.shape)
-    a, b, c, d = (part.ravel() for part in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:]))
+    a, b, c, d = (
+        part.ravel() for part in (k[:-1, :-1], k[:-1, 1:], k[1:, :-1], k[1:, 1:])
+    )
     faces = np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)])
     corners = depth.ravel()[faces]
     faces = faces[(corners.min(1) > 0) & (np.ptp(corners, axis=1) < TORN)]
     points = points @ seen.pose[:3, :3].T + seen.pose[:3, 3]
     edges, times = np.unique(
-        np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)), axis=0, return_counts=True
+        np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)),
+        axis=0,
+        return_counts=True,
     )
     rim = edges[times == 1]  # has steps as large as pixels: they are smoothed away
     count = np.maximum(np.bincount(rim.ravel(), minlength=len(points)), 1)[:, None]
@@ -55,7 +71,10 @@ class SoftLight:
     """The light on an object, as far as it was seen, and on the ground below it."""
 
     def __init__(self, observations: Sequence[Observation]) -> None:
-        seen: list[Floats] = [np.zeros((1, 3)), *(o.points for o in observations if o.seen)]
+        seen: list[Floats] = [
+            np.zeros((1, 3)),
+            *(o.points for o in observations if o.seen),
+        ]
         self.surfaces = [surface(o) for o in observations]
         self._caster = RayCaster(self.surfaces)
         # sensors see one surface at several places
@@ -63,9 +82,11 @@ class SoftLight:
         self.floor = float(np.percentile(np.concatenate(seen)[:, 2], 0.5)) - 0.01
         x, y = np.meshgrid(*[np.linspace(-SHADOW_REACH, SHADOW_REACH, SHADOW_GRID)] * 2)
         ground = np.stack([x, y, np.full_like(x, self.floor)], -1).reshape(-1, 3)
-        light = self._sky(ground, np.tile([0.0, 0.0, 1.0], (len(ground), 1)), SKY).reshape(
-            SHADOW_GRID, SHADOW_GRID
-        )
+        light = self._sky(
+            ground,
+            np.tile([0.0, 0.0, 1.0], (len(ground), 1)),
+            SKY,
+        ).reshape(SHADOW_GRID, SHADOW_GRID)
         self._ground = gaussian_filter(light, 1.2, mode="nearest")
 
     def _sky(self, points: Floats, normals: Floats, balls: Floats) -> Floats:
@@ -73,7 +94,9 @@ class SoftLight:
         free = np.zeros(len(points))
         for ball in balls / np.linalg.norm(balls, axis=1, keepdims=True):
             free += np.isinf(
-                self._caster.cast(points + self._off * normals, normals + 0.97 * ball)[0]
+                self._caster.cast(points + self._off * normals, normals + 0.97 * ball)[
+                    0
+                ]
             )
         return free / len(balls)
 
@@ -96,7 +119,10 @@ class SoftLight:
             The picture, (H, W, 3) uint8, and the distance along each pixel's ray, (H, W).
         """
         rays = (
-            PinholeCamera.of(np.asarray(intrinsics, np.float64), shape).rays.reshape(-1, 3)
+            PinholeCamera.of(np.asarray(intrinsics, np.float64), shape).rays.reshape(
+                -1,
+                3,
+            )
             @ pose[:3, :3].T
         )
         origins = np.tile(pose[:3, 3], (len(rays), 1)).astype(np.float32)
@@ -106,20 +132,25 @@ class SoftLight:
 
         with np.errstate(divide="ignore", invalid="ignore"):
             down = (self.floor - pose[2, 3]) / rays[:, 2]
-        below = np.where((down > 0) & np.isfinite(down), down, 0)[:, None] * rays + origins
+        below = (
+            np.where((down > 0) & np.isfinite(down), down, 0)[:, None] * rays + origins
+        )
         at = (below[:, 1::-1] / SHADOW_REACH + 1) * (SHADOW_GRID - 1) / 2
         light = map_coordinates(self._ground, at.T, order=1, cval=1.0)
         colours *= 1 - np.outer((down > 0) * np.clip(0.97 - light, 0, 1), SHADE)
 
         normals = hits["Ng"][hit] / np.maximum(
-            np.linalg.norm(hits["Ng"][hit], axis=1, keepdims=True), 1e-12
+            np.linalg.norm(hits["Ng"][hit], axis=1, keepdims=True),
+            1e-12,
         )
         normals *= -np.sign((normals * rays[hit]).sum(1, keepdims=True))
         facing = 0.5 + 0.5 * normals @ (pose[:3, :3] @ LAMP_DIRECTION) / np.linalg.norm(
             LAMP_DIRECTION
         )
         points = origins[hit] + hits["tfar"][hit, None] * rays[hit]
-        bright = (0.35 + 0.65 * self._sky(points, normals, SKY[:24])) * (0.5 + 0.62 * facing)
+        bright = (0.35 + 0.65 * self._sky(points, normals, SKY[:24])) * (
+            0.5 + 0.62 * facing
+        )
         colours[hit] = np.array(rgb(WOOD)) * bright[:, None]
 
         far = np.where(hit, hits["tfar"], np.inf).reshape(shape)

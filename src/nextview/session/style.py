@@ -85,7 +85,9 @@ def new_figure(width: float, height: float) -> tuple[Figure, Axes]:
 
 def percent_axis(axis: Axis) -> None:
     """Write the shares along an axis in percent, with no more digits than they need."""
-    axis.set_major_formatter(FuncFormatter(lambda share, _: f"{round(100 * share, 6):g} %"))
+    axis.set_major_formatter(
+        FuncFormatter(lambda share, _: f"{round(100 * share, 6):g} %")
+    )
 
 
 def legend(axes: Axes, title: str | None = None) -> None:
@@ -114,9 +116,13 @@ def rgb(colour: str) -> tuple[int, int, int]:
 def heat(values: Floats) -> NDArray[np.uint8]:
     """Values in the colours of viridis, lowest to highest, (...) to (..., 3); NaN is grey."""
     known = np.isfinite(values)
-    low, high = (values[known].min(), values[known].max()) if known.any() else (0.0, 1.0)
+    low, high = (
+        (values[known].min(), values[known].max()) if known.any() else (0.0, 1.0)
+    )
     scaled = np.where(known, values - low, 0.0) / (high - low if high > low else 1.0)
-    colours = (255 * matplotlib.colormaps["viridis"](scaled)[..., :3] + 0.5).astype(np.uint8)
+    colours = (255 * matplotlib.colormaps["viridis"](scaled)[..., :3] + 0.5).astype(
+        np.uint8
+    )
     return np.where(known[..., None], colours, np.array(UNKNOWN_COLOUR, np.uint8))
 
 
@@ -125,7 +131,11 @@ def to_svg(figure: Figure) -> str:
     text = StringIO()
     with matplotlib.rc_context(FIGURE_STYLE):
         figure.savefig(
-            text, format="svg", bbox_inches="tight", pad_inches=0.05, metadata={"Date": None}
+            text,
+            format="svg",
+            bbox_inches="tight",
+            pad_inches=0.05,
+            metadata={"Date": None},
         )
     # XML has none of these
     return re.sub(r"[\x00-\x08\x0b\x0c\x0e-\x1f]", "\ufffd", text.getvalue())
@@ -139,4 +149,10 @@ def to_png(figure: Figure, path: Path) -> None:
         path: of the file.
     """
     with matplotlib.rc_context(FIGURE_STYLE):
-        figure.savefig(path, dpi=160, facecolor="white", bbox_inches="tight", pad_inches=0.1)
+        figure.savefig(
+            path,
+            dpi=160,
+            facecolor="white",
+            bbox_inches="tight",
+            pad_inches=0.1,
+        )

@@ -19,7 +19,9 @@ JUMP = 0.03
 NEAR_SUPPORT = 0.02
 OWN_RADIUS = 1.1  # object radii around the centre within which a surface counts as the object's own
 FEWEST_NEAR_POINTS = 3  # that are measured near a place before it counts as occupied
-SIGHT_WINDOW = 2  # pixels to each side that tell what lies on the line of sight to a place
+SIGHT_WINDOW = (
+    2  # pixels to each side that tell what lies on the line of sight to a place
+)
 NARROWEST_WALL = 0.5  # metres that a frame shows of a wall, at least
 WALL_TOLERANCE = 0.02  # metres, beside the noise
 BEHIND = 0.15  # metres behind a wall from which on a point does not belong to it
@@ -91,9 +93,16 @@ class Surroundings:
         """Whether the camera stood behind the wall of another frame, or sees something there."""
         if wall.height(self.frame.camera_to_world[:3, 3]) < 0:
             return True
-        return _share_behind(wall.height(self.points), self.tolerance) > MOST_POINTS_BEHIND
+        return (
+            _share_behind(wall.height(self.points), self.tolerance) > MOST_POINTS_BEHIND
+        )
 
-    def look_at(self, places: Float, around: ObjectFrame, margin: float) -> tuple[Mask, Mask]:
+    def look_at(
+        self,
+        places: Float,
+        around: ObjectFrame,
+        margin: float,
+    ) -> tuple[Mask, Mask]:
         """Which places the frame looks through, and which are hidden by other things.
 
         Args:
@@ -117,9 +126,14 @@ class Surroundings:
 
         share = np.where(blocked, measured / np.where(blocked, away, 1), 0)
         surface = camera + (places - camera) * share[:, None]
-        own = np.linalg.norm(surface - around.centre, axis=1) < OWN_RADIUS * around.radius
+        own = (
+            np.linalg.norm(surface - around.centre, axis=1) < OWN_RADIUS * around.radius
+        )
         depth = np.where(blocked, measured, 1)
-        on_plane = _height(surface, self.plane) < NEAR_SUPPORT + _tolerance(self.noise, depth)
+        on_plane = _height(surface, self.plane) < NEAR_SUPPORT + _tolerance(
+            self.noise,
+            depth,
+        )
         return free, blocked & ~own & ~on_plane
 
     def _depth_towards(self, seen_at: Float) -> Float:
@@ -135,7 +149,11 @@ class Surroundings:
         inside = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
 
         around = np.arange(-SIGHT_WINDOW, SIGHT_WINDOW + 1)
-        rows = np.clip(row[inside, None, None].astype(int) + around[:, None], 0, height - 1)
+        rows = np.clip(
+            row[inside, None, None].astype(int) + around[:, None],
+            0,
+            height - 1,
+        )
         columns = np.clip(column[inside, None, None].astype(int) + around, 0, width - 1)
         windows = self.frame.depth[rows, columns].astype(np.float64)
         depth = windows.reshape(len(windows), len(around) ** 2)
@@ -173,7 +191,8 @@ def _smooth_pixels(frame: Frame) -> tuple[Index, Index]:
     smooth = np.ones(len(rows), bool)
     for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
         beside = frame.depth[
-            np.clip(rows + down, 0, height - 1), np.clip(columns + right, 0, width - 1)
+            np.clip(rows + down, 0, height - 1),
+            np.clip(columns + right, 0, width - 1),
         ]
         smooth &= (beside > 0) & (np.abs(beside - depth) < JUMP * depth)
     return rows[smooth], columns[smooth]
@@ -195,4 +214,8 @@ def _walls(sighting: Sighting, around: ObjectFrame) -> tuple[Plane, ...]:
 
 def _share_behind(away: Float, tolerance: Float) -> float:
     """Share of points, at distances before a wall, (N,), and off by so much, that lie behind it."""
-    return float((away < -(BEHIND + WALL_TOLERANCE + tolerance)).mean()) if len(away) else 0.0
+    return (
+        float((away < -(BEHIND + WALL_TOLERANCE + tolerance)).mean())
+        if len(away)
+        else 0.0
+    )

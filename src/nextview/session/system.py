@@ -12,10 +12,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nextview.checks import number, one_line, whole
-from nextview.errors import MeshError, ModelError, OtherUseError, PolicyError, UsageError
+from nextview.errors import (
+    MeshError,
+    ModelError,
+    OtherUseError,
+    PolicyError,
+    UsageError,
+)
 from nextview.geometry.mesh import Mesh, load_mesh, mesh_warnings
 from nextview.geometry.observation import Camera
-from nextview.geometry.viewsphere import VIEW_LAYOUTS, Viewpoints, ViewSphere, viewpoints_of
+from nextview.geometry.viewsphere import (
+    VIEW_LAYOUTS,
+    Viewpoints,
+    ViewSphere,
+    viewpoints_of,
+)
 from nextview.policies.base import Policy
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.policies.maps import MapPeak, SpherePeak
@@ -43,7 +54,12 @@ MOST_THREADS = 1024
 # the models that ship with the package, and their share of false alarms
 DEFAULT_MODELS = "modelnet10"
 UNKNOWN_ALPHA = 0.02
-FRAME_FILES = (".mcap", ".db3", ".bag", ".png")  # files of captured frames, not of meshes
+FRAME_FILES = (
+    ".mcap",
+    ".db3",
+    ".bag",
+    ".png",
+)  # files of captured frames, not of meshes
 
 
 @dataclass(frozen=True, repr=False)
@@ -150,7 +166,12 @@ class System:
         """
         if not isinstance(camera, FrameCamera):
             return self.session(start, seed, any_orientation=any_orientation)
-        session = self.session(start, seed, camera.object, any_orientation=any_orientation)
+        session = self.session(
+            start,
+            seed,
+            camera.object,
+            any_orientation=any_orientation,
+        )
         if getattr(camera, "knows_reach", False):
             session.limits = Limits.none()
         return session
@@ -190,7 +211,9 @@ class System:
             ObservationError: the object is found in none of the captured views.
         """
         if largest_part and not (isinstance(what, str | Path) and not is_frames(what)):
-            raise UsageError("the largest part is taken of a mesh file while it is read")
+            raise UsageError(
+                "the largest part is taken of a mesh file while it is read"
+            )
         if isinstance(what, str) and not what.strip():
             raise UsageError(
                 "what is looked at has an empty name; give a mesh file or a folder of views"
@@ -204,7 +227,9 @@ class System:
                 for sentence in mesh_warnings(what):
                     warnings.warn(f"{what.name}: {sentence}", stacklevel=2)
             else:
-                raise MeshError(f"{what}: the up axis of a mesh file is y or z, not {up}")
+                raise MeshError(
+                    f"{what}: the up axis of a mesh file is y or z, not {up}"
+                )
 
         if isinstance(what, Mesh):
             what = simulated(what, sensor, seed)
@@ -212,8 +237,12 @@ class System:
             raise UsageError("a sensor is for meshes: a camera has its own errors")
 
         if not hasattr(what, "observe"):
-            wanted = "a mesh file, a Mesh, a folder of views, or a camera with observe(pose)"
-            raise UsageError(f"what is looked at is {wanted}, not {one_line(repr(what))}")
+            wanted = (
+                "a mesh file, a Mesh, a folder of views, or a camera with observe(pose)"
+            )
+            raise UsageError(
+                f"what is looked at is {wanted}, not {one_line(repr(what))}"
+            )
         return self.session_with(what, start, seed, any_orientation).run(what)
 
     def __repr__(self) -> str:
@@ -234,7 +263,11 @@ def _in_any_orientation(models: Models) -> Models:
     return replace(models, recogniser=recogniser.in_any_orientation)
 
 
-def simulated(mesh: Mesh, sensor: "str | Sensor | None" = None, seed: int = 0) -> Camera:
+def simulated(
+    mesh: Mesh,
+    sensor: "str | Sensor | None" = None,
+    seed: int = 0,
+) -> Camera:
     """Create a simulated camera in front of a mesh.
 
     Args:
@@ -251,7 +284,11 @@ def simulated(mesh: Mesh, sensor: "str | Sensor | None" = None, seed: int = 0) -
         return SimulatedCamera(mesh)
     from nextview.simulation.sensed_camera import SensedCamera
 
-    return SensedCamera(mesh, sensor, np.random.default_rng(whole(seed, "the seed", 0, 2**63 - 1)))
+    return SensedCamera(
+        mesh,
+        sensor,
+        np.random.default_rng(whole(seed, "the seed", 0, 2**63 - 1)),
+    )
 
 
 def load(
@@ -312,19 +349,30 @@ def load(
     names = _names_of(models)
     given["models"] = names if len(names) > 1 else names[0]
     _check_options(policy, threads, risk, unknown)
-    Stopping(threshold, max_views)  # says what is wrong with it, before anything is opened
+    Stopping(
+        threshold,
+        max_views,
+    )  # says what is wrong with it, before anything is opened
 
     collections = {name: find_models(name) for name in names}
     found = collections[names[-1]]
     sphere = viewpoints_of(viewpoints)
-    knows = _opened(collections, threads) if recogniser is None else own_recogniser(recogniser)
+    knows = (
+        _opened(collections, threads)
+        if recogniser is None
+        else own_recogniser(recogniser)
+    )
     policies = found.policies
     # the policy of a memory belongs to its things alone
     if recogniser is not None or len(names) > 1:
-        policies = {name: card for name, card in policies.items() if name != DISCRIMINATE}
+        policies = {
+            name: card for name, card in policies.items() if name != DISCRIMINATE
+        }
 
     share = _unknown_share(
-        unknown, knows, str(found.recogniser) if recogniser is None else knows.name
+        unknown,
+        knows,
+        str(found.recogniser) if recogniser is None else knows.name,
     )
     if not share:
         knows.novelty = None  # it takes time
@@ -333,33 +381,60 @@ def load(
     else:
         name = str(policy)
         made = make_policy_anywhere(
-            with_cards(name, policies), sphere, (), knows.classes, found.maps
+            with_cards(name, policies),
+            sphere,
+            (),
+            knows.classes,
+            found.maps,
         )
 
     opened = Models(knows, open_maps(found.maps, made.needs, threads))
     # a map's own policy goes to the valley for some classes, which the map's card names
     if name in opened.maps:
         made = make_policy_anywhere(
-            name, sphere, opened.valley_classes(name), knows.classes, found.maps
+            name,
+            sphere,
+            opened.valley_classes(name),
+            knows.classes,
+            found.maps,
         )
     if isinstance(made, MapPeak | SpherePeak):
         made = replace(
             made,
-            sphere=_grid_of(opened.maps[made.map_name.removesuffix(SPHERE_SUFFIX)], made.sphere),
+            sphere=_grid_of(
+                opened.maps[made.map_name.removesuffix(SPHERE_SUFFIX)],
+                made.sphere,
+            ),
         )
-    rule = _rule(stopping, Stopping.of(knows.calibration, threshold, risk, max_views), risk)
+    rule = _rule(
+        stopping,
+        Stopping.of(knows.calibration, threshold, risk, max_views),
+        risk,
+    )
     return System(opened, made, name, sphere, rule, share, given)
 
 
-def _check_options(policy: Any, threads: int, risk: float | None, unknown: float | None) -> None:
+def _check_options(
+    policy: Any,
+    threads: int,
+    risk: float | None,
+    unknown: float | None,
+) -> None:
     """Refuse arguments of ``load`` that make no sense, before anything is opened; UsageError."""
     if policy is not None and not isinstance(policy, str | Path):
-        raise UsageError(f"a policy is given by name or path, not {one_line(repr(policy))}")
+        raise UsageError(
+            f"a policy is given by name or path, not {one_line(repr(policy))}"
+        )
     whole(threads, "the number of threads", 0, MOST_THREADS)
     if risk is not None:
         number(risk, "the risk")
-    if unknown is not None and number(unknown, "the share of known objects called unknown", 0) >= 1:
-        raise UsageError(f"the share of known objects called unknown is below 1, not {unknown}")
+    if (
+        unknown is not None
+        and number(unknown, "the share of known objects called unknown", 0) >= 1
+    ):
+        raise UsageError(
+            f"the share of known objects called unknown is below 1, not {unknown}"
+        )
 
 
 def _names_of(models: Any) -> list[str]:
@@ -367,7 +442,9 @@ def _names_of(models: Any) -> list[str]:
     given = list(models) if isinstance(models, list | tuple) else [models]
     for name in given or [models]:
         if not isinstance(name, str | Path):
-            raise UsageError(f"models are given by name or path, not {one_line(repr(name))}")
+            raise UsageError(
+                f"models are given by name or path, not {one_line(repr(name))}"
+            )
     names = [str(name) for name in given]
     if len(set(names)) < len(names):
         raise UsageError(f"one of the models is there twice: {', '.join(names)}")
@@ -377,7 +454,8 @@ def _names_of(models: Any) -> list[str]:
 def _opened(collections: dict[str, Collection], threads: int) -> Recogniser:
     """The recogniser of one collection, or that of several together."""
     opened = {
-        name: open_recogniser(found.recogniser, threads) for name, found in collections.items()
+        name: open_recogniser(found.recogniser, threads)
+        for name, found in collections.items()
     }
     if len(opened) > 1:
         return SeveralRecognisers(opened)
@@ -391,13 +469,19 @@ def _unknown_share(asked: float | None, recogniser: Recogniser, called: str) -> 
     """
     can_tell = tells_unknown(recogniser)
     if asked and not can_tell:
-        raise ModelError(f"{called}: cannot tell unknown objects; nextview fit unknown teaches it")
+        raise ModelError(
+            f"{called}: cannot tell unknown objects; nextview fit unknown teaches it"
+        )
     if asked is None:
         return UNKNOWN_ALPHA if can_tell else 0.0
     return asked
 
 
-def _rule(given: Stopping | Rule | str | None, usual: Stopping, risk: float | None) -> Stopping:
+def _rule(
+    given: Stopping | Rule | str | None,
+    usual: Stopping,
+    risk: float | None,
+) -> Stopping:
     if given is None or isinstance(given, Stopping):
         return given or usual
     if risk is not None:
@@ -413,7 +497,9 @@ def _grid_of(network: MapNetwork, sphere: ViewSphere) -> ViewSphere:
         if network.rings in (None, grid.rings):
             return grid
     there = f"the {len(sphere)} viewpoints {sphere.rings}"
-    raise PolicyError(f"the map {network.card.name} has {network.rings} rings, and {there}")
+    raise PolicyError(
+        f"the map {network.card.name} has {network.rings} rings, and {there}"
+    )
 
 
 def is_frames(path: str | Path) -> bool:
@@ -422,7 +508,10 @@ def is_frames(path: str | Path) -> bool:
     return os.path.isdir(path) or os.path.splitext(path)[1].lower() in FRAME_FILES
 
 
-def _camera_of(folder: Path, up: str | tuple[float, float, float] | None) -> "CapturedCamera":
+def _camera_of(
+    folder: Path,
+    up: str | tuple[float, float, float] | None,
+) -> "CapturedCamera":
     from nextview.captured.camera import UP, CapturedCamera
     from nextview.captured.folders import read_capture
 
@@ -434,29 +523,48 @@ def _camera_of(folder: Path, up: str | tuple[float, float, float] | None) -> "Ca
 
 
 def _default_policy(
-    own: dict[str, Path], sphere: Viewpoints, recogniser: Recogniser
+    own: dict[str, Path],
+    sphere: Viewpoints,
+    recogniser: Recogniser,
 ) -> tuple[str, Policy]:
     """Return "discriminate" for taught things, "gain" if one fits, else "spread"."""
     if isinstance(recogniser, SeveralRecognisers):
         return DISCRIMINATE, DiscriminateGeometry(sphere)
     if (memory := own.get(DISCRIMINATE)) is not None:
-        return DISCRIMINATE, make_policy_anywhere(str(memory), sphere, (), recogniser.classes)
+        return DISCRIMINATE, make_policy_anywhere(
+            str(memory),
+            sphere,
+            (),
+            recogniser.classes,
+        )
+
     try:
-        gain = make_policy_anywhere(str(own.get("gain", "gain")), sphere, (), recogniser.classes)
+        gain = make_policy_anywhere(
+            str(own.get("gain", "gain")),
+            sphere,
+            (),
+            recogniser.classes,
+        )
         grid = getattr(gain, "sphere", None)
         if "azimuth_bins" not in gain.needs or recogniser.azimuth_bins == getattr(
-            grid, "azimuths", None
+            grid,
+            "azimuths",
+            None,
         ):
             return "gain", gain
     except OtherUseError:
         pass
+
     return "spread", make_policy_anywhere("spread", sphere)
 
 
 _bundled = lru_cache(maxsize=1)(load)
 
 
-def recognise(what: str | Path | Mesh | Camera | FrameCamera, **options: Any) -> Recognition:
+def recognise(
+    what: str | Path | Mesh | Camera | FrameCamera,
+    **options: Any,
+) -> Recognition:
     """Recognise an object with the bundled models; options as for ``System.recognise``.
 
     Args:

@@ -26,7 +26,9 @@ SAME_DIRECTION = 1e-6  # radians between directions that are the same
 
 
 def sensed_camera(
-    scene: TargetScene, sensor: Sensor | SensorMix | str, rng: np.random.Generator
+    scene: TargetScene,
+    sensor: Sensor | SensorMix | str,
+    rng: np.random.Generator,
 ) -> SensedCamera:
     """Create a camera three radii from a scene's target, which is segmented exactly.
 
@@ -41,7 +43,12 @@ def sensed_camera(
     drawn = sensor_named(sensor).draw(rng.spawn(1)[0])
     drawn = replace(drawn, radius=drawn.distance / CAMERA_DISTANCE, boxes=0.0)
     return SensedCamera(
-        scene.target, drawn, rng, around=scene.around, table=SCENE_TABLE, true_size=False
+        scene.target,
+        drawn,
+        rng,
+        around=scene.around,
+        table=SCENE_TABLE,
+        true_size=False,
     )
 
 
@@ -57,10 +64,15 @@ class RobotCamera:
     allows to be answered from near. The errors of the sensor are drawn by seed 0.
     """
 
-    knows_reach = True  # the scene says where a camera can stand; see ``session.FrameCamera``
+    knows_reach = (
+        True  # the scene says where a camera can stand; see ``session.FrameCamera``
+    )
 
     def __init__(
-        self, scene: TargetScene, sensor: Sensor | SensorMix | str = "none", named: Named = "point"
+        self,
+        scene: TargetScene,
+        sensor: Sensor | SensorMix | str = "none",
+        named: Named = "point",
     ) -> None:
         if named not in get_args(Named):
             raise UsageError(
@@ -76,7 +88,12 @@ class RobotCamera:
         corners = scene.target.vertices * self._truth.radius
         asked = {
             "point": {"point": np.zeros(3)},
-            "box": {"box": Box(corners.min(0) - SAME_DIRECTION, corners.max(0) + SAME_DIRECTION)},
+            "box": {
+                "box": Box(
+                    corners.min(0) - SAME_DIRECTION,
+                    corners.max(0) + SAME_DIRECTION,
+                )
+            },
             "known": {"known": self._camera.object_frame, "support": False},
             "mask": {},
         }[named]
@@ -86,22 +103,33 @@ class RobotCamera:
 
     def reachable(self, pose: Float) -> bool:
         """Return whether the camera can reach a pose of the scene, (4, 4), metres."""
-        return bool(self.scene.reachable(self._truth.pose_in_object(pose)[None, :3, 3])[0])
+        return bool(
+            self.scene.reachable(self._truth.pose_in_object(pose)[None, :3, 3])[0]
+        )
 
     def observe(self, pose: Float) -> Frame:
         """Look from a pose, (4, 4), in the believed object frame, or from near it."""
         believed = (
-            self.object.object_frame if self.object.sightings or self.object.known else self._truth
+            self.object.object_frame
+            if self.object.sightings or self.object.known
+            else self._truth
         )
         asked = direction_of(self._truth.pose_in_object(believed.pose_in_world(pose)))
         order = np.argsort(
-            angle_between(np.broadcast_to(asked, self._directions.shape), self._directions)
+            angle_between(
+                np.broadcast_to(asked, self._directions.shape),
+                self._directions,
+            )
         )
 
         for direction in (asked, *self._directions[order]):
             there = level_pose(direction)
-            tried = self._refused if direction is asked else [*self._refused, *self._taken]
-            used = any(angle_between(direction, other) < SAME_DIRECTION for other in tried)
+            tried = (
+                self._refused if direction is asked else [*self._refused, *self._taken]
+            )
+            used = any(
+                angle_between(direction, other) < SAME_DIRECTION for other in tried
+            )
             if used or not self.scene.reachable(there[None, :3, 3])[0]:
                 continue
 
@@ -113,7 +141,9 @@ class RobotCamera:
                     else replace(frame, mask=None, pixel_centre=0.5)
                 )
             self._refused.append(direction)
-        raise NoViewLeftError("the target shows from no other place that can be reached")
+        raise NoViewLeftError(
+            "the target shows from no other place that can be reached"
+        )
 
     def refused(self, error: ObservationError) -> None:
         """The target is not found in the last frame: no other one is taken from there."""

@@ -18,11 +18,15 @@ from nextview.simulation.scene import cached_mesh, mesh_hash, upright_boxes
 from nextview.simulation.sensor import Sensor
 from nextview.types import Float, Mask
 
-UNEVEN_HEIGHT = 0.001  # metres, standard deviation of the height of a floor or a table top
+UNEVEN_HEIGHT = (
+    0.001  # metres, standard deviation of the height of a floor or a table top
+)
 WAVES = 12  # that an uneven top is made of
 SHORTEST_WAVE = 0.25  # metres
 LONGEST_WAVE = 2.0
-CORNER_SPACING = 0.1  # metres between the corners of an uneven top; fewer than MOST_CORNERS a side
+CORNER_SPACING = (
+    0.1  # metres between the corners of an uneven top; fewer than MOST_CORNERS a side
+)
 MOST_CORNERS = 60
 LOWEST_CAMERA = 0.06  # metres above what the target stands on: the camera's own housing
 HIGHEST_CAMERA = 1.8  # metres above the floor: what a mobile robot reaches
@@ -84,7 +88,11 @@ class Room:
         )
 
 
-def build_room(layout: RoomLayout, meshes: str | Path, max_faces: int = MAX_FACES) -> Room:
+def build_room(
+    layout: RoomLayout,
+    meshes: str | Path,
+    max_faces: int = MAX_FACES,
+) -> Room:
     """Build a room of the mesh files below a folder.
 
     Args:
@@ -102,7 +110,9 @@ def build_room(layout: RoomLayout, meshes: str | Path, max_faces: int = MAX_FACE
     ]
     if (faces := sum(len(faces) for _, faces in placed)) > max_faces:
         most = f"more than {max_faces:,}; --max-faces (max_faces) allows more"
-        raise MeshError(f"room {layout.name}: its meshes have {faces:,} triangles, {most}")
+        raise MeshError(
+            f"room {layout.name}: its meshes have {faces:,} triangles, {most}"
+        )
 
     rng = np.random.default_rng([layout.seed, *layout.name.encode()])
     around = [_uneven_top(layout.width, layout.depth, rng), _walls(layout)]
@@ -157,7 +167,9 @@ def _uneven_top(width: float, depth: float, rng: np.random.Generator) -> Triangl
 
     Its heights are a sum of waves in all directions.
     """
-    across, along = (min(MOST_CORNERS, 2 + round(side / CORNER_SPACING)) for side in (width, depth))
+    across, along = (
+        min(MOST_CORNERS, 2 + round(side / CORNER_SPACING)) for side in (width, depth)
+    )
     x, y = np.meshgrid(
         np.linspace(-width / 2, width / 2, across),
         np.linspace(-depth / 2, depth / 2, along),
@@ -165,7 +177,9 @@ def _uneven_top(width: float, depth: float, rng: np.random.Generator) -> Triangl
     )
     wave = 2 * np.pi / rng.uniform(SHORTEST_WAVE, LONGEST_WAVE, WAVES)
     towards, phase = rng.uniform(0, 2 * np.pi, (2, WAVES))
-    angle = wave * (np.cos(towards) * x[..., None] + np.sin(towards) * y[..., None]) + phase
+    angle = (
+        wave * (np.cos(towards) * x[..., None] + np.sin(towards) * y[..., None]) + phase
+    )
     height = UNEVEN_HEIGHT * np.sqrt(2 / WAVES) * np.sin(angle).sum(-1)
 
     corners = np.stack([x, y, height], -1).reshape(-1, 3)
@@ -187,7 +201,12 @@ def _walls(layout: RoomLayout) -> Triangles:
 def _slab_things(slab: Slab, rng: np.random.Generator) -> list[Triangles]:
     """A box, and the uneven top that lies on it if it is a table's."""
     size = np.array([[slab.width, slab.depth, slab.height]])
-    box = upright_boxes(size, np.array([slab.azimuth]), np.array([[slab.x, slab.y]]), slab.z)
+    box = upright_boxes(
+        size,
+        np.array([slab.azimuth]),
+        np.array([[slab.x, slab.y]]),
+        slab.z,
+    )
     if slab.even:
         return [(box.vertices, box.faces)]
 
@@ -201,7 +220,9 @@ def _inside(slab: Slab, place: Float, margin: float) -> bool:
     """Whether a place, (3,), lies in a box or up to a margin beside it."""
     own = rotation_z(slab.azimuth).T @ (place - (slab.x, slab.y, slab.z))
     half = np.array([slab.width, slab.depth]) / 2 + margin
-    return bool((np.abs(own[:2]) < half).all() and -margin < own[2] < slab.height + margin)
+    return bool(
+        (np.abs(own[:2]) < half).all() and -margin < own[2] < slab.height + margin
+    )
 
 
 class RoomCamera:
@@ -219,7 +240,10 @@ class RoomCamera:
         self.room = room
         self.sensor = sensor
         self.seed = seed
-        self._rays = PinholeCamera.of(sensor.intrinsics, sensor.shape).rays.reshape(-1, 3)
+        self._rays = PinholeCamera.of(sensor.intrinsics, sensor.shape).rays.reshape(
+            -1,
+            3,
+        )
 
     def look(self, pose: Float) -> tuple[Frame, Mask]:
         """Look from a camera-to-world pose, (4, 4), OpenCV's axes.

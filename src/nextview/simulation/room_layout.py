@@ -11,7 +11,13 @@ from msgspec import Meta, Struct
 
 from nextview.errors import DatasetError
 from nextview.files import read_record, write_record
-from nextview.simulation.scene_layout import LAYOUT_LENGTH, Hash, Length, Size, below_the_meshes
+from nextview.simulation.scene_layout import (
+    LAYOUT_LENGTH,
+    Hash,
+    Length,
+    Size,
+    below_the_meshes,
+)
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 Rotation = Annotated[tuple[Length, ...], Meta(min_length=9, max_length=9)]

@@ -23,7 +23,9 @@ SCENE_CLEARANCE = 0.2  # what a camera needs to each side, object radii
 BLOCK_GAP = (0.02, 0.3)
 FOOTPRINT = (0.3, 0.9)
 BLOCK_HEIGHT = (0.6, 2.6)
-_CORNERS = np.array([[x, y, z] for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
+_CORNERS = np.array(
+    [[x, y, z] for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)]
+)
 _FACES = np.reshape([int(i) for i in "021123456576014154263367042246135375"], (-1, 3))
 # every footprint is wider by this on each side, object radii: so the thinnest sheet has one too
 FOOTPRINT_EDGE = 1e-3
@@ -89,7 +91,10 @@ class TargetScene:
         found = positions[:, 2] - self.floor
         for item in self.items:
             above = np.maximum(positions[:, 2] - item.vertices[:, 2].max(), 0)
-            found = np.minimum(found, np.hypot(distances(item.footprint, positions[:, :2]), above))
+            found = np.minimum(
+                found,
+                np.hypot(distances(item.footprint, positions[:, :2]), above),
+            )
         return found
 
     def reachable(self, positions: Float) -> Mask:
@@ -101,11 +106,18 @@ class TargetScene:
         positions = points(positions, "the positions of cameras")
         free = self.clearance(positions) >= SCENE_CLEARANCE
         for wall in (item.footprint for item in self.items if item.wall):
-            free &= [separation(np.array([p, (0.0, 0.0)]), wall) > 0 for p in positions[:, :2]]
+            free &= [
+                separation(np.array([p, (0.0, 0.0)]), wall) > 0
+                for p in positions[:, :2]
+            ]
         return free
 
 
-def build_scene(layout: SceneLayout, meshes: str | Path, max_faces: int = MAX_FACES) -> TargetScene:
+def build_scene(
+    layout: SceneLayout,
+    meshes: str | Path,
+    max_faces: int = MAX_FACES,
+) -> TargetScene:
     """Build a scene from the mesh files of a folder.
 
     Args:
@@ -128,11 +140,19 @@ def build_scene(layout: SceneLayout, meshes: str | Path, max_faces: int = MAX_FA
         loaded.append(cached_mesh(path, max_faces))
         if (faces := sum(len(mesh.faces) for mesh in loaded)) > max_faces:
             most = f"more than {max_faces:,}; --max-faces (max_faces) allows more"
-            raise MeshError(f"scene {layout.name}: its meshes have {faces:,} triangles, {most}")
+            raise MeshError(
+                f"scene {layout.name}: its meshes have {faces:,} triangles, {most}"
+            )
+
     target, *others = loaded
     floor = float(target.vertices[:, 2].min())
-    objects = [place(mesh, at, floor) for mesh, at in zip(others, layout.objects, strict=True)]
-    return TargetScene(target, (*objects, *(block_item(block, floor) for block in layout.blocks)))
+    objects = [
+        place(mesh, at, floor) for mesh, at in zip(others, layout.objects, strict=True)
+    ]
+    return TargetScene(
+        target,
+        (*objects, *(block_item(block, floor) for block in layout.blocks)),
+    )
 
 
 def place(mesh: Mesh, at: Placement, floor: float) -> Item:
@@ -202,7 +222,8 @@ def boxes_around(vertices: Float, count: int, rng: np.random.Generator) -> Mesh:
     floor = vertices[:, 2].min()
     reach = np.hypot(vertices[:, 0], vertices[:, 1]).max()
     size = np.concatenate(
-        [rng.uniform(*FOOTPRINT, (count, 2)), rng.uniform(*BLOCK_HEIGHT, (count, 1))], 1
+        [rng.uniform(*FOOTPRINT, (count, 2)), rng.uniform(*BLOCK_HEIGHT, (count, 1))],
+        1,
     )
     azimuth, towards = rng.uniform(0, 2 * np.pi, (2, count))
     away = reach + np.hypot(size[:, 0], size[:, 1]) / 2 + rng.uniform(*BLOCK_GAP, count)
@@ -221,7 +242,12 @@ def square(half: float, height: float) -> tuple[Float, NDArray[np.int32]]:
         Vertices, (4, 3), and faces, (2, 3) int32.
     """
     corners = np.array(
-        [[-half, -half, height], [half, -half, height], [half, half, height], [-half, half, height]]
+        [
+            [-half, -half, height],
+            [half, -half, height],
+            [half, half, height],
+            [-half, half, height],
+        ]
     )
     return corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 

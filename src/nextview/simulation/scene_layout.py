@@ -14,7 +14,9 @@ CLUTTER_LEVELS = {
     "medium": 0.65,
     "heavy": 0.45,
 }  # mean share of the target that shows
-NAMED = re.compile(r".*@(\w+)-\d+")  # names of scenes that were drawn: target, level and number
+NAMED = re.compile(
+    r".*@(\w+)-\d+"
+)  # names of scenes that were drawn: target, level and number
 SUFFIX = ".json"
 LAYOUT_VIEWS = 40
 # or radians: what is computed with more has no precision left
@@ -104,10 +106,12 @@ class SceneLayout(Struct, frozen=True, forbid_unknown_fields=True):
     objects: Annotated[tuple[Placement, ...], LAYOUT_LENGTH] = ()
     blocks: Annotated[tuple[Block, ...], LAYOUT_LENGTH] = ()
     visible: Annotated[
-        tuple[Annotated[float, Meta(ge=0, le=1)], ...], Meta(max_length=LAYOUT_VIEWS)
+        tuple[Annotated[float, Meta(ge=0, le=1)], ...],
+        Meta(max_length=LAYOUT_VIEWS),
     ] = ()
     unreachable: Annotated[
-        tuple[Annotated[int, Meta(ge=0, lt=LAYOUT_VIEWS)], ...], Meta(max_length=LAYOUT_VIEWS)
+        tuple[Annotated[int, Meta(ge=0, lt=LAYOUT_VIEWS)], ...],
+        Meta(max_length=LAYOUT_VIEWS),
     ] = ()
 
     def __post_init__(self) -> None:

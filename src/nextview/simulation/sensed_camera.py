@@ -20,9 +20,8 @@ from nextview.simulation.sensor import Sensor, SensorMix, sensor_named, uniform_
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.types import Float, Float32, Mask
 
-BARE_TABLE_RADIUS = (
-    1.5  # radius of the table that the object stands on, if nothing else is said, object radii
-)
+# radius of the table that the object stands on, if nothing else is said, object radii
+BARE_TABLE_RADIUS = 1.5
 # the object is looked for in a sphere so many radii large: with a wrong pose it sticks out of its
 # own
 OBJECT_REACH = 1.3
@@ -77,7 +76,10 @@ class SensedCamera:
         draws = rng.spawn(1)[0]
         centre = draws.normal(0, setup.centre * setup.radius, 3)
         radius = setup.radius * np.exp(draws.normal(0, setup.size))
-        lean = Rotation.from_rotvec([*draws.normal(0, setup.tilt, 2), 0], degrees=True).as_matrix()
+        lean = Rotation.from_rotvec(
+            [*draws.normal(0, setup.tilt, 2), 0],
+            degrees=True,
+        ).as_matrix()
         # where the robot takes the object to be
         self.object_frame = ObjectFrame(centre, float(radius), lean)
         if around is None and self.sensor.boxes:
@@ -87,7 +89,11 @@ class SensedCamera:
         self._around = None if around is None else self._looking_at(around)
 
     def _looking_at(self, mesh: Mesh) -> SimulatedCamera:
-        return SimulatedCamera(mesh, intrinsics=self.sensor.intrinsics, shape=self.sensor.shape)
+        return SimulatedCamera(
+            mesh,
+            intrinsics=self.sensor.intrinsics,
+            shape=self.sensor.shape,
+        )
 
     def observe(self, pose: Float) -> Observation:
         """Look from the direction of a pose, (4, 4), at the sensor's own distance.
@@ -96,7 +102,10 @@ class SensedCamera:
         """
         try:
             thing = ObservedObject(
-                known=self.object_frame, support=False, denoise=self.denoise, life_size=False
+                known=self.object_frame,
+                support=False,
+                denoise=self.denoise,
+                life_size=False,
             )
             # Something of a millimetre is far out of the picture of a camera whose place is known
             # to millimetres.
@@ -105,14 +114,19 @@ class SensedCamera:
                 raise ObservationError("nothing is seen")
             observation = thing.add(frame)
         except ObservationError:
-            asked = virtual_pose(self.object_frame.pose_in_object(self._truth.pose_in_world(pose)))
+            asked = virtual_pose(
+                self.object_frame.pose_in_object(self._truth.pose_in_world(pose))
+            )
             observation = Observation(
-                np.zeros((SIZE, SIZE), np.float32), asked, pinhole(SIZE, CAMERA_DISTANCE)
+                np.zeros((SIZE, SIZE), np.float32),
+                asked,
+                pinhole(SIZE, CAMERA_DISTANCE),
             )
         if self._metres is None:
             return observation
         return replace(
-            observation, radius=self._metres * self.object_frame.radius / self._truth.radius
+            observation,
+            radius=self._metres * self.object_frame.radius / self._truth.radius,
         )
 
     def frame(self, pose: Float) -> Frame | None:
@@ -125,7 +139,9 @@ class SensedCamera:
         true = believed.copy()
         if self.sensor.turned or self.sensor.moved:
             angles = rng.normal(0, self.sensor.turned, 3)
-            true[:3, :3] = true[:3, :3] @ Rotation.from_rotvec(angles, degrees=True).as_matrix()
+            true[:3, :3] = (
+                true[:3, :3] @ Rotation.from_rotvec(angles, degrees=True).as_matrix()
+            )
             true[:3, 3] += rng.normal(0, self.sensor.moved, 3)
         self.true_pose = true
         depth, whose = self._scene(true)
@@ -135,7 +151,9 @@ class SensedCamera:
         mask = measured > 0
         other = (shown != OBJECT_SURFACE) & (source[part] >= 0)
         if self.sensor.table:
-            left_in = uniform_field(rng, depth.shape, LEFTOVER, part) < self.sensor.table
+            left_in = (
+                uniform_field(rng, depth.shape, LEFTOVER, part) < self.sensor.table
+            )
             other &= (shown != TABLE_SURFACE) | ~left_in
         mask[part] &= ~other
         if self.sensor.crop:
@@ -145,7 +163,10 @@ class SensedCamera:
 
         frame = Frame(measured, self.sensor.intrinsics, believed, pixel_centre=0.5)
         mask[part] &= inside_sphere(
-            frame, self.object_frame.centre, OBJECT_REACH * self.object_frame.radius, part
+            frame,
+            self.object_frame.centre,
+            OBJECT_REACH * self.object_frame.radius,
+            part,
         )
 
         return (
@@ -163,7 +184,9 @@ class SensedCamera:
         Returns:
             A number from 0 to 1; 0 if nothing of the object is in the picture.
         """
-        inside = self._truth.pose_in_object(self._truth.pose_in_world(pose, self.sensor.distance))
+        inside = self._truth.pose_in_object(
+            self._truth.pose_in_world(pose, self.sensor.distance)
+        )
         depth = self._camera.observe(inside).depth
         shown = depth > 0
         count = np.count_nonzero(shown)
@@ -199,7 +222,9 @@ class SensedCamera:
         height = pose[2, 3] - self._floor
         setup = self.sensor
         corners = [
-            (a * self._reach, b * self._reach, self._floor) for a in (-1, 1) for b in (-1, 1)
+            (a * self._reach, b * self._reach, self._floor)
+            for a in (-1, 1)
+            for b in (-1, 1)
         ]
         seen = (np.array(corners) - pose[:3, 3]) @ pose[:3, :3]  # of a square around it
         part = slice(0, setup.height), slice(0, setup.width)
@@ -208,15 +233,23 @@ class SensedCamera:
             at = setup.focal * seen[:, 1::-1] / seen[:, 2:] + np.array(setup.shape) / 2
             part = spans(at.min(0) - 1, at.max(0) + 2, setup.shape)
         x = ((np.arange(setup.width) + 0.5 - setup.width / 2) / setup.focal)[part[1]]
-        y = ((np.arange(setup.height) + 0.5 - setup.height / 2) / setup.focal)[part[0], None]
+        y = ((np.arange(setup.height) + 0.5 - setup.height / 2) / setup.focal)[
+            part[0],
+            None,
+        ]
         falls = x * pose[2, 0] + y * pose[2, 1] + pose[2, 2]
         down = (falls < 0) & (height > 0)
         along = np.where(down, -height / np.where(down, falls, -1), np.inf)
         with np.errstate(invalid="ignore"):
             across = [
-                pose[i, 3] + along * (x * pose[i, 0] + y * pose[i, 1] + pose[i, 2]) for i in (0, 1)
+                pose[i, 3] + along * (x * pose[i, 0] + y * pose[i, 1] + pose[i, 2])
+                for i in (0, 1)
             ]
-            return part, np.where(across[0] ** 2 + across[1] ** 2 < self._reach**2, along, np.inf)
+            return part, np.where(
+                across[0] ** 2 + across[1] ** 2 < self._reach**2,
+                along,
+                np.inf,
+            )
 
     def _cropped(self, depth: Float32, mask: Mask, rng: np.random.Generator) -> Float32:
         """Return the picture without what is beyond a line across the object."""

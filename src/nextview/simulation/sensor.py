@@ -26,7 +26,9 @@ STEEPEST_INCIDENCE = np.radians(80.0)
 # pixels: a window that holds one pixel; the narrowest shadow
 NO_GRAIN = 0.1
 NARROWEST = 1.0
-WIDEST_STEP = 8  # projector columns that two neighbouring pixels of one surface may lie apart
+WIDEST_STEP = (
+    8  # projector columns that two neighbouring pixels of one surface may lie apart
+)
 # limits of numbers, sides of pictures, grain and strength
 LARGEST_SETTING = 10_000
 SIDE = 4096
@@ -135,7 +137,9 @@ class Sensor:
         number(strength, "the strength of a sensor", 0, STRONGEST)
         name = self.name if strength == 1 else f"{self.name}:{strength:g}"
         return replace(
-            self, name=name, **{error: getattr(self, error) * strength for error in ERRORS}
+            self,
+            name=name,
+            **{error: getattr(self, error) * strength for error in ERRORS},
         )
 
     @property
@@ -173,7 +177,11 @@ class Sensor:
         """Itself: what ``SensorMix`` draws anew for every object."""
         return self
 
-    def measure(self, depth: Float32, rng: np.random.Generator) -> tuple[Float32, Index]:
+    def measure(
+        self,
+        depth: Float32,
+        rng: np.random.Generator,
+    ) -> tuple[Float32, Index]:
         """Return what the sensor measures of a true depth image.
 
         An error of strength 0 leaves the image unchanged bit for bit. Each error has its own random
@@ -196,7 +204,11 @@ class Sensor:
         if not depth.size:
             return measured, sources
 
-        intrinsics = self.intrinsics - [[0, 0, part[1].start], [0, 0, part[0].start], [0, 0, 0]]
+        intrinsics = self.intrinsics - [
+            [0, 0, part[1].start],
+            [0, 0, part[0].start],
+            [0, 0, 0],
+        ]
         axial, lateral, grazing, flying, holes = rng.spawn(5)
         q = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0)
         slope = slopes(q)
@@ -207,7 +219,9 @@ class Sensor:
         if self.grazing:
             share = normal_field(grazing, q.shape, self.grain)
             cosine = np.cos(angle)
-            steep = cosine < self.grazing  # no share of it, which is 1 at most, is less elsewhere
+            steep = (
+                cosine < self.grazing
+            )  # no share of it, which is 1 at most, is less elsewhere
             lost[steep] |= cosine[steep] < self.grazing * ndtr(share[steep])
         changed = q
         if self.flying:
@@ -248,12 +262,16 @@ class Sensor:
         z = np.where(q > 0, 1 / np.where(q > 0, q, 1), 1.0)
         along = (self.axial * kinect_axial(z, angle)) ** 2 + self.noise**2
         # The published laws were measured on what came out, in steps already: theirs is taken off.
-        steps = (self.disparity**2 - self.step**2 / 12) / (self.focal * self.baseline) ** 2
+        steps = (self.disparity**2 - self.step**2 / 12) / (
+            self.focal * self.baseline
+        ) ** 2
         sigma = np.sqrt(np.maximum(along / z**4 + steps, 0))
         return np.where(q > 0, q + sigma * normal_field(rng, q.shape, self.grain), 0)
 
 
-ERRORS = tuple(field.name for field in fields(Sensor))[10:]  # the strengths, from axial on
+ERRORS = tuple(field.name for field in fields(Sensor))[
+    10:
+]  # the strengths, from axial on
 
 _SETUP: dict[str, Any] = {
     "turned": 0.3,
@@ -310,7 +328,14 @@ _SIDE = 224
 _RADIUS = SENSORS["none"].radius
 _FOCAL = float(pinhole(_SIDE, CAMERA_DISTANCE)[0, 0])
 # the networks' own camera
-RENDER = Sensor("render", _SIDE, _SIDE, _FOCAL, distance=CAMERA_DISTANCE * _RADIUS, radius=_RADIUS)
+RENDER = Sensor(
+    "render",
+    _SIDE,
+    _SIDE,
+    _FOCAL,
+    distance=CAMERA_DISTANCE * _RADIUS,
+    radius=_RADIUS,
+)
 
 
 @dataclass(frozen=True)
@@ -338,7 +363,11 @@ class SensorMix:
         """A sensor in a setup, for one object."""
         kind = rng.choice(["render", "kinect", "stereo"], p=[0.5, 0.2, 0.3])
         if kind == "render":
-            errors = {"noise": (0.6, 0.02 * _RADIUS), "holes": (0.4, 0.25), "grain": (0.3, 2.0)}
+            errors = {
+                "noise": (0.6, 0.02 * _RADIUS),
+                "holes": (0.4, 0.25),
+                "grain": (0.3, 2.0),
+            }
             sensor = replace(RENDER, **_some(rng, errors))
         else:
             sensor = SENSORS[str(kind)].scaled(float(rng.uniform(0, 2)))
@@ -360,7 +389,10 @@ class SensorMix:
         return {"name": self.name, **asdict(self)}
 
 
-def _some(rng: np.random.Generator, errors: dict[str, tuple[float, float]]) -> dict[str, Any]:
+def _some(
+    rng: np.random.Generator,
+    errors: dict[str, tuple[float, float]],
+) -> dict[str, Any]:
     """Strengths of some errors, each with its chance of being there and its greatest strength."""
     there, share = rng.random((2, len(errors)))
     chance, most = np.array(list(errors.values())).T
@@ -373,7 +405,9 @@ def sensor_named(text: str | Sensor | SensorMix) -> Sensor | SensorMix:
         return text
     name, given, strength = str(text).partition(":")
     if name not in (*SENSORS, "mix"):
-        raise UsageError(f"no sensor is called {name!r}; there are {', '.join(SENSORS)} and mix")
+        raise UsageError(
+            f"no sensor is called {name!r}; there are {', '.join(SENSORS)} and mix"
+        )
     try:
         times = float(strength) if given else 1.0
     except ValueError:
@@ -404,7 +438,12 @@ def _slope(q: Float) -> Float:
     return np.where(np.isfinite(smaller), smaller, 0.0)
 
 
-def shifted(q: Float, slope: tuple[Float, Float], right: Index, down: Index) -> tuple[Float, Index]:
+def shifted(
+    q: Float,
+    slope: tuple[Float, Float],
+    right: Index,
+    down: Index,
+) -> tuple[Float, Index]:
     """Show in each pixel the surface of a neighbour, where the pixel's own ray meets it.
 
     Edges move, and planes stay.
@@ -422,9 +461,15 @@ def shifted(q: Float, slope: tuple[Float, Float], right: Index, down: Index) -> 
     column = np.arange(q.shape[1])
     at_row = np.clip(row + down, 0, len(q) - 1)
     at_column = np.clip(column + right, 0, q.shape[1] - 1)
-    at = at_row * q.shape[1] + at_column  # one index into all rows: NumPy takes half the time
+    at = (
+        at_row * q.shape[1] + at_column
+    )  # one index into all rows: NumPy takes half the time
     there = q.take(at)
-    moved = there - slope[0].take(at) * (at_column - column) - slope[1].take(at) * (at_row - row)
+    moved = (
+        there
+        - slope[0].take(at) * (at_column - column)
+        - slope[1].take(at) * (at_row - row)
+    )
     # a slope seen edge-on leads anywhere
     moved = np.where(np.abs(moved - there) < 0.1 * there, moved, there)
     return np.where(there > 0, moved, 0), at
@@ -449,7 +494,11 @@ def incidence(q: Float, slope: tuple[Float, Float], intrinsics: Float) -> Float:
     b = slope[1] * camera.fy
     c = q - a * x - b * y
     length = np.sqrt((a * a + b * b + c * c) * (x * x + y * y + 1))
-    return np.where(q > 0, np.arccos(np.clip(q / np.where(length > 0, length, 1), 0, 1)), 0.0)
+    return np.where(
+        q > 0,
+        np.arccos(np.clip(q / np.where(length > 0, length, 1), 0, 1)),
+        0.0,
+    )
 
 
 def across_edges(q: Float, slope: tuple[Float, Float]) -> Float:
@@ -504,7 +553,9 @@ def in_shadow(q: Float, focal: float, baseline: float) -> Mask:
     joined[:, :-1] = seen[:, :-1] & seen[:, 1:] & (bend <= DEPTH_EDGE * q[:, :-1])
     last = np.where(joined, np.roll(column, -1, 1), column)
     # One index into all rows: NumPy takes half the time.
-    first_index, last_index = (first_in_row + np.rint(at).astype(int) for at in (column, last))
+    first_index, last_index = (
+        first_in_row + np.rint(at).astype(int) for at in (column, last)
+    )
     flat = lit.reshape(-1)
     at = first_index[seen]
     end = last_index[seen]
@@ -548,7 +599,10 @@ def kinect_lateral(angle: Floats) -> Float:
 
 
 def normal_field(
-    rng: np.random.Generator, shape: tuple[int, int], grain: float, part: Part | None = None
+    rng: np.random.Generator,
+    shape: tuple[int, int],
+    grain: float,
+    part: Part | None = None,
 ) -> Float:
     """Draw white noise of variance 1 under a Gaussian window.
 
@@ -568,7 +622,8 @@ def normal_field(
 
     far = int(4 * grain + 0.5) + 1  # as far as the window reaches
     inside = all(
-        s.start >= far and s.stop + far <= side for s, side in zip(part, shape, strict=True)
+        s.start >= far and s.stop + far <= side
+        for s, side in zip(part, shape, strict=True)
     )
     if inside:
         rows, columns = (slice(s.start - far, s.stop + far) for s in part)
@@ -589,7 +644,10 @@ def _power(grain: float) -> float:
 
 
 def uniform_field(
-    rng: np.random.Generator, shape: tuple[int, int], grain: float, part: Part | None = None
+    rng: np.random.Generator,
+    shape: tuple[int, int],
+    grain: float,
+    part: Part | None = None,
 ) -> Float:
     """Draw numbers between 0 and 1 with correlated neighbours, as in ``normal_field``.
 

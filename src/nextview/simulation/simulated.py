@@ -9,7 +9,12 @@ from numpy.typing import NDArray
 from nextview.checks import whole
 from nextview.geometry.depth import AMBIENT
 from nextview.geometry.mesh import Mesh
-from nextview.geometry.observation import Observation, checked_intrinsics, checked_pose, pinhole
+from nextview.geometry.observation import (
+    Observation,
+    checked_intrinsics,
+    checked_pose,
+    pinhole,
+)
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster, embree_scene
 from nextview.geometry.viewsphere import CAMERA_DISTANCE
@@ -33,7 +38,8 @@ def _dot(a: Float32, b: Float32) -> Float32:
 
 
 SHOWS_NOTHING, SHOWS_TARGET, SHOWS_OTHER, SHOWS_TABLE = np.arange(
-    4, dtype=np.uint8
+    4,
+    dtype=np.uint8,
 )  # what a pixel shows
 # how much nearer than the target something has to be to hide it, object radii: the table touches it
 OCCLUDER_GAP = 1e-4
@@ -110,10 +116,17 @@ class SimulatedCamera:
             squared = _dot(normals, normals)
             # not 0 where that square is
             cosine /= np.sqrt(squared) * self._ray_length[bound].ravel() + 1e-18
-            doubtful = np.flatnonzero(hit & ((cosine < EDGE_ON) | (squared < SLIVER**2)))
-            where = hits["tfar"][doubtful, None] * self._rays[bound].reshape(-1, 3)[doubtful]
+            doubtful = np.flatnonzero(
+                hit & ((cosine < EDGE_ON) | (squared < SLIVER**2))
+            )
+            where = (
+                hits["tfar"][doubtful, None]
+                * self._rays[bound].reshape(-1, 3)[doubtful]
+            )
             # (n, 3, xyz)
-            corners = (self._corners.T[self._faces[hits["primID"][doubtful]]] - origin) @ rotation
+            corners = (
+                self._corners.T[self._faces[hits["primID"][doubtful]]] - origin
+            ) @ rotation
             hit[doubtful] = (
                 (where > corners.min(1) - STRAY) & (where < corners.max(1) + STRAY)
             ).all(1)
@@ -130,10 +143,19 @@ class SimulatedCamera:
             return slice(0, height), slice(0, width)
         (fx, _, cx), (_, fy, cy) = self.intrinsics[:2]
         spans = []
-        for projected, focal, centre, side in ((y / z, fy, cy, height), (x / z, fx, cx, width)):
+
+        for projected, focal, centre, side in (
+            (y / z, fy, cy, height),
+            (x / z, fx, cx, width),
+        ):
             low = projected.min() * focal + centre
             high = projected.max() * focal + centre
-            spans.append(slice(*np.clip([int(np.floor(low)) - 1, int(np.ceil(high)) + 1], 0, side)))
+            spans.append(
+                slice(
+                    *np.clip([int(np.floor(low)) - 1, int(np.ceil(high)) + 1], 0, side)
+                )
+            )
+
         return spans[0], spans[1]
 
 
@@ -141,12 +163,19 @@ class OccludedCamera:
     """A camera in front of the target of a scene; what hides it is cut out."""
 
     def __init__(
-        self, scene: "TargetScene", size: int = 224, distance: float = CAMERA_DISTANCE
+        self,
+        scene: "TargetScene",
+        size: int = 224,
+        distance: float = CAMERA_DISTANCE,
     ) -> None:
         self.scene = scene
         self._target = SimulatedCamera(scene.target, size, distance)
         self._others = RayCaster(
-            [(mesh.vertices, mesh.faces) for mesh in (scene.table, scene.around) if mesh]
+            [
+                (mesh.vertices, mesh.faces)
+                for mesh in (scene.table, scene.around)
+                if mesh
+            ]
         )
         self._rays = PinholeCamera.of(pinhole(size, distance), (size, size)).rays
 
@@ -164,7 +193,11 @@ class OccludedCamera:
     def visible_share(self, pose: Float) -> float:
         """Return the visible share of the target's picture from a pose, (4, 4)."""
         seen = self._target.observe(pose)
-        return 1 - np.count_nonzero(self._hidden(seen)) / seen.visible if seen.visible else 0.0
+        return (
+            1 - np.count_nonzero(self._hidden(seen)) / seen.visible
+            if seen.visible
+            else 0.0
+        )
 
     def _hidden(self, seen: Observation) -> Mask:
         """Pixels of the target alone before which something stands, (H, W)."""
@@ -179,9 +212,16 @@ class OccludedCamera:
 class SceneCamera:
     """Shows a whole scene through a pinhole, (3, 3), pixels, first pixel's centre at 0.5."""
 
-    def __init__(self, scene: "TargetScene", intrinsics: Float, shape: tuple[int, int]) -> None:
+    def __init__(
+        self,
+        scene: "TargetScene",
+        intrinsics: Float,
+        shape: tuple[int, int],
+    ) -> None:
         meshes = (scene.target, scene.table, scene.around)
-        self._caster = RayCaster([(mesh.vertices, mesh.faces) for mesh in meshes if mesh])
+        self._caster = RayCaster(
+            [(mesh.vertices, mesh.faces) for mesh in meshes if mesh]
+        )
         self._rays = PinholeCamera.of(checked_intrinsics(intrinsics, shape), shape).rays
         self._owners = np.array([SHOWS_TARGET, SHOWS_TABLE, SHOWS_OTHER, SHOWS_NOTHING])
 
@@ -200,7 +240,12 @@ class SceneCamera:
         ].reshape(shape)
 
 
-def visible_shares(scene: "TargetScene", poses: Float, size: int, distance: float) -> Float:
+def visible_shares(
+    scene: "TargetScene",
+    poses: Float,
+    size: int,
+    distance: float,
+) -> Float:
     """Return the share of the target's picture that nothing hides, from each pose.
 
     Args:

@@ -97,7 +97,9 @@ class SimulatedTable:
                 raise UsageError(f"{mesh.name}: the unit of length is not known")
             metres = (mesh.vertices * mesh.radius + mesh.centre) * UNITS[mesh.unit]
             poses = resting(mesh)
-            turn = rotation_z(rng.uniform(0, 2 * np.pi)) @ poses[rng.integers(len(poses))]
+            turn = (
+                rotation_z(rng.uniform(0, 2 * np.pi)) @ poses[rng.integers(len(poses))]
+            )
             turned = metres @ turn.T
             middle = (turned.min(0) + turned.max(0)) / 2
             start = np.array([middle[0], middle[1], turned[:, 2].min()])
@@ -113,7 +115,10 @@ class SimulatedTable:
 
 
 def _free_place(
-    outline: Float, others: Sequence[Float], rng: np.random.Generator, gap: float
+    outline: Float,
+    others: Sequence[Float],
+    rng: np.random.Generator,
+    gap: float,
 ) -> Float:
     """Where a thing with an outline, (K, 2), about the origin has a gap to all others, (2,)."""
     if not others:
@@ -147,7 +152,12 @@ class TableCamera:
             (4, 4) float64.
     """
 
-    def __init__(self, table: SimulatedTable, sensor: Sensor, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        table: SimulatedTable,
+        sensor: Sensor,
+        rng: np.random.Generator,
+    ) -> None:
         """Set a camera up over a table.
 
         Args:
@@ -162,14 +172,21 @@ class TableCamera:
         self.lean[:3, :3] = Rotation.from_rotvec(angles, degrees=True).as_matrix()
         self._count = 0
         self.change(table)
-        self._rays = PinholeCamera.of(sensor.intrinsics, sensor.shape).rays.reshape(-1, 3)
+        self._rays = PinholeCamera.of(sensor.intrinsics, sensor.shape).rays.reshape(
+            -1,
+            3,
+        )
 
     def change(self, table: SimulatedTable) -> None:
         """Put another table in the place of the one so far: somebody moved a thing."""
         self.table = table
         self._count = len(table.things)
-        things: list[Triangles] = [(thing.placed, thing.faces) for thing in table.things]
-        size = np.array([[*TABLE_SIDES, TABLE_THICKNESS], [FLOOR_SIDE, FLOOR_SIDE, 0.01]])
+        things: list[Triangles] = [
+            (thing.placed, thing.faces) for thing in table.things
+        ]
+        size = np.array(
+            [[*TABLE_SIDES, TABLE_THICKNESS], [FLOOR_SIDE, FLOOR_SIDE, 0.01]]
+        )
         for box, height in zip(size, (-TABLE_THICKNESS, -TABLE_HEIGHT), strict=True):
             mesh = upright_boxes(box[None], np.zeros(1), np.zeros((1, 2)), height)
             things.append((mesh.vertices, mesh.faces))
@@ -192,14 +209,18 @@ class TableCamera:
         rng = self._rng.spawn(1)[0]
         true = np.linalg.inv(self.lean) @ pose
         turn = rng.normal(0, self.sensor.turned, 3)
-        true[:3, :3] = true[:3, :3] @ Rotation.from_rotvec(turn, degrees=True).as_matrix()
+        true[:3, :3] = (
+            true[:3, :3] @ Rotation.from_rotvec(turn, degrees=True).as_matrix()
+        )
         true[:3, 3] += rng.normal(0, self.sensor.moved, 3)
 
         self.true_pose = true
         depth, owner = self._caster.cast(true[:3, 3], self._rays @ true[:3, :3].T)
         seen = np.isfinite(depth)
         if not seen.any():
-            raise ObservationError("nothing is seen: the camera looks past the table and the floor")
+            raise ObservationError(
+                "nothing is seen: the camera looks past the table and the floor"
+            )
         clean = np.where(seen, depth, 0).reshape(self.sensor.shape).astype(np.float32)
         measured, source = self.sensor.measure(clean, rng)
         owner = np.where((owner >= 0) & (owner < self._count), owner, -1)
@@ -209,7 +230,12 @@ class TableCamera:
         return Frame(measured, self.sensor.intrinsics, pose, pixel_centre=0.5)
 
 
-def poses_around(azimuths: Floats, elevation: float, distance: float, centre: Float) -> Float:
+def poses_around(
+    azimuths: Floats,
+    elevation: float,
+    distance: float,
+    centre: Float,
+) -> Float:
     """Level cameras around a place, that look at it.
 
     Args:
@@ -221,6 +247,10 @@ def poses_around(azimuths: Floats, elevation: float, distance: float, centre: Fl
     Returns:
         Camera-to-world poses, (V, 4, 4), metres, OpenCV axes.
     """
-    poses = look_at_origin(np.full(len(azimuths), elevation), np.asarray(azimuths), distance)
+    poses = look_at_origin(
+        np.full(len(azimuths), elevation),
+        np.asarray(azimuths),
+        distance,
+    )
     poses[:, :3, 3] += centre
     return poses

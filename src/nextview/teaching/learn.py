@@ -19,7 +19,15 @@ from nextview.data.pool import WorkerDied, each
 from nextview.data.pool import count as count_workers
 from nextview.data.progress import TrackProgress, silently
 from nextview.errors import DatasetError, NextviewError, UsageError
-from nextview.files import check_new, command, new_file, new_folder, only_one, sha256_of, unfinished
+from nextview.files import (
+    check_new,
+    command,
+    new_file,
+    new_folder,
+    only_one,
+    sha256_of,
+    unfinished,
+)
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import Features
 from nextview.recognition.model_card import (
@@ -59,13 +67,21 @@ from nextview.teaching.verification_fit import (
     to_be_shown,
     with_new_things,
 )
-from nextview.things.memory import AZIMUTHS, Memory, TaughtRecogniser, check_features, open_memory
+from nextview.things.memory import (
+    AZIMUTHS,
+    Memory,
+    TaughtRecogniser,
+    check_features,
+    open_memory,
+)
 from nextview.things.stored_surfaces import StoredSurfaces
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 from nextview.types import Index
 
-MEMORY_NAME = "memory"  # of the card in a folder of taught things, and of the file beside it
+MEMORY_NAME = (
+    "memory"  # of the card in a folder of taught things, and of the file beside it
+)
 CARD = f"{MEMORY_NAME}.json"
 MEMORY_FILE = f"{MEMORY_NAME}{MEMORY_SUFFIX}"
 LEARNED_PICTURE = "learned.png"
@@ -131,7 +147,8 @@ class Learned:
         thing = "thing" if self.things == 1 else "things"
         lines = [f"{self.things} {thing}{classes} learned; {self._how_often()}"]
         lines += [
-            f"confused: {a} and {b} ({share:.0%} of the cases)" for a, b, share in self.confused[:5]
+            f"confused: {a} and {b} ({share:.0%} of the cases)"
+            for a, b, share in self.confused[:5]
         ]
         if len(self.confused) > 5:
             lines.append(f"and {len(self.confused) - 5} pairs less often")
@@ -199,7 +216,11 @@ class LearnOptions(TypedDict, total=False):
     track: TrackProgress
 
 
-def learn(folder: str | Path, out: str | Path, **options: Unpack[LearnOptions]) -> Learned:
+def learn(
+    folder: str | Path,
+    out: str | Path,
+    **options: Unpack[LearnOptions],
+) -> Learned:
     """Teach the things in a folder and write a memory that recognises them.
 
     Each mesh file is a thing, as is each folder of captured depth frames. An interrupted run
@@ -269,7 +290,9 @@ def learn_things(
     keeps = add or bool(remove)
     _check_places(out, keeps, overwrite)
     nothing_new = bool(remove) and folder.resolve() == out.resolve()
-    found = Found([], []) if nothing_new else find_things(folder, out, how.one_class or add)
+    found = (
+        Found([], []) if nothing_new else find_things(folder, out, how.one_class or add)
+    )
     left_out = list(found.left_out)
 
     with only_one(out), unfinished(out, PARTS) as part:
@@ -281,7 +304,9 @@ def learn_things(
         work = Work(how, part, workers, scheduler, track)
         track(_teach(found.things, work, taught, left_out), len(found.things), "things")
         if not taught and nothing_new:
-            raise UsageError(f"{out}: no thing would be left; delete the folder instead")
+            raise UsageError(
+                f"{out}: no thing would be left; delete the folder instead"
+            )
         if not taught:
             raise DatasetError(
                 f"{folder}: none of its things could be taught ({'; '.join(left_out[:3])})"
@@ -350,7 +375,10 @@ def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]
         arrays["radii"] = arrays["radii"].reshape(1)
         surface = memory.surfaces.surface(index, thing.name)
         if surface is not None:
-            symmetries = np.array([(*one.axis, one.order) for one in thing.symmetries], np.float64)
+            symmetries = np.array(
+                [(*one.axis, one.order) for one in thing.symmetries],
+                np.float64,
+            )
             arrays |= {
                 VERTICES: surface.vertices,
                 FACES: surface.faces,
@@ -364,7 +392,10 @@ PER_THING = ("held_out", "held_out_views", "radii", "pictures")
 
 
 def _teach(
-    sources: Sequence[ThingSource], work: Work, taught: list[Pair], left_out: list[str]
+    sources: Sequence[ThingSource],
+    work: Work,
+    taught: list[Pair],
+    left_out: list[str],
 ) -> Iterator[int]:
     """Teach things in parallel, each into its own file; finished ones are kept."""
     waiting = []
@@ -378,7 +409,11 @@ def _teach(
     # the longest first: none is left alone at the end
     waiting.sort(key=lambda item: -item[0].path.stat().st_size)
     # A thing alone takes all cores.
-    threads = 1 if work.scheduler else max(1, count_workers(work.workers) // max(1, len(waiting)))
+    threads = (
+        1
+        if work.scheduler
+        else max(1, count_workers(work.workers) // max(1, len(waiting)))
+    )
     teach_one = partial(_teach_one, work.how, work.part, threads)
 
     before = len(sources) - len(waiting)
@@ -418,7 +453,12 @@ def _stamp(source: ThingSource, how: TeachingOptions) -> str:
 
     features = find_card(FEATURE_NETWORK).sha256
     return repr(
-        (str(source.path.resolve()), content.hexdigest(), replace(how, any_size=False), features)
+        (
+            str(source.path.resolve()),
+            content.hexdigest(),
+            replace(how, any_size=False),
+            features,
+        )
     )
 
 
@@ -432,7 +472,9 @@ def _files_of(path: Path) -> Iterator[Path]:
         real = Path(place).resolve()
         above = {real, *real.parents}
         # A link to a folder above would be walked for ever.
-        folders[:] = [name for name in sorted(folders) if Path(place, name).resolve() not in above]
+        folders[:] = [
+            name for name in sorted(folders) if Path(place, name).resolve() not in above
+        ]
         yield from (Path(place, name) for name in sorted(names))
 
 
@@ -458,7 +500,10 @@ def _finished(file: Path, stamp: str) -> Arrays | None:
 
 
 def _teach_one(
-    how: TeachingOptions, part: Path, threads: int, item: tuple[ThingSource, str]
+    how: TeachingOptions,
+    part: Path,
+    threads: int,
+    item: tuple[ThingSource, str],
 ) -> Arrays | str:
     """What is to be remembered of one thing; a sentence where it cannot be taught."""
     source, stamp = item
@@ -474,7 +519,11 @@ def _teach_one(
 
 
 def _write(
-    out: Path, taught: Sequence[Pair], left_out: Sequence[str], old: ModelCard | None, work: Work
+    out: Path,
+    taught: Sequence[Pair],
+    left_out: Sequence[str],
+    old: ModelCard | None,
+    work: Work,
 ) -> Learned:
     """Fit what is fitted to all things together, and write memory and card.
 
@@ -485,13 +534,22 @@ def _write(
     classes = tuple(dict.fromkeys(source.label for source, _ in taught))
     label = np.array([classes.index(source.label) for source, _ in taught])
     memory, fit = _fitted(taught, label)
-    card = _card(taught, classes, label, memory, fit, () if old is None else old.training.commands)
+    card = _card(
+        taught,
+        classes,
+        label,
+        memory,
+        fit,
+        () if old is None else old.training.commands,
+    )
     verified = _verified(card, memory, old, work)
     if verified is not None:
         card = _with_verification(card, memory, verified)
         if verified.accuracy:
             first = [int(np.flatnonzero(label == c)[0]) for c in range(len(classes))]
-            confused = tuple((first[a], first[b], share) for a, b, share in verified.confused)
+            confused = tuple(
+                (first[a], first[b], share) for a, b, share in verified.confused
+            )
             fit = replace(fit, accuracy=verified.accuracy, confused=confused)
 
     with new_folder(out, overwrite=True, last=CARD) as part:
@@ -532,7 +590,10 @@ def _save(folder: Path, card: ModelCard, memory: Memory) -> Path:
 
 
 def _verified(
-    card: ModelCard, memory: Memory, old: ModelCard | None, work: Work
+    card: ModelCard,
+    memory: Memory,
+    old: ModelCard | None,
+    work: Work,
 ) -> VerifiedFit | None:
     """Show things of known geometry, and fit to what is found; None if there are none.
 
@@ -553,17 +614,36 @@ def _verified(
     labels = class_of_things(recogniser, known)
     before = None if old is None or old.memory is None else old.memory.verification
     rng = np.random.default_rng(work.how.seed)
-    if old is None or old.memory is None or before is None or len(labels) >= GROWTH * before.things:
-        return fit_verification(_shown(folder, range(len(labels)), len(labels), rng, work), labels)
+    if (
+        old is None
+        or old.memory is None
+        or before is None
+        or len(labels) >= GROWTH * before.things
+    ):
+        return fit_verification(
+            _shown(folder, range(len(labels)), len(labels), rng, work),
+            labels,
+        )
 
     names = [thing.name for thing in old.memory.things]
-    carried = np.array([names.index(name) if name in names else -1 for name in known.names])
+    carried = np.array(
+        [names.index(name) if name in names else -1 for name in known.names]
+    )
     new = np.flatnonzero(carried < 0).tolist()
-    return with_new_things(before, _shown(folder, new, len(labels), rng, work), labels, carried)
+    return with_new_things(
+        before,
+        _shown(folder, new, len(labels), rng, work),
+        labels,
+        carried,
+    )
 
 
 def _shown(
-    folder: Path, things: Sequence[int], known: int, rng: np.random.Generator, work: Work
+    folder: Path,
+    things: Sequence[int],
+    known: int,
+    rng: np.random.Generator,
+    work: Work,
 ) -> list[Shown]:
     """Show things to the memory in parallel; sorted, so that the order does not matter."""
     items = to_be_shown(things, known, rng)
@@ -572,10 +652,13 @@ def _shown(
     def watched() -> Iterator[int]:
         show_one = partial(show, folder / CARD, work.how.sensor, work.how.seed)
         for count, (item, result) in enumerate(
-            each(show_one, items, work.workers, work.scheduler), 1
+            each(show_one, items, work.workers, work.scheduler),
+            1,
         ):
             if isinstance(result, WorkerDied):
-                raise DatasetError(f"{folder}: its things could not be shown ({result})")
+                raise DatasetError(
+                    f"{folder}: its things could not be shown ({result})"
+                )
             found[item] = result
             yield count
 
@@ -584,7 +667,11 @@ def _shown(
     return [one for item in sorted(found) for one in found[item]]
 
 
-def _with_verification(card: ModelCard, memory: Memory, verified: VerifiedFit) -> ModelCard:
+def _with_verification(
+    card: ModelCard,
+    memory: Memory,
+    verified: VerifiedFit,
+) -> ModelCard:
     """Return a card with the fits to the surfaces; residuals are 0 without geometry."""
     about = card.memory
     assert about is not None
@@ -599,13 +686,17 @@ def _with_verification(card: ModelCard, memory: Memory, verified: VerifiedFit) -
         scores["verified by geometry"] = _by_views(verified.accuracy)
         scores["the same by features"] = _by_views(verified.by_features)
     return replace_record(
-        card, memory=replace_record(about, verification=verification), scores=scores
+        card,
+        memory=replace_record(about, verification=verification),
+        scores=scores,
     )
 
 
 def _by_views(shares: Sequence[float]) -> dict[str, float]:
     """Shares after 1, 2, ... views, as a card holds them."""
-    return {str(k): round(share, 4) for k, share in zip(VIEWS_FITTED, shares, strict=False)}
+    return {
+        str(k): round(share, 4) for k, share in zip(VIEWS_FITTED, shares, strict=False)
+    }
 
 
 def _fitted(taught: Sequence[Pair], label: Index) -> tuple[Memory, Fit]:
@@ -615,17 +706,32 @@ def _fitted(taught: Sequence[Pair], label: Index) -> tuple[Memory, Fit]:
     """
     poses = [len(arrays["views"]) for _, arrays in taught]
     thing = np.repeat(np.arange(len(taught)), poses)
-    stacked = {name: np.stack([arrays[name] for _, arrays in taught]) for name in PER_THING}
+    stacked = {
+        name: np.stack([arrays[name] for _, arrays in taught]) for name in PER_THING
+    }
     stacked["radii"] = stacked["radii"][:, 0]
     joint = {
         name: np.concatenate([arrays[name] for _, arrays in taught])
         for name in ("views", "rotations")
     }
-    fit = fit_memory(joint["views"], thing, label, *(stacked[name] for name in PER_THING[:3]))
-    surfaces = StoredSurfaces.of([_surface_of(source, arrays) for source, arrays in taught])
-    memory = Memory(
-        thing=thing, head=fit.head, head_bias=fit.head_bias, surfaces=surfaces, **joint, **stacked
+    fit = fit_memory(
+        joint["views"],
+        thing,
+        label,
+        *(stacked[name] for name in PER_THING[:3]),
     )
+    surfaces = StoredSurfaces.of(
+        [_surface_of(source, arrays) for source, arrays in taught]
+    )
+    memory = Memory(
+        thing=thing,
+        head=fit.head,
+        head_bias=fit.head_bias,
+        surfaces=surfaces,
+        **joint,
+        **stacked,
+    )
+
     return memory, fit
 
 
@@ -656,7 +762,8 @@ def _card(
 
     features = find_card(FEATURE_NETWORK)
     novelty, usual = (
-        tuple(map(tuple, np.round(rows, 4).tolist())) for rows in (fit.quantiles, fit.usual)
+        tuple(map(tuple, np.round(rows, 4).tolist()))
+        for rows in (fit.quantiles, fit.usual)
     )
 
     return ModelCard(
@@ -668,16 +775,27 @@ def _card(
         classes=classes,
         azimuth_bins=AZIMUTHS,
         calibration=Calibration(
-            1.0, 1.0, None, fit.correlation, tuple(label[memory.thing].tolist())
+            1.0,
+            1.0,
+            None,
+            fit.correlation,
+            tuple(label[memory.thing].tolist()),
         ),
         size=size_evidence(memory.radii, label),
         training=Training(f"{len(taught)} things", commands=commands),
         scores={
             "held-out views": {
-                str(k): round(a, 4) for k, a in zip(VIEWS_FITTED, fit.accuracy, strict=True)
+                str(k): round(a, 4)
+                for k, a in zip(VIEWS_FITTED, fit.accuracy, strict=True)
             }
         },
-        memory=Taught(things, features.sha256, fit.weight, novelty=novelty, usual=usual),
+        memory=Taught(
+            things,
+            features.sha256,
+            fit.weight,
+            novelty=novelty,
+            usual=usual,
+        ),
     ).made_by(command())
 
 
@@ -733,17 +851,29 @@ def _notes(taught: Sequence[Pair]) -> tuple[str, ...]:
     first: dict[bytes, str] = {}
     for source, arrays in taught:
         # The picture is a render without errors: only the same mesh gives the very same one.
-        look = arrays["pictures"].tobytes() + np.round(np.log(arrays["radii"]), 3).tobytes()
+        look = (
+            arrays["pictures"].tobytes()
+            + np.round(np.log(arrays["radii"]), 3).tobytes()
+        )
         if (twin := first.setdefault(look, source.name)) != source.name:
-            notes.append(f"{twin} and {source.name} look the same: one thing under two names?")
+            notes.append(
+                f"{twin} and {source.name} look the same: one thing under two names?"
+            )
     for source, arrays in taught:
         # of what was taught now, from a mesh file
         doubts = arrays.get("doubts", np.zeros(0, np.uint8))
-        notes.extend(f"{source.name}: {doubt}" for doubt in doubts.tobytes().decode().splitlines())
+        notes.extend(
+            f"{source.name}: {doubt}"
+            for doubt in doubts.tobytes().decode().splitlines()
+        )
     for source, arrays in taught:
         if not arrays["held_out"].any():
-            notes.append(f"{source.name}: the sensor sees nothing of it; is it in another unit?")
-    unknown = [source.name for source, arrays in taught if not np.isfinite(arrays["radii"])]
+            notes.append(
+                f"{source.name}: the sensor sees nothing of it; is it in another unit?"
+            )
+    unknown = [
+        source.name for source, arrays in taught if not np.isfinite(arrays["radii"])
+    ]
     if unknown and len(taught) > 1:
         notes.append(
             f"the size of {len(unknown)} of {len(taught)} things is not known; --unit makes it"

@@ -49,7 +49,11 @@ def draw_learned(path: Path, pictures: ThingPictures, fit: Fit) -> None:
     pairs_height = LINE + (LINE + ROW if pairs else 0)
     height = TITLE_HEIGHT + rows * ROW + pairs_height + PICTURE_MARGIN
 
-    figure = Figure(figsize=(PAGE_WIDTH, height), dpi=PIXELS_PER_INCH, facecolor="white")
+    figure = Figure(
+        figsize=(PAGE_WIDTH, height),
+        dpi=PIXELS_PER_INCH,
+        facecolor="white",
+    )
     # one for all pictures: axes take longer than what is in them
     page = figure.add_axes((0, 0, 1, 1))
     page.set_axis_off()
@@ -57,7 +61,11 @@ def draw_learned(path: Path, pictures: ThingPictures, fit: Fit) -> None:
     _draw_things(page, pictures, shown)
     _draw_bars(figure, fit, height)
     _draw_pairs(page, pictures, pairs, TITLE_HEIGHT + rows * ROW + LINE)
-    page.set(xlim=(0, PAGE_WIDTH), ylim=(height, 0), aspect="auto")  # a picture sets them anew
+    page.set(
+        xlim=(0, PAGE_WIDTH),
+        ylim=(height, 0),
+        aspect="auto",
+    )  # a picture sets them anew
     figure.savefig(path)
 
 
@@ -65,16 +73,26 @@ def _even_choice(names: list[str]) -> list[str]:
     """All names, or an even choice of MOST_THINGS_SHOWN."""
     if len(names) <= MOST_THINGS_SHOWN:
         return names
-    return [names[k * len(names) // MOST_THINGS_SHOWN] for k in range(MOST_THINGS_SHOWN)]
+    return [
+        names[k * len(names) // MOST_THINGS_SHOWN] for k in range(MOST_THINGS_SHOWN)
+    ]
 
 
 def _draw_things(page: Axes, pictures: ThingPictures, shown: list[str]) -> None:
-    title = "1 thing learned" if len(pictures) == 1 else f"{len(pictures)} things learned"
+    title = (
+        "1 thing learned" if len(pictures) == 1 else f"{len(pictures)} things learned"
+    )
     page.text(PICTURE_MARGIN, 0.45, title, size=17, color=PICTURE_INK, weight="bold")
+
     if len(shown) < len(pictures):
         page.text(
-            PICTURE_MARGIN, 0.66, f"{len(shown)} of them, evenly chosen:", size=9, color=QUIET
+            PICTURE_MARGIN,
+            0.66,
+            f"{len(shown)} of them, evenly chosen:",
+            size=9,
+            color=QUIET,
         )
+
     for k, name in enumerate(shown):
         row, column = _place(k)
         left = PICTURE_MARGIN + column * (PICTURE_WIDTH + PICTURE_GAP)
@@ -95,7 +113,9 @@ def _draw_bars(figure: Figure, fit: Fit, height: float) -> None:
     size = THING_ROWS * ROW - 2 * LINE - 0.5
     bottom = height - TITLE_HEIGHT - 0.3 - size
     width = PAGE_WIDTH - PICTURE_MARGIN - left
-    axes = figure.add_axes((left / PAGE_WIDTH, bottom / height, width / PAGE_WIDTH, size / height))
+    axes = figure.add_axes(
+        (left / PAGE_WIDTH, bottom / height, width / PAGE_WIDTH, size / height)
+    )
 
     views = [str(k) for k in VIEWS_FITTED[: len(fit.accuracy)]]
     bars = axes.bar(views, [100 * a for a in fit.accuracy], color=BAR, width=0.6)
@@ -111,7 +131,10 @@ def _draw_bars(figure: Figure, fit: Fit, height: float) -> None:
 
 
 def _draw_pairs(
-    page: Axes, pictures: ThingPictures, pairs: list[tuple[str, str, float]], top: float
+    page: Axes,
+    pictures: ThingPictures,
+    pairs: list[tuple[str, str, float]],
+    top: float,
 ) -> None:
     heading = (
         "confused most, share of the cases after two views"
@@ -125,7 +148,11 @@ def _draw_pairs(
         left = PICTURE_MARGIN + k * each
         _draw_picture(page, left, top + 1.6 * LINE, pictures[first], first)
         _draw_picture(
-            page, left + PICTURE_WIDTH + PICTURE_GAP, top + 1.6 * LINE, pictures[second], second
+            page,
+            left + PICTURE_WIDTH + PICTURE_GAP,
+            top + 1.6 * LINE,
+            pictures[second],
+            second,
         )
         page.text(
             left + PICTURE_WIDTH + PICTURE_GAP / 2,
@@ -138,12 +165,24 @@ def _draw_pairs(
 
 
 def _draw_picture(
-    page: Axes, left: float, top: float, picture: NDArray[np.uint8], name: str
+    page: Axes,
+    left: float,
+    top: float,
+    picture: NDArray[np.uint8],
+    name: str,
 ) -> None:
     """A small picture with its name below, at a place in inches."""
     shade = np.where(picture > 0, 60 + 0.7 * picture.astype(float), 255)
     extent = (left, left + PICTURE_WIDTH, top + PICTURE_WIDTH, top)
-    page.imshow(shade, cmap="gray", vmin=0, vmax=255, interpolation="bilinear", extent=extent)
+    page.imshow(
+        shade,
+        cmap="gray",
+        vmin=0,
+        vmax=255,
+        interpolation="bilinear",
+        extent=extent,
+    )
+
     words = name.replace("_", " ")
     short = words if len(words) <= LONGEST_LABEL else f"{words[: LONGEST_LABEL - 3]}..."
     middle = left + PICTURE_WIDTH / 2

@@ -5,7 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nextview.recognition.belief import Calibration, SizeEvidence, log_evidence_of, of_true_class
+from nextview.recognition.belief import (
+    Calibration,
+    SizeEvidence,
+    log_evidence_of,
+    of_true_class,
+)
 from nextview.things.memory import AZIMUTHS, by_ring, similarities
 from nextview.types import Float, Float32, Floats, Index, Mask
 
@@ -82,10 +87,15 @@ def fit_memory(
             alike[row][:, (fold[thing] == fold[t]) & several[thing]] = NO_LIKENESS
     heads, whole = _heads(views, thing, label, several, fold, held_out, judged)
     size = size_evidence(radii, label)
-    measured = radii * np.exp(rng.normal(0, SIZE_ERROR, len(radii)))  # as a sensor would measure it
+    measured = radii * np.exp(
+        rng.normal(0, SIZE_ERROR, len(radii))
+    )  # as a sensor would measure it
     sizes = np.float32(0) if size is None else size.logits(measured)[judged, None]
     drawn = np.stack(
-        [np.stack([rng.permutation(held_out.shape[1]) for _ in range(DRAWS)]) for _ in judged]
+        [
+            np.stack([rng.permutation(held_out.shape[1]) for _ in range(DRAWS)])
+            for _ in judged
+        ]
     )
     where = held_out_views[judged]
     of_class = label[thing]
@@ -95,25 +105,43 @@ def fit_memory(
         for w in COSINE_WEIGHTS:
             sums = _sums(w * alike, h * heads + sizes, where, drawn, VIEWS_FITTED)
             scored += [
-                (_belief(sums, heads.shape[-1], of_class, c), (w, c, h)) for c in BIN_CORRELATIONS
+                (_belief(sums, heads.shape[-1], of_class, c), (w, c, h))
+                for c in BIN_CORRELATIONS
             ]
     truth = label[judged]
     loss = [
-        -np.mean([of_true_class(logs, truth).mean() for logs in beliefs]) for beliefs, _ in scored
+        -np.mean([of_true_class(logs, truth).mean() for logs in beliefs])
+        for beliefs, _ in scored
     ]
     beliefs, (weight, correlation, head) = scored[int(np.argmin(loss))]
-    accuracy = tuple(float((logs.argmax(-1) == truth[:, None]).mean()) for logs in beliefs)
+    accuracy = tuple(
+        float((logs.argmax(-1) == truth[:, None]).mean()) for logs in beliefs
+    )
     sums = _sums(
-        weight * alike, head * heads + sizes, where, drawn, range(1, 1 + max(VIEWS_FITTED))
+        weight * alike,
+        head * heads + sizes,
+        where,
+        drawn,
+        range(1, 1 + max(VIEWS_FITTED)),
     )
     each = _belief(sums, heads.shape[-1], of_class, correlation)
     usual = np.stack([_usual(logs, truth) for logs in each])
-    scores = [-logs.max(-1) - own[logs.argmax(-1)] for logs, own in zip(each, usual, strict=True)]
+    scores = [
+        -logs.max(-1) - own[logs.argmax(-1)]
+        for logs, own in zip(each, usual, strict=True)
+    ]
     quantiles = np.quantile(scores, np.linspace(0, 1, QUANTILE_COUNT), axis=(1, 2)).T
     confused = _confused(beliefs[1], truth, judged, label)
 
     return Fit(
-        weight, correlation, head * whole[0], head * whole[1], quantiles, usual, accuracy, confused
+        weight,
+        correlation,
+        head * whole[0],
+        head * whole[1],
+        quantiles,
+        usual,
+        accuracy,
+        confused,
     )
 
 
@@ -134,7 +162,9 @@ def _usual(logs: Floats, truth: Index) -> Floats:
 def _judged(views: Floats, thing: Index, held_out: Floats, where: Floats) -> Float32:
     """How alike each held-out view is to each resting pose and azimuth, (T, K, H, azimuths)."""
     flat = similarities(
-        by_ring(views), held_out.reshape(-1, held_out.shape[-1]), where[..., 0].ravel()
+        by_ring(views),
+        held_out.reshape(-1, held_out.shape[-1]),
+        where[..., 0].ravel(),
     )
     return flat.reshape(*held_out.shape[:2], len(thing), AZIMUTHS)
 
@@ -156,14 +186,20 @@ def _heads(
     f = views.shape[-1]
     found = np.zeros((len(judged), held_out.shape[1], classes), np.float32)
     if not several.any():
-        return found, (np.zeros((f, classes), np.float32), np.zeros(classes, np.float32))
+        return found, (
+            np.zeros((f, classes), np.float32),
+            np.zeros(classes, np.float32),
+        )
+
     x = views[:, :, ::4].reshape(len(thing), -1, f)
     y = label[thing]
+
     for k in range(FOLDS):
         others = (fold[thing] != k) | ~several[thing]
         weights, bias = _ridge(x[others], y[others], classes)
         own = fold[judged] == k
         found[own] = held_out[judged][own] @ weights + bias
+
     return found, _ridge(x, y, classes)
 
 
@@ -175,9 +211,10 @@ def _ridge(x: Floats, y: Index, classes: int) -> tuple[Floats, Floats]:
     h, n, f = x.shape
     rows = x.reshape(h * n, f)
     target = np.repeat(np.eye(classes, dtype=np.float32)[y], n, 0)
-    weight = np.repeat(1 / np.maximum(np.bincount(y, minlength=classes), 1)[y] / n, n).astype(
-        np.float32
-    )[:, None]
+    weight = np.repeat(
+        1 / np.maximum(np.bincount(y, minlength=classes), 1)[y] / n,
+        n,
+    ).astype(np.float32)[:, None]
     middle = (weight * rows).sum(0) / weight.sum()
     centred = rows - middle
     gram = centred.T @ (weight * centred) + RIDGE * 0.01 * np.eye(f, dtype=np.float32)
@@ -186,17 +223,28 @@ def _ridge(x: Floats, y: Index, classes: int) -> tuple[Floats, Floats]:
 
 
 def _sums(
-    alike: Floats, logits: Floats, where: Floats, drawn: Index, after: Sequence[int]
+    alike: Floats,
+    logits: Floats,
+    where: Floats,
+    drawn: Index,
+    after: Sequence[int],
 ) -> dict[int, Floats]:
     """Sums of log-evidence ``after`` so many drawn views, (T, draws, ...) each."""
-    total = [log_evidence_of(x, a, z) for x, a, z in zip(logits, alike, where[..., 1], strict=True)]
+    total = [
+        log_evidence_of(x, a, z)
+        for x, a, z in zip(logits, alike, where[..., 1], strict=True)
+    ]
     return {
-        k: np.stack([t[d[:, :k]].sum(1) for t, d in zip(total, drawn, strict=True)]) for k in after
+        k: np.stack([t[d[:, :k]].sum(1) for t, d in zip(total, drawn, strict=True)])
+        for k in after
     }
 
 
 def _belief(
-    sums: dict[int, Floats], classes: int, hypotheses: Index, correlation: float
+    sums: dict[int, Floats],
+    classes: int,
+    hypotheses: Index,
+    correlation: float,
 ) -> list[Float]:
     """Return the log-belief from sums of log-evidence, (T, draws, classes), up to a constant."""
     calibration = Calibration(1.0, 1.0, None, correlation, tuple(hypotheses.tolist()))
@@ -204,7 +252,10 @@ def _belief(
 
 
 def _confused(
-    logs: Floats, truth: Index, judged: Index, label: Index
+    logs: Floats,
+    truth: Index,
+    judged: Index,
+    label: Index,
 ) -> tuple[tuple[int, int, float], ...]:
     """Return pairs of things by how often one is named as the other, worst first."""
     answers = logs.argmax(-1)
@@ -216,7 +267,8 @@ def _confused(
             pair = min(int(t), other), max(int(t), other)
             pairs[pair] = pairs.get(pair, 0) + 0.5 / answers.shape[1]
     return tuple(
-        (a, b, share) for (a, b), share in sorted(pairs.items(), key=lambda item: -item[1])
+        (a, b, share)
+        for (a, b), share in sorted(pairs.items(), key=lambda item: -item[1])
     )
 
 
@@ -249,7 +301,8 @@ def size_evidence(radii: Floats, label: Index) -> SizeEvidence | None:
         if len(own):
             off = (grid[:, None] - own) / wide
             density[c] = np.log(
-                (0.9 * np.exp(-(off**2) / 2) + 0.1 / 4 * np.exp(-(off**2) / 32)).mean(1) / wide
+                (0.9 * np.exp(-(off**2) / 2) + 0.1 / 4 * np.exp(-(off**2) / 32)).mean(1)
+                / wide
                 + 1e-9
             )
     density -= density.max()  # a usual size is no evidence against what is known

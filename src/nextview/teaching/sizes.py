@@ -39,7 +39,11 @@ def check_sizes(paths: Sequence[Path], radii: Floats, unit: str | None) -> None:
 
     for path, times in zip(paths, radii / median, strict=True):
         if times > ODD_SIZE or times < 1 / ODD_SIZE:
-            how = f"{times:,.0f} times larger" if times > 1 else f"{1 / times:,.0f} times smaller"
+            how = (
+                f"{times:,.0f} times larger"
+                if times > 1
+                else f"{1 / times:,.0f} times smaller"
+            )
             hint = "is it in another unit? --any-size takes it as it is"
             raise DatasetError(f"{path}: is {how} than most others; {hint}")
 

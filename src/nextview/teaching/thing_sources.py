@@ -45,7 +45,11 @@ class Found:
     notes: tuple[str, ...] = ()
 
 
-def find_things(folder: Path, out: Path | None = None, one_class: bool = False) -> Found:
+def find_things(
+    folder: Path,
+    out: Path | None = None,
+    one_class: bool = False,
+) -> Found:
     """Find the things that a folder teaches.
 
     A mesh in the folder itself, and a folder or a ROS 2 bag of captured frames, is a thing and a
@@ -73,7 +77,9 @@ def find_things(folder: Path, out: Path | None = None, one_class: bool = False) 
     if not folder.is_dir():
         raise DatasetError(f"{folder}: there is no such folder")
     if not str(folder).isprintable():
-        raise DatasetError(f"{one_line(str(folder), 200)}: its name cannot be printed; rename it")
+        raise DatasetError(
+            f"{one_line(str(folder), 200)}: its name cannot be printed; rename it"
+        )
 
     captures = _captures(folder)
     skip = dict.fromkeys(captures, "")
@@ -85,7 +91,10 @@ def find_things(folder: Path, out: Path | None = None, one_class: bool = False) 
     in_bags = {path.relative_to(folder) for path in captures}
     left_out = left_out_phrases(
         [(path, reason) for path, reason in listing.left_out if path not in in_bags]
-        + [(e.path.relative_to(folder), f"of the split {e.split}") for e in other_splits]
+        + [
+            (e.path.relative_to(folder), f"of the split {e.split}")
+            for e in other_splits
+        ]
     )
     things = [_of_frames(path) for path in captures]
     things += [ThingSource(entry.name, entry.label, entry.path) for entry in entries]
@@ -94,7 +103,9 @@ def find_things(folder: Path, out: Path | None = None, one_class: bool = False) 
             f"{folder}: holds no mesh ({', '.join(FORMATS)}) and no folder or bag of depth"
             " frames with poses"
         )
-        raise DatasetError("; left out: ".join([text, *filter(None, ["; ".join(left_out)])]))
+        raise DatasetError(
+            "; left out: ".join([text, *filter(None, ["; ".join(left_out)])])
+        )
     things.sort(key=lambda thing: (thing.label, thing.name))
     _check_names(things)
     if not one_class:
@@ -103,7 +114,11 @@ def find_things(folder: Path, out: Path | None = None, one_class: bool = False) 
     layout = [listing.layout()] if entries else []
     bags = sum(is_bag(path) for path in captures)
     layout += _counted(bags, "ROS 2 bag", "ROS 2 bags")
-    layout += _counted(len(captures) - bags, "folder of depth frames", "folders of depth frames")
+    layout += _counted(
+        len(captures) - bags,
+        "folder of depth frames",
+        "folders of depth frames",
+    )
     notes = (f"in {folder}: {', '.join(layout)}", *listing.notes)
     return Found(things, left_out, notes)
 
@@ -115,7 +130,9 @@ def _captures(folder: Path) -> list[Path]:
         path
         for path in inside
         if path.name.isprintable()
-        and (is_bag(path) or (path.is_dir() and (is_capture(path) or is_turntable(path))))
+        and (
+            is_bag(path) or (path.is_dir() and (is_capture(path) or is_turntable(path)))
+        )
     ]
 
 
@@ -145,7 +162,9 @@ def _check_names(things: list[ThingSource]) -> None:
     for thing in things:
         if first.setdefault(thing.name, thing) is not thing:
             both = f"{first[thing.name].path} and {thing.path}"
-            raise DatasetError(f"{both} would both be called {thing.name}; rename one of them")
+            raise DatasetError(
+                f"{both} would both be called {thing.name}; rename one of them"
+            )
 
 
 def _check_classes(folder: Path, things: list[ThingSource]) -> None:

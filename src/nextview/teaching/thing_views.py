@@ -23,7 +23,12 @@ from nextview.errors import DatasetError, ObservationError
 from nextview.geometry.mesh import UNITS, Y_UP, Mesh, is_y_up, load_mesh, mesh_warnings
 from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.resting import resting_poses, rotated
-from nextview.geometry.viewsphere import ViewSphere, angle_between, direction_of, look_at_origin
+from nextview.geometry.viewsphere import (
+    ViewSphere,
+    angle_between,
+    direction_of,
+    look_at_origin,
+)
 from nextview.recognition.inference import Features
 from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import unit
@@ -45,7 +50,11 @@ NEAR_CAPTURED = np.radians(
 )  # a captured view teaches what the thing looks like from no farther than this
 MEMORY_GRID = ViewSphere(RINGS, AZIMUTHS)
 # poses of views through the sensor
-SENSED = MEMORY_GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape(-1, 4, 4)
+SENSED = MEMORY_GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape(
+    -1,
+    4,
+    4,
+)
 # of a thing's arrays: a phrase about the frames that were not used; it is not remembered
 LEFT_OUT = "left_out"
 # of a thing's arrays: its surface, if its size is known
@@ -138,7 +147,13 @@ def teach(path: Path, name: str, how: TeachingOptions, threads: int = 1) -> Arra
         # Of any of its resting poses: things lie in practice, and calibration and the rate of
         # strangers follow these.
         shown_pose = lying[int(rng.integers(len(lying)))]
-        held_out = _sensed(pool, shown_pose, look_at_origin(*directions), how.sensor, rng)
+        held_out = _sensed(
+            pool,
+            shown_pose,
+            look_at_origin(*directions),
+            how.sensor,
+            rng,
+        )
         clean = [_clean(pool, each) for each in lying]
         sensed = [_sensed(pool, each, SENSED, how.sensor, rng) for each in lying]
         around = [_around(*both) for both in zip(clean, sensed, strict=True)]
@@ -152,7 +167,9 @@ def teach(path: Path, name: str, how: TeachingOptions, threads: int = 1) -> Arra
         "radii": np.array([np.nan if mesh.metres is None else mesh.metres], np.float32),
         "doubts": np.frombuffer("\n".join(mesh_warnings(mesh)).encode(), np.uint8),
         "pictures": _picture(
-            SimulatedCamera(mesh, 64).observe(look_at_origin(np.radians(25), np.radians(35)))
+            SimulatedCamera(mesh, 64).observe(
+                look_at_origin(np.radians(25), np.radians(35))
+            )
         ),
         **_surface(mesh, to_mesh),
     }
@@ -205,7 +222,11 @@ def _around(clean: EmbeddingParts, sensed: EmbeddingParts) -> Float32:
     through = np.zeros_like(ideal)
     # Between the rings and azimuths that are looked at through the sensor the embeddings are
     # interpolated.
-    through[::2, ::2] = np.concatenate(list(sensed)).reshape(len(RINGS[::2]), AZIMUTHS // 2, -1)
+    through[::2, ::2] = np.concatenate(list(sensed)).reshape(
+        len(RINGS[::2]),
+        AZIMUTHS // 2,
+        -1,
+    )
     through[::2, 1::2] = unit(through[::2, ::2] + np.roll(through[::2, ::2], -1, 1))
     through[1::2] = unit(through[:-1:2] + through[2::2])
     return joined(ideal, through)
@@ -215,16 +236,23 @@ def _clean(pool: ThreadPoolExecutor, mesh: Mesh) -> EmbeddingParts:
     """Embeddings of the views of the grid without errors."""
     camera = SimulatedCamera(mesh)
     return pool.map(
-        partial(_seen, camera), np.split(MEMORY_GRID.poses, len(MEMORY_GRID) // VIEWS_PER_BATCH)
+        partial(_seen, camera),
+        np.split(MEMORY_GRID.poses, len(MEMORY_GRID) // VIEWS_PER_BATCH),
     )
 
 
 def _sensed(
-    pool: ThreadPoolExecutor, mesh: Mesh, poses: Float, sensor: str, rng: Generator
+    pool: ThreadPoolExecutor,
+    mesh: Mesh,
+    poses: Float,
+    sensor: str,
+    rng: Generator,
 ) -> EmbeddingParts:
     """Embeddings of a mesh from poses, (B, 4, 4), through a sensor."""
     parts = np.split(poses, range(SETUP, len(poses), SETUP))
-    cameras = (partial(SensedCamera, mesh, sensor, own) for own in rng.spawn(len(parts)))
+    cameras = (
+        partial(SensedCamera, mesh, sensor, own) for own in rng.spawn(len(parts))
+    )
     return pool.map(lambda camera, part: _seen(camera(), part), cameras, parts)
 
 
@@ -255,7 +283,8 @@ def _of_capture(capture: Capture, name: str) -> Arrays:
     rest = np.flatnonzero(~kept) if not kept.all() else np.arange(len(seen))
     held_out = np.resize(rest, HELD_OUT)
     angles = np.stack(
-        [np.arcsin(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])], 1
+        [np.arcsin(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])],
+        1,
     )
 
     found = camera.object.object_frame
@@ -304,4 +333,6 @@ def embeddings(observations: list[Observation]) -> Float32:
         network(inputs[start : start + VIEWS_PER_BATCH])
         for start in range(0, len(inputs), VIEWS_PER_BATCH)
     ]
-    return np.concatenate(parts) * np.array([view.seen for view in observations])[:, None]
+    return (
+        np.concatenate(parts) * np.array([view.seen for view in observations])[:, None]
+    )

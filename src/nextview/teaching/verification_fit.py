@@ -17,7 +17,12 @@ from nextview.simulation.sensed_camera import SensedCamera
 from nextview.things.memory import RINGS, TaughtRecogniser
 from nextview.things.taught import TaughtThings, residuals_of
 from nextview.things.unknown import KnownResiduals
-from nextview.things.weighing import LEAST_TRUE_BELIEF, EvidenceWeights, JudgedEpisode, fit_weights
+from nextview.things.weighing import (
+    LEAST_TRUE_BELIEF,
+    EvidenceWeights,
+    JudgedEpisode,
+    fit_weights,
+)
 from nextview.types import Float, Index
 
 VIEWS_VERIFIED = (1, 2, 3)  # after so many views things are judged
@@ -76,7 +81,11 @@ class VerifiedFit:
     things: int = 0
 
 
-def to_be_shown(things: Sequence[int], known: int, rng: Generator) -> list[tuple[int, int]]:
+def to_be_shown(
+    things: Sequence[int],
+    known: int,
+    rng: Generator,
+) -> list[tuple[int, int]]:
     """Which things are shown how often: (thing, draw) each.
 
     Args:
@@ -110,7 +119,10 @@ def show(card: Path, sensor: str, seed: int, item: tuple[int, int]) -> list[Show
     others = np.arange(len(labels))
     if (labels == labels[thing]).sum() > 1:
         others = np.delete(others, thing)
-        known = TaughtThings(known.recogniser, [known.verifier.caster.surfaces[k] for k in others])
+        known = TaughtThings(
+            known.recogniser,
+            [known.verifier.caster.surfaces[k] for k in others],
+        )
 
     rng = np.random.default_rng([seed, thing, draw])
     observations = _views(_opened(card)[0], thing, sensor, rng)
@@ -122,7 +134,9 @@ def show(card: Path, sensor: str, seed: int, item: tuple[int, int]) -> list[Show
     for count in VIEWS_VERIFIED[: len(observations)]:
         try:
             verified = known.verify(observations[:count], evidence[:count])
-        except ObservationError:  # what was seen is too little to be compared with surfaces
+        except (
+            ObservationError
+        ):  # what was seen is too little to be compared with surfaces
             continue
         judged = _of_classes(verified.judged(0), int(labels[thing]), labels[others])
         named = int(others[verified.things[0]])
@@ -157,17 +171,34 @@ def class_of_things(recogniser: TaughtRecogniser, known: TaughtThings) -> Index:
     return of_all[[names.index(name) for name in known.names]]
 
 
-def _views(known: TaughtThings, thing: int, sensor: str, rng: Generator) -> list[Observation]:
+def _views(
+    known: TaughtThings,
+    thing: int,
+    sensor: str,
+    rng: Generator,
+) -> list[Observation]:
     """Some random views of a thing that show it."""
     surface = known.verifier.caster.surfaces[thing]
-    resting = known.verifier.rotations[rng.choice(np.flatnonzero(known.verifier.owners == thing))]
+    resting = known.verifier.rotations[
+        rng.choice(np.flatnonzero(known.verifier.owners == thing))
+    ]
     turn = rotation_z(rng.uniform(0, 2 * np.pi)) @ resting
-    mesh = make_mesh(surface.vertices.astype(np.float64) @ turn.T, surface.faces, surface.name, "m")
+    mesh = make_mesh(
+        surface.vertices.astype(np.float64) @ turn.T,
+        surface.faces,
+        surface.name,
+        "m",
+    )
     camera = SensedCamera(mesh, sensor, rng.spawn(1)[0])
 
-    elevations = np.arcsin(rng.uniform(0, np.sin(np.radians(RINGS[-1])), SHOWING_VIEWS_TRIED))
+    elevations = np.arcsin(
+        rng.uniform(0, np.sin(np.radians(RINGS[-1])), SHOWING_VIEWS_TRIED)
+    )
     observations = []
-    for pose in look_at_origin(elevations, rng.uniform(0, 2 * np.pi, SHOWING_VIEWS_TRIED)):
+    for pose in look_at_origin(
+        elevations,
+        rng.uniform(0, 2 * np.pi, SHOWING_VIEWS_TRIED),
+    ):
         observation = camera.observe(pose)
         if observation.seen:
             observations.append(observation)
@@ -246,7 +277,10 @@ def _weights(shown: Sequence[Shown]) -> EvidenceWeights:
     return EvidenceWeights(*found)
 
 
-def _log_likelihood(weights: EvidenceWeights, episodes: Sequence[JudgedEpisode]) -> float:
+def _log_likelihood(
+    weights: EvidenceWeights,
+    episodes: Sequence[JudgedEpisode],
+) -> float:
     """Sum of the logarithms of the belief in the truth."""
     believed = [episode.belief(weights)[episode.truth] for episode in episodes]
     return float(np.log(np.maximum(believed, LEAST_TRUE_BELIEF)).sum())
@@ -258,7 +292,10 @@ def _residuals(shown: Sequence[Shown], labels: Index) -> KnownResiduals | None:
     if not len(named):
         return None
     fitted = KnownResiduals.fit(named, values, views, len(labels))
-    return KnownResiduals(fitted.usual, tuple(likely_excess(row) for row in fitted.excess))
+    return KnownResiduals(
+        fitted.usual,
+        tuple(likely_excess(row) for row in fitted.excess),
+    )
 
 
 def _right(shown: Sequence[Shown], labels: Index) -> tuple[Index, Float, Index]:
@@ -295,7 +332,10 @@ def likely_excess(found: Float) -> Float:
 
 
 def with_new_things(
-    before: Verification, shown: Sequence[Shown], labels: Index, carried: Index
+    before: Verification,
+    shown: Sequence[Shown],
+    labels: Index,
+    carried: Index,
 ) -> VerifiedFit:
     """Add what was found of new things to what was fitted before.
 
@@ -324,7 +364,9 @@ def with_new_things(
 
 
 def as_stored(
-    weights: EvidenceWeights, residuals: KnownResiduals | None, things: int
+    weights: EvidenceWeights,
+    residuals: KnownResiduals | None,
+    things: int,
 ) -> Verification:
     """Round weights and residuals for a card.
 
@@ -336,16 +378,24 @@ def as_stored(
     Returns:
         What the card holds of them.
     """
-    named = {field.name: float(f"{getattr(weights, field.name):.4g}") for field in fields(weights)}
+    named = {
+        field.name: float(f"{getattr(weights, field.name):.4g}")
+        for field in fields(weights)
+    }
     if residuals is None:
         return Verification(named, things)
     excess = []
+
     for row in residuals.excess:
         if len(row) > MOST_RESIDUALS:
             row = np.quantile(row, np.linspace(0, 1, MOST_RESIDUALS))
         excess.append(tuple(np.round(row, DECIMALS).tolist()))
+
     return Verification(
-        named, things, tuple(np.round(residuals.usual, DECIMALS).tolist()), tuple(excess)
+        named,
+        things,
+        tuple(np.round(residuals.usual, DECIMALS).tolist()),
+        tuple(excess),
     )
 
 
@@ -356,19 +406,27 @@ def _accuracy(shown: Sequence[Shown], answers: Sequence[int]) -> tuple[float, ..
     right = np.array([one.judged.truth for one in shown]) == answers
     views = np.array([one.views for one in shown])
     return tuple(
-        float(right[views == count].mean()) for count in VIEWS_VERIFIED if (views == count).any()
+        float(right[views == count].mean())
+        for count in VIEWS_VERIFIED
+        if (views == count).any()
     )
 
 
-def _confused(shown: Sequence[Shown], answers: Sequence[int]) -> tuple[tuple[int, int, float], ...]:
+def _confused(
+    shown: Sequence[Shown],
+    answers: Sequence[int],
+) -> tuple[tuple[int, int, float], ...]:
     """Return pairs of classes by how often one is named as the other, worst first."""
     truths = [one.judged.truth for one in shown if one.views == 2]
-    named = [answer for one, answer in zip(shown, answers, strict=True) if one.views == 2]
+    named = [
+        answer for one, answer in zip(shown, answers, strict=True) if one.views == 2
+    ]
     pairs = dict[tuple[int, int], float]()
     for truth, answer in zip(truths, named, strict=True):
         if truth != answer:
             pair = min(truth, answer), max(truth, answer)
             pairs[pair] = pairs.get(pair, 0) + 0.5 / truths.count(truth)
     return tuple(
-        (a, b, share) for (a, b), share in sorted(pairs.items(), key=lambda item: -item[1])
+        (a, b, share)
+        for (a, b), share in sorted(pairs.items(), key=lambda item: -item[1])
     )

@@ -8,7 +8,9 @@ import numpy as np
 from nextview.checks import extras
 from nextview.types import Float32, Floats, Index
 
-LARGE_RING = 20_000  # views of a ring from which looking at all of them takes more than 10 ms
+LARGE_RING = (
+    20_000  # views of a ring from which looking at all of them takes more than 10 ms
+)
 INDEX = "PCA64,IVF256,SQ8"  # 64 numbers of a byte for each view, in 256 cells
 PROBED = 16  # cells that are searched
 VIEWS_SAMPLED = 10_240  # views from which an index learns its cells
@@ -55,7 +57,9 @@ class NearestViews:
                 ]
             )
             near = np.unique(near[near >= 0])
-            alike = sum(share[ring] * (self._views[ring, near] @ embedding) for ring in rings)
+            alike = sum(
+                share[ring] * (self._views[ring, near] @ embedding) for ring in rings
+            )
             found[row] = np.min(alike)
             found[row, near] = alike
         return found

@@ -17,7 +17,9 @@ NOT_MEASURED, ELSEWHERE, THING = np.arange(3, dtype=np.uint8)
 """What a pixel shows: nothing was measured; something else, or nothing at all, was; the thing."""
 
 WINDOW_MARGIN = 0.35  # of the size of the thing's outline that is looked at around it
-USUAL_FILL = 0.2  # share of the pixels that show the thing, below which more of them are chosen
+USUAL_FILL = (
+    0.2  # share of the pixels that show the thing, below which more of them are chosen
+)
 MOST_DENSE = 2.0  # times as many rows and columns at most
 SMALLEST_MARGIN = 4  # pixels of the image around the outline, at least
 NOISE_ROWS = 40  # rows of an image in which its noise is measured
@@ -73,11 +75,15 @@ class DepthView:
     def thing_points(self) -> Float32:
         """Where the pixels of the thing end, (N, 3) float32, object frame, metres."""
         thing = self.kind == THING
-        return self.origin.astype(np.float32) + self.rays[thing] * self.depth[thing, None]
+        return (
+            self.origin.astype(np.float32) + self.rays[thing] * self.depth[thing, None]
+        )
 
 
 def depth_view(
-    observation: Observation, side: int, radius: float | None = None
+    observation: Observation,
+    side: int,
+    radius: float | None = None,
 ) -> DepthView | None:
     """Choose the pixels of an observation that are compared with surfaces.
 
@@ -118,7 +124,11 @@ class MetricImage:
     ground: Ground | None
 
     @classmethod
-    def of(cls, observation: Observation, radius: float | None = None) -> "MetricImage | None":
+    def of(
+        cls,
+        observation: Observation,
+        radius: float | None = None,
+    ) -> "MetricImage | None":
         """Take over what a camera saw; None if it did not see the thing.
 
         An observation that knows all that its camera saw is taken as it was measured. Without that,
@@ -170,7 +180,9 @@ class MetricImage:
         kind = self.kind[chosen].ravel()
         origin = self.pose[:3, 3]
         some = (depth > 0) & np.isfinite(depth)
-        points = origin + self._rays(rows, columns)[some] * depth[some, None].astype(np.float64)
+        points = origin + self._rays(rows, columns)[some] * depth[some, None].astype(
+            np.float64
+        )
         thing = kind[some] == THING
         return find_ground(points[~thing], points[thing], origin, self.pose[:3, 2])
 
@@ -178,7 +190,10 @@ class MetricImage:
         """Rays through some rows and columns of pixels, (rows * columns, 3), object frame."""
         x, y = PinholeCamera.of(self.intrinsics, self.depth.shape).slopes(rows, columns)
         ahead = np.ones((len(rows), len(columns)))
-        return np.stack([*np.meshgrid(x, y), ahead], -1).reshape(-1, 3) @ self.pose[:3, :3].T
+        return (
+            np.stack([*np.meshgrid(x, y), ahead], -1).reshape(-1, 3)
+            @ self.pose[:3, :3].T
+        )
 
     def view(self, side: int) -> DepthView:
         """Choose pixels on a grid over the outline of the thing and a margin around it.
@@ -206,7 +221,9 @@ class MetricImage:
         else:
             # It tells more than single pixels, which are too few beside edges.
             noise = self.ground.noise * finite**2
-            heights = self.ground.heights(origin + rays * finite[:, None].astype(np.float64))
+            heights = self.ground.heights(
+                origin + rays * finite[:, None].astype(np.float64)
+            )
             level = (kind == THING) & (np.abs(heights) < LEVEL_NOISE * noise)
 
         return DepthView(
@@ -227,7 +244,9 @@ class MetricImage:
         )
 
 
-def _what_is_seen(observation: Observation) -> tuple[Float32, NDArray[np.uint8], Float, Float]:
+def _what_is_seen(
+    observation: Observation,
+) -> tuple[Float32, NDArray[np.uint8], Float, Float]:
     """Depth, object radii, what each pixel shows, pose and intrinsics."""
     scene = observation.scene
     if scene is None:
@@ -268,7 +287,8 @@ def _window(mask: Mask, side: int, relative_margin: float) -> tuple[Index, Index
     denser = np.clip(np.sqrt(USUAL_FILL / fill), 1, MOST_DENSE)
     count = int(np.ceil(side * denser))
     rows, columns = (
-        np.unique(np.rint(np.linspace(first, last, count)).astype(np.int64)) for first, last in ends
+        np.unique(np.rint(np.linspace(first, last, count)).astype(np.int64))
+        for first, last in ends
     )
     return rows, columns
 
@@ -281,7 +301,10 @@ def _step(lines: Index) -> float:
 def _outline(mask: Mask) -> tuple[Float32, Float32]:
     """Distance of each pixel to the outline, negative within, and the direction to it."""
     if mask.all():
-        return np.full(mask.shape, -np.inf, np.float32), np.zeros((*mask.shape, 2), np.float32)
+        return np.full(mask.shape, -np.inf, np.float32), np.zeros(
+            (*mask.shape, 2),
+            np.float32,
+        )
 
     outside, nearest = distance_transform_edt(~mask, return_indices=True)
     within = distance_transform_edt(mask)

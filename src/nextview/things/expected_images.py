@@ -19,11 +19,15 @@ from nextview.things.unseen_space import MeasuredDepth, chance_of_sight
 from nextview.types import Float, Float32, Mask
 
 LOWEST_COSINE = 0.15  # of incidence, in the judgement of a pixel
-SUPPORT_NEAR = 0.01  # metres from the height of the support, within which a point lies on it
+SUPPORT_NEAR = (
+    0.01  # metres from the height of the support, within which a point lies on it
+)
 OWN_MARGIN = 0.005  # metres around the thing, within which a point may be its own
 OBSTACLE_REACH = 4.0  # radii of the thing, within which an obstacle may hide it
 OBSTACLE_ROWS = 120  # rows of a depth image that are looked through for obstacles
-UNSEEN_REACH = 2.0  # radii of the thing, within which something that no view shows may hide it
+UNSEEN_REACH = (
+    2.0  # radii of the thing, within which something that no view shows may hide it
+)
 UNSEEN_EVERY = 2  # every so many rows and columns of pixels, unseen space is looked up
 
 
@@ -50,7 +54,9 @@ class ExpectedSensor:
             ObservationError: there is none.
         """
         if not views:
-            raise ObservationError("without a view that shows the thing the sensor is not known")
+            raise ObservationError(
+                "without a view that shows the thing the sensor is not known"
+            )
         noise = []
         for view in views:
             thing = view.kind == THING
@@ -83,7 +89,10 @@ class SeenSurroundings:
 
     @classmethod
     def of(
-        cls, observations: Sequence[Observation], caster: SurfaceCaster, hypotheses: Hypotheses
+        cls,
+        observations: Sequence[Observation],
+        caster: SurfaceCaster,
+        hypotheses: Hypotheses,
     ) -> "SeenSurroundings":
         """Gather what some views saw beside the thing.
 
@@ -115,7 +124,12 @@ class SeenSurroundings:
         near = np.linalg.norm(points, axis=1) < OBSTACLE_REACH * radius
         obstacles = points[(height > SUPPORT_NEAR) & near & ~own]
         images = (MeasuredDepth.of(observation) for observation in observations)
-        return cls(obstacles, floor, reach, tuple(image for image in images if image is not None))
+        return cls(
+            obstacles,
+            floor,
+            reach,
+            tuple(image for image in images if image is not None),
+        )
 
 
 def _beside(observation: Observation) -> Float:
@@ -228,7 +242,10 @@ def rendered_images(
     radius = max(caster.surfaces[thing].radius for thing in np.unique(things).tolist())
     clear = _clear(scene, origins, rays, depth.min(1), before, radius)
     behind = np.isfinite(before) | _support_shows(scene, origins, rays)
-    centre = np.mean(np.einsum("hij,hj->hi", turns, caster.centres[things]) + places, axis=0)
+    centre = np.mean(
+        np.einsum("hij,hj->hi", turns, caster.centres[things]) + places,
+        axis=0,
+    )
     return HypothesisImages(
         rays=rays,
         lengths=lengths.astype(np.float32),
@@ -246,7 +263,10 @@ def rendered_images(
 
 
 def _windows(
-    caster: SurfaceCaster, hypotheses: Hypotheses, cameras: Float, side: int
+    caster: SurfaceCaster,
+    hypotheses: Hypotheses,
+    cameras: Float,
+    side: int,
 ) -> tuple[Float, Float, Float]:
     """Tangents of columns and rows, (V, side) each, that cover all hypotheses, and the steps."""
     boxes = []
@@ -268,7 +288,13 @@ def _windows(
     return x, y, step[:, ::-1]
 
 
-def _obstacle_depth(obstacles: Float, cameras: Float, x: Float, y: Float, step: Float) -> Float32:
+def _obstacle_depth(
+    obstacles: Float,
+    cameras: Float,
+    x: Float,
+    y: Float,
+    step: Float,
+) -> Float32:
     """Depth of the nearest obstacle at each pixel, (V, P) float32; infinity where there is none."""
     views, side = x.shape
     depth = np.full((views, side, side), np.inf, np.float32)
@@ -278,8 +304,12 @@ def _obstacle_depth(obstacles: Float, cameras: Float, x: Float, y: Float, step: 
     in_camera = (obstacles - cameras[:, None, :3, 3]) @ cameras[:, :3, :3]
     z = in_camera[..., 2]
     ahead = np.maximum(z, 1e-3)
-    column = np.floor((in_camera[..., 0] / ahead - x[:, :1]) / step[:, 1:] + 0.5).astype(np.int64)
-    row = np.floor((in_camera[..., 1] / ahead - y[:, :1]) / step[:, :1] + 0.5).astype(np.int64)
+    column = np.floor(
+        (in_camera[..., 0] / ahead - x[:, :1]) / step[:, 1:] + 0.5
+    ).astype(np.int64)
+    row = np.floor((in_camera[..., 1] / ahead - y[:, :1]) / step[:, :1] + 0.5).astype(
+        np.int64
+    )
     inside = (z > 1e-3) & (row >= 0) & (row < side) & (column >= 0) & (column < side)
     view, point = np.nonzero(inside)
     at = (view, row[view, point], column[view, point])
@@ -311,7 +341,12 @@ def _clear(
     hidden = shows & (depth[:, some] > before[:, some])
     top = float(scene.obstacles[:, 2].max())
     chance = chance_of_sight(
-        scene.seen, ends, rays[:, some] / lengths, hidden, UNSEEN_REACH * radius, top
+        scene.seen,
+        ends,
+        rays[:, some] / lengths,
+        hidden,
+        UNSEEN_REACH * radius,
+        top,
     )
     coarse = chance.reshape(views, -(-side // UNSEEN_EVERY), -1)
     fine = coarse.repeat(UNSEEN_EVERY, 1).repeat(UNSEEN_EVERY, 2)

@@ -14,15 +14,25 @@ from functools import lru_cache
 
 import numpy as np
 
-from nextview.things.expected_images import LOWEST_COSINE, ExpectedSensor, HypothesisImages
+from nextview.things.expected_images import (
+    LOWEST_COSINE,
+    ExpectedSensor,
+    HypothesisImages,
+)
 from nextview.things.registration import SCAN_ERROR, RegistrationPrior
 from nextview.things.verification import PixelModel
 from nextview.types import Float, Float32, Index, Mask
 
-FITTED_EVERY = 3  # every so many pixels take part in the fit of one hypothesis to another
+FITTED_EVERY = (
+    3  # every so many pixels take part in the fit of one hypothesis to another
+)
 FITTED_REACH = 0.004  # metres of deviation at which a pixel of this fit counts half
-GRAZING_COSINE = 0.3  # of incidence, below which holes become usual: see the cameras of simulation
-FITTED_SURFACE_ERROR = 0.001  # metres by which a surface is off from its scan, in this fit
+GRAZING_COSINE = (
+    0.3  # of incidence, below which holes become usual: see the cameras of simulation
+)
+FITTED_SURFACE_ERROR = (
+    0.001  # metres by which a surface is off from its scan, in this fit
+)
 LARGEST_DEVIATION = 12.0  # standard deviations, beyond which a pixel is an outlier
 TABLE_STEPS = 20  # entries of a table per standard deviation
 
@@ -43,7 +53,9 @@ def _pairs(count: int) -> tuple[Index, Index]:
 
 
 def _depth_variance(
-    images: HypothesisImages, sensor: ExpectedSensor, pixels: PixelModel
+    images: HypothesisImages,
+    sensor: ExpectedSensor,
+    pixels: PixelModel,
 ) -> Float32:
     """Variance of the depth that is measured of each hypothesis, (V, H, P) float32, metres^2."""
     depth = np.where(np.isfinite(images.depth), images.depth, 1)
@@ -54,7 +66,9 @@ def _depth_variance(
 
 
 def gaps_after_alignment(
-    images: HypothesisImages, sensor: ExpectedSensor, prior: RegistrationPrior
+    images: HypothesisImages,
+    sensor: ExpectedSensor,
+    prior: RegistrationPrior,
 ) -> Float32:
     """Return the depth difference of each pair of hypotheses that remains after alignment.
 
@@ -157,7 +171,10 @@ def divergences(
 
 
 def different_pixels(
-    images: HypothesisImages, sensor: ExpectedSensor, pixels: PixelModel, prior: RegistrationPrior
+    images: HypothesisImages,
+    sensor: ExpectedSensor,
+    pixels: PixelModel,
+    prior: RegistrationPrior,
 ) -> Mask:
     """Where the first two hypotheses differ by more than the noise, once they are aligned.
 
@@ -274,7 +291,11 @@ class _Judged:
         judged = np.where(rival, kept * match + lost * hole, 0)
         # Where only the true one shows: surface that the other one does not explain.
         alone = shows & ~rival
-        judged += np.where(alone, kept * self.missing[:, true] * self.apart[:, other], 0)
+        judged += np.where(
+            alone,
+            kept * self.missing[:, true] * self.apart[:, other],
+            0,
+        )
         # Where only the other one shows: what is behind is seen through it, or nothing is measured.
         through = rival & ~shows
         seen_through = self.outlier * self.apart[:, true]
@@ -288,7 +309,11 @@ class _Judged:
         either = shows | rival
         union = either.sum(2)
         sight = (self.clear * either).sum(2) / np.maximum(union, 1)
-        return -mean.astype(np.float64) * sight * np.minimum(1, union * self.area / self.enough)
+        return (
+            -mean.astype(np.float64)
+            * sight
+            * np.minimum(1, union * self.area / self.enough)
+        )
 
     def different(self, first: Index, second: Index, gaps: Float32) -> Mask:
         """Return the pixels in which two hypotheses differ by more than the noise.

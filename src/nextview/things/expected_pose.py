@@ -85,7 +85,10 @@ def sharper_poses(
 
 
 def _information(
-    images: HypothesisImages, centre: Float, sensor: ExpectedSensor, prior: RegistrationPrior
+    images: HypothesisImages,
+    centre: Float,
+    sensor: ExpectedSensor,
+    prior: RegistrationPrior,
 ) -> Float:
     """What each view tells of turn and place of the first hypothesis, (V, 6, 6)."""
     shows = np.isfinite(images.depth[:, 0])
@@ -108,12 +111,21 @@ def _information(
 
 
 def _summed(
-    arms: Float32, directions: Float32, weights: Float32, pixels: Float32, prior: RegistrationPrior
+    arms: Float32,
+    directions: Float32,
+    weights: Float32,
+    pixels: Float32,
+    prior: RegistrationPrior,
 ) -> Float:
     """Information of pixels that hold a thing in some directions, (V, 6, 6)."""
-    moved = np.concatenate([np.cross(arms, directions), directions], 2).astype(np.float64)
+    moved = np.concatenate([np.cross(arms, directions), directions], 2).astype(
+        np.float64
+    )
     # As in registration: neighbouring pixels err together.
-    count = np.minimum(pixels.sum(1), prior.pixels) / np.maximum((weights > 0).sum(1), 1)
+    count = np.minimum(pixels.sum(1), prior.pixels) / np.maximum(
+        (weights > 0).sum(1),
+        1,
+    )
     weighted = moved * (weights * count[:, None])[..., None]
     return np.asarray(weighted.swapaxes(1, 2) @ moved, np.float64)
 
@@ -135,6 +147,9 @@ def _outward(images: HypothesisImages, shows: Mask) -> Float32:
     along = rays[:, 1, 0] - rays[:, 0, 0]
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    out = right[..., None] * across[:, None, None] + down[..., None] * along[:, None, None]
+    out = (
+        right[..., None] * across[:, None, None]
+        + down[..., None] * along[:, None, None]
+    )
     length = np.linalg.norm(out, axis=3, keepdims=True)
     return (out / np.maximum(length, 1e-6)).reshape(views, -1, 3)

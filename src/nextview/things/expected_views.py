@@ -16,7 +16,11 @@ from numpy.typing import NDArray
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, elevation_of, look_at_origin
 from nextview.things.depth_view import DepthView, depth_view
-from nextview.things.expected_images import ExpectedSensor, SeenSurroundings, rendered_images
+from nextview.things.expected_images import (
+    ExpectedSensor,
+    SeenSurroundings,
+    rendered_images,
+)
 from nextview.things.expected_likelihood import (
     different_pixels,
     divergences,
@@ -37,9 +41,8 @@ SENSOR_SIDE = 24  # rows and columns of a view by which the camera's noise is ju
 RENDERED_SIDE = 18  # rows and columns of the rendered images
 PICTURE_SIDE = 64  # rows and columns of pictures to look at
 BHATTACHARYYA = 0.25  # of two equally wide Gaussians, as a share of their divergence
-HALF_FOUND = (
-    1000.0  # pixels of the camera that show the thing, at which half of what they tell counts
-)
+# pixels of the camera that show the thing, at which half of what they tell counts
+HALF_FOUND = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +93,9 @@ class ExpectedViews:
             goal: what is to be told.
         """
         information = self.information(goal)
-        return information if goal == "thing" else information + self.found * self.sharper
+        return (
+            information if goal == "thing" else information + self.found * self.sharper
+        )
 
     def gain(self, truth: int, goal: Goal = "thing") -> Float:
         """Gain of the log-belief in the right answer with each view, (V,) float64.
@@ -140,7 +145,11 @@ class ExpectedViews:
             goal: what is to be told.
         """
         entropy = self.entropy(goal)
-        share = min(1.0, float(self.information(goal)[view]) / entropy) if entropy > 0 else 0.0
+        share = (
+            min(1.0, float(self.information(goal)[view]) / entropy)
+            if entropy > 0
+            else 0.0
+        )
         verb = "would settle" if share >= 0.5 else "would tell little of"
         doubt = f"{100 * share:.0f} % of the doubt"
         pair = self.told_apart(view)
@@ -150,7 +159,9 @@ class ExpectedViews:
             return f"there is no rival of {names[self.hypotheses.things[0]]}"
 
         first, second = (names[self.hypotheses.things[row]] for row in pair)
-        differs = f"they differ in {100 * self.different[view][pair]:.0f} % of the pixels"
+        differs = (
+            f"they differ in {100 * self.different[view][pair]:.0f} % of the pixels"
+        )
         return f"{verb} {first} or {second}: {differs}, {doubt}"
 
 
@@ -196,10 +207,20 @@ def expected_views(
     pixels_shown = rendered.pixels_shown(sensor.pitch) @ hypotheses.belief
     found = pixels_shown / (pixels_shown + HALF_FOUND)
     sharper = np.zeros(len(cameras))
+
     if covariance is not None:
         surface = caster.surfaces[hypotheses.things[0]]
         pose = hypotheses.poses[0]
-        sharper = sharper_poses(rendered, surface, pose, covariance, sensor, prior, taken)
+        sharper = sharper_poses(
+            rendered,
+            surface,
+            pose,
+            covariance,
+            sensor,
+            prior,
+            taken,
+        )
+
     return ExpectedViews(hypotheses, weight * divergence, different, found, sharper)
 
 
@@ -254,7 +275,10 @@ class Outlook:
 
     @classmethod
     def of(
-        cls, verifier: Verifier, verified: Verified, observations: Sequence[Observation]
+        cls,
+        verifier: Verifier,
+        verified: Verified,
+        observations: Sequence[Observation],
     ) -> "Outlook":
         """Gather what some views have shown.
 
@@ -267,7 +291,9 @@ class Outlook:
         Raises:
             ObservationError: no view shows the thing, or its scale is not known.
         """
-        found = ((each, depth_view(each, SENSOR_SIDE)) for each in observations if each.seen)
+        found = (
+            (each, depth_view(each, SENSOR_SIDE)) for each in observations if each.seen
+        )
         seen = [(each, view) for each, view in found if view is not None]
         sensor = ExpectedSensor.of([view for _, view in seen])
         hypotheses = Hypotheses.leading(verified)
@@ -283,7 +309,12 @@ class Outlook:
             weights=verifier.weights,
             pixels=verifier.pixels,
             prior=verifier.prior,
-            covariance=_covariance(verifier, verified, [view for _, view in seen], hypotheses),
+            covariance=_covariance(
+                verifier,
+                verified,
+                [view for _, view in seen],
+                hypotheses,
+            ),
         )
 
     @property
@@ -305,7 +336,11 @@ class Outlook:
         Returns:
             Camera-to-world poses, (V, 4, 4) float64, object frame, metres.
         """
-        return look_at_origin(elevation_of(directions), azimuth_of(directions), self.distance)
+        return look_at_origin(
+            elevation_of(directions),
+            azimuth_of(directions),
+            self.distance,
+        )
 
     def rivals(self, camera: Float, side: int = PICTURE_SIDE) -> RivalPictures | None:
         """Draw the two leading hypotheses, of two things if there are two, and their difference.
@@ -324,12 +359,21 @@ class Outlook:
             return None
         rows = np.array([order[0], others[0]])
         two = Hypotheses(things[rows], self.hypotheses.poses[rows], np.full(2, 0.5))
-        images = rendered_images(self.caster, two, camera[None], self.surroundings, side)
+        images = rendered_images(
+            self.caster,
+            two,
+            camera[None],
+            self.surroundings,
+            side,
+        )
+
         shows = np.isfinite(images.depth[0])
         pictures = np.where(shows, 255 * images.cosine[0], 0).astype(np.uint8)
         different = different_pixels(images, self.sensor, self.pixels, self.prior)[0]
         return RivalPictures(
-            two.things, pictures.reshape(2, side, side), different.reshape(side, side)
+            two.things,
+            pictures.reshape(2, side, side),
+            different.reshape(side, side),
         )
 
     def expect(self, cameras: Float) -> ExpectedViews:

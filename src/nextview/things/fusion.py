@@ -20,7 +20,9 @@ FINEST_CELL = 0.0015  # metres: what depth cameras tell apart
 CELLS = 45.0  # in a radius, of a large thing
 SQUARE = 0.75  # half the side of a square, cells: neighbours overlap
 MOST_FUSED_POINTS = 20_000  # of a frame; an even choice of more is taken
-STEEPEST_COSINE = 0.25  # cosine of the angle of incidence below which a pixel does not count
+STEEPEST_COSINE = (
+    0.25  # cosine of the angle of incidence below which a pixel does not count
+)
 FEW_SHARE = 0.1  # of what a usual cell was seen, below which it is an error
 FEWEST_SQUARES = 50
 
@@ -37,7 +39,9 @@ def fuse(sightings: Sequence[Sighting], radius: float, name: str) -> Surface | N
         Its surface, in the frame of the world, metres; None if too little was measured.
     """
     seen = [_measured(sighting) for sighting in sightings]
-    points, normals, weights = (np.concatenate(parts) for parts in zip(*seen, strict=True))
+    points, normals, weights = (
+        np.concatenate(parts) for parts in zip(*seen, strict=True)
+    )
     if not len(points):
         return None
 
@@ -69,7 +73,11 @@ def _measured(sighting: Sighting) -> tuple[Float, Float, Float]:
     cosine = -np.einsum("ni,ni->n", normals, points) / np.linalg.norm(points, axis=1)
 
     pose = sighting.frame.camera_to_world
-    good = np.isfinite(points).all(1) & np.isfinite(normals).all(1) & (cosine > STEEPEST_COSINE)
+    good = (
+        np.isfinite(points).all(1)
+        & np.isfinite(normals).all(1)
+        & (cosine > STEEPEST_COSINE)
+    )
     in_world = points[good] @ pose[:3, :3].T + pose[:3, 3]
     return in_world, normals[good] @ pose[:3, :3].T, step * cosine[good]
 

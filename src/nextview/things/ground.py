@@ -9,9 +9,8 @@ from nextview.types import Float, Floats
 
 FEWEST_PLANE_POINTS = 50  # on the plane
 LEAST_PLANE_SHARE = 0.25  # of what is measured beside the thing
-PLANE_LAYER = (
-    0.15  # thickness of the layer that the plane is looked for in, half sizes of the thing
-)
+# thickness of the layer that the plane is looked for in, half sizes of the thing
+PLANE_LAYER = 0.15
 THINNEST_LAYER = 0.006  # metres
 LEAST_VERTICAL = np.cos(
     np.radians(15.0)
@@ -41,7 +40,12 @@ class Ground:
         return points @ normal + points.dtype.type(self.offset)
 
 
-def find_ground(beside: Float, thing: Float, origin: Float, axis: Float) -> Ground | None:
+def find_ground(
+    beside: Float,
+    thing: Float,
+    origin: Float,
+    axis: Float,
+) -> Ground | None:
     """Find the plane that a thing stands on in what is measured beside it.
 
     It is the level plane that most points lie on, at the bottom of what is seen of the thing or
@@ -82,7 +86,9 @@ def find_ground(beside: Float, thing: Float, origin: Float, axis: Float) -> Grou
     normal = np.array([-plane[0], -plane[1], 1.0]) / np.sqrt(1 + plane[:2] @ plane[:2])
     offset = -(plane[2] - plane[:2] @ centre[:2]) * normal[2]
     ground = Ground(
-        normal, float(offset), _noise(off[near] * normal[2], beside[near], normal, origin, axis)
+        normal,
+        float(offset),
+        _noise(off[near] * normal[2], beside[near], normal, origin, axis),
     )
     bottom = np.quantile(ground.heights(thing), 0.1)
     if normal[2] < LEAST_VERTICAL or bottom < -layer:
@@ -90,11 +96,19 @@ def find_ground(beside: Float, thing: Float, origin: Float, axis: Float) -> Grou
     return ground
 
 
-def _noise(off: Float, points: Float, normal: Float, origin: Float, axis: Float) -> float:
+def _noise(
+    off: Float,
+    points: Float,
+    normal: Float,
+    origin: Float,
+    axis: Float,
+) -> float:
     """Deviation of inverse depth from a plane, 1/metres, of points by their heights, (N,)."""
     away = points - origin
     depth = away @ axis
-    along = np.abs(away @ normal) / depth  # by how much a metre of depth changes the height
+    along = (
+        np.abs(away @ normal) / depth
+    )  # by how much a metre of depth changes the height
     deviation = np.abs(off) / np.maximum(along, 0.05) / depth**2
     return float(np.median(deviation)) / NORMAL_MEDIAN
 

@@ -9,7 +9,9 @@ from nextview.types import Float, Index
 
 MOST_LEADING = 10  # hypotheses that are rendered
 FEW_THINGS = 5  # likeliest things whose best hypothesis is always among them
-LEAST_LEADING_SHARE = 1e-4  # of the likeliest hypothesis' belief, below which one does not count
+LEAST_LEADING_SHARE = (
+    1e-4  # of the likeliest hypothesis' belief, below which one does not count
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,13 +40,19 @@ class Hypotheses:
             The hypotheses. The belief in a thing is shared among its hypotheses.
         """
         in_thing = np.bincount(
-            verified.things, verified.probabilities, minlength=len(verified.belief)
+            verified.things,
+            verified.probabilities,
+            minlength=len(verified.belief),
         )
         share = verified.probabilities / np.maximum(in_thing[verified.things], 1e-300)
         belief = verified.belief[verified.things] * share
 
-        first = np.unique(verified.things, return_index=True)[1]  # the best hypothesis of each
-        first = first[np.argsort(-verified.belief[verified.things[first]], kind="stable")]
+        first = np.unique(verified.things, return_index=True)[
+            1
+        ]  # the best hypothesis of each
+        first = first[
+            np.argsort(-verified.belief[verified.things[first]], kind="stable")
+        ]
         ahead = np.zeros(len(belief))
         ahead[first[:FEW_THINGS]] = 1
         rows = np.argsort(-(ahead + belief), kind="stable")[:most]

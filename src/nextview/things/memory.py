@@ -24,7 +24,9 @@ from nextview.types import Float32, Floats, Index
 RINGS = (0.0, 18.0, 36.0, 54.0, 72.0)  # elevations of the remembered views, degrees
 AZIMUTHS = 16  # remembered views on a ring: the azimuth bins of a memory
 THING_PICTURE = 64  # side of the picture of a thing, pixels
-LARGEST_THING_RADIUS = 1e4  # of a thing, metres; nothing as large is looked at from around
+LARGEST_THING_RADIUS = (
+    1e4  # of a thing, metres; nothing as large is looked at from around
+)
 LARGEST_LOGIT = 700.0  # that a head can say: the exponential of more is no number
 
 
@@ -70,38 +72,63 @@ class Memory:
         poses = len(self.thing)
         things = len(self.radii)
 
-        check_array("its views", self.views, np.floating, (poses, len(RINGS), AZIMUTHS, None))
+        check_array(
+            "its views",
+            self.views,
+            np.floating,
+            (poses, len(RINGS), AZIMUTHS, None),
+        )
         size = self.views.shape[-1]
         check_array("its rotations", self.rotations, np.floating, (poses, 3, 3))
 
         check_array("its held_out", self.held_out, np.floating, (things, None, size))
         held_out = self.held_out.shape[1]
-        check_array("its held_out_views", self.held_out_views, np.floating, (things, held_out, 2))
-        check_array("its pictures", self.pictures, np.uint8, (things, THING_PICTURE, THING_PICTURE))
+        check_array(
+            "its held_out_views",
+            self.held_out_views,
+            np.floating,
+            (things, held_out, 2),
+        )
+        check_array(
+            "its pictures",
+            self.pictures,
+            np.uint8,
+            (things, THING_PICTURE, THING_PICTURE),
+        )
 
         check_array("its head_bias", self.head_bias, np.floating, (None,))
         check_array("its head", self.head, np.floating, (size, len(self.head_bias)))
         if len(self.surfaces) != things:
-            raise ModelError(f"its surfaces are of {len(self.surfaces)} things, not {things}")
+            raise ModelError(
+                f"its surfaces are of {len(self.surfaces)} things, not {things}"
+            )
 
     def _check_values(self) -> None:
         """See that the numbers can be what they stand for."""
         if np.unique(self.thing).tolist() != list(range(len(self.radii))):
-            raise ModelError("its thing names things that are not there, or not all that are")
+            raise ModelError(
+                "its thing names things that are not there, or not all that are"
+            )
         if (np.diff(self.thing) < 0).any():
             raise ModelError("its thing does not ascend")
 
         known = self.radii[~np.isnan(self.radii)]
         if not ((known > 0) & (known <= LARGEST_THING_RADIUS)).all():
-            raise ModelError(f"its radii are not above zero and at most {LARGEST_THING_RADIUS:g} m")
+            raise ModelError(
+                f"its radii are not above zero and at most {LARGEST_THING_RADIUS:g} m"
+            )
 
         nameless = np.isnan(self.radii) & (self.surfaces.counts[:, 0] > 0)
         if nameless.any():
-            raise ModelError("its radii lack that of a thing whose surface is known in metres")
+            raise ModelError(
+                "its radii lack that of a thing whose surface is known in metres"
+            )
 
         head = self.head.astype(np.float64)
         # Views are unit vectors.
-        largest = np.linalg.norm(head, axis=0) + np.abs(self.head_bias.astype(np.float64))
+        largest = np.linalg.norm(head, axis=0) + np.abs(
+            self.head_bias.astype(np.float64)
+        )
         if largest.max() > LARGEST_LOGIT:
             raise ModelError(
                 f"its head says more than {LARGEST_LOGIT:g} of a view, which no chance has"
@@ -115,7 +142,8 @@ class Memory:
         rotations = self.rotations.astype(np.float64)
         products = rotations @ rotations.swapaxes(1, 2)
         turned = (
-            np.abs(products - np.eye(3)).max() < ROUNDED and (np.linalg.det(rotations) > 0).all()
+            np.abs(products - np.eye(3)).max() < ROUNDED
+            and (np.linalg.det(rotations) > 0).all()
         )
         if not turned:
             raise ModelError("its rotations are no rotations")
@@ -135,7 +163,9 @@ class Memory:
         """
         arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in _OF_VIEWS}
         arrays |= {name: getattr(self.surfaces, name) for name in _OF_SURFACES}
-        arrays |= {name: arrays[name].astype(np.float16) for name in ("views", "held_out")}
+        arrays |= {
+            name: arrays[name].astype(np.float16) for name in ("views", "held_out")
+        }
         content = save(arrays)
         with new_file(path, overwrite) as part:
             part.write_bytes(content)
@@ -166,7 +196,9 @@ def read_memory(path: Path, sha256: str) -> Memory:
     arrays = arrays_in(content, _OF_VIEWS, where)
     stored = arrays_in(content, (), where, _OF_SURFACES)
     if not stored:
-        raise ModelError(f"{path}: is of an earlier version; teach it again with nextview learn")
+        raise ModelError(
+            f"{path}: is of an earlier version; teach it again with nextview learn"
+        )
     missing = sorted(set(_OF_SURFACES) - set(stored))
     if missing:
         raise ModelError(f"{where} (it holds no {missing[0]})")
@@ -201,7 +233,9 @@ def open_memory(model: str | Path) -> tuple[ModelCard, Memory]:
             f"{card.card_path}: takes other inputs than the features that it was taught with"
         )
     if card.azimuth_bins != AZIMUTHS:
-        raise ModelError(f"{card.card_path}: has {card.azimuth_bins} azimuth bins, not {AZIMUTHS}")
+        raise ModelError(
+            f"{card.card_path}: has {card.azimuth_bins} azimuth bins, not {AZIMUTHS}"
+        )
 
     memory = read_memory(card.path, card.sha256)
     if memory.thing.tolist() != list(card.memory.poses):
@@ -290,9 +324,18 @@ class TaughtRecogniser(NetworkRecogniser):
         if about.novelty:
             judged = np.array([self.memory.held_out[..., 0].size])
             usual = np.array(about.usual) if about.usual else None
-            self.novelty = Quantiles(np.array(about.novelty), judged, joint=True, usual=usual)
+            self.novelty = Quantiles(
+                np.array(about.novelty),
+                judged,
+                joint=True,
+                usual=usual,
+            )
 
-    def from_inputs(self, inputs: NDArray[Any], elevations: Floats | None = None) -> Evidence:
+    def from_inputs(
+        self,
+        inputs: NDArray[Any],
+        elevations: Floats | None = None,
+    ) -> Evidence:
         """Judge views by shape alone.
 
         Args:
@@ -336,7 +379,10 @@ class TaughtRecogniser(NetworkRecogniser):
 def by_ring(views: Floats) -> Float32:
     """Sort remembered views, (H, rings, azimuths, F), by ring: (rings, H * azimuths, F) float32."""
     h, rings, azimuths, f = views.shape
-    return np.ascontiguousarray(views.swapaxes(0, 1).reshape(rings, h * azimuths, f), np.float32)
+    return np.ascontiguousarray(
+        views.swapaxes(0, 1).reshape(rings, h * azimuths, f),
+        np.float32,
+    )
 
 
 def joined(clean: Floats, sensed: Floats) -> Float32:

@@ -40,7 +40,11 @@ def candidates_of(
     views = [view for view in shown if view is not None]
     candidates = []
     for thing, pose, probability, displacements in zip(
-        found.things, found.poses, found.probabilities, found.cameras, strict=True
+        found.things,
+        found.poses,
+        found.probabilities,
+        found.cameras,
+        strict=True,
     ):
         surface = things.verifier.caster.surfaces[thing]
         candidate = PoseCandidate(
@@ -67,14 +71,19 @@ def candidates_of(
     for row, (degrees, millimetres) in zip(rows, deviations, strict=True):
         share = candidates[row].probability / total
         candidate = replace(
-            candidates[row], probability=share, degrees=degrees, millimetres=millimetres
+            candidates[row],
+            probability=share,
+            degrees=degrees,
+            millimetres=millimetres,
         )
         kept.append(candidate)
     return tuple(kept), _camera_error(things.verifier, observations, views)
 
 
 def _camera_error(
-    verifier: Verifier, observations: Sequence[Observation], views: Sequence[DepthView]
+    verifier: Verifier,
+    observations: Sequence[Observation],
+    views: Sequence[DepthView],
 ) -> float:
     """By how much errors of the cameras' places displace a pose, millimetres; 0 for exact ones."""
     if all(observation.exact for observation in observations):

@@ -38,7 +38,11 @@ class Proposals:
 
     def select(self, rows: NDArray) -> "Proposals":
         """Some of the proposals, by index or mask."""
-        return Proposals(self.hypotheses[rows], self.azimuths[rows], self.log_belief[rows])
+        return Proposals(
+            self.hypotheses[rows],
+            self.azimuths[rows],
+            self.log_belief[rows],
+        )
 
 
 def propose(
@@ -86,7 +90,11 @@ def propose(
     needed = max(np.searchsorted(so_far, enough) + 1, around.size)
     count = int(np.clip(needed, fewest, most))
     azimuths = -2 * np.pi * bin_of[:count] / bins
-    return Proposals(hypotheses[:count], azimuths, np.log(marginal[hypotheses[:count]] + 1e-300))
+    return Proposals(
+        hypotheses[:count],
+        azimuths,
+        np.log(marginal[hypotheses[:count]] + 1e-300),
+    )
 
 
 def _peaks(joint: Float) -> Mask:

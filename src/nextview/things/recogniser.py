@@ -42,7 +42,9 @@ class VerifiedRecogniser(TaughtRecogniser):
             ModelError: see ``open_memory``, or the memory knows no geometry.
         """
         super().__init__(model, threads)
-        assert len(self.things.names)  # made now: what is wrong with it is said when it is opened
+        assert len(
+            self.things.names
+        )  # made now: what is wrong with it is said when it is opened
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what is made of the memory, and leads back to it."""
@@ -76,7 +78,10 @@ class VerifiedRecogniser(TaughtRecogniser):
         return labels
 
     def together(
-        self, observations: Sequence[Observation], total: Floats, counted: int
+        self,
+        observations: Sequence[Observation],
+        total: Floats,
+        counted: int,
     ) -> JointBelief:
         """What is believed of an object by all views of it.
 
@@ -126,8 +131,17 @@ class VerifiedRecogniser(TaughtRecogniser):
 
         best = int(belief.argmax())
         if best not in self.labels:
-            return JointBelief(belief, why_no_pose=self._no_geometry(belief), found=found)
-        poses, camera_error = candidates_of(self.things, found, observations, self.labels)
+            return JointBelief(
+                belief,
+                why_no_pose=self._no_geometry(belief),
+                found=found,
+            )
+        poses, camera_error = candidates_of(
+            self.things,
+            found,
+            observations,
+            self.labels,
+        )
         return JointBelief(
             belief,
             poses=poses,
@@ -136,7 +150,11 @@ class VerifiedRecogniser(TaughtRecogniser):
             found=found,
         )
 
-    def outlook(self, observations: Sequence[Observation], joint: JointBelief) -> Outlook | None:
+    def outlook(
+        self,
+        observations: Sequence[Observation],
+        joint: JointBelief,
+    ) -> Outlook | None:
         """What is known when the next view is to be chosen.
 
         Args:

@@ -149,14 +149,20 @@ class Alignment:
         poses = np.tile(np.eye(4), (len(self), 1, 1))
         poses[:, :3, :3] = self.rotations
         own_centres = caster.centres[self.things].astype(np.float64)
-        poses[:, :3, 3] = self.centres - np.einsum("hij,hj->hi", self.rotations, own_centres)
+        poses[:, :3, 3] = self.centres - np.einsum(
+            "hij,hj->hi",
+            self.rotations,
+            own_centres,
+        )
         return poses
 
 
 def joined(first: Alignment, second: Alignment) -> Alignment:
     """Put the hypotheses of two alignments with the same views one after the other."""
     parts = {
-        field.name: np.concatenate([getattr(first, field.name), getattr(second, field.name)])
+        field.name: np.concatenate(
+            [getattr(first, field.name), getattr(second, field.name)]
+        )
         for field in fields(Alignment)
     }
     return Alignment(**parts)
@@ -185,11 +191,17 @@ def start(things: NDArray[np.integer], rotations: Float, views: int) -> Alignmen
 
 
 SCAN_ERROR = 0.0007  # deviation of a surface from the thing itself, metres
-RELATIVE_SCAN_ERROR = 0.005  # and a part of its radius: large things are scanned less exactly
+RELATIVE_SCAN_ERROR = (
+    0.005  # and a part of its radius: large things are scanned less exactly
+)
 SUNK = 0.005  # metres that a hypothesis may be below the ground, beside the errors of the scan
-HIDING = 0.005  # metres by which something stands before a surface that it hides, at least
+HIDING = (
+    0.005  # metres by which something stands before a surface that it hides, at least
+)
 HIDING_NOISE = 4.0  # deviations of the noise by which it does
-NOISE_REACH = 2.0  # deviations of the noise at which a pixel counts half, however fine the level
+NOISE_REACH = (
+    2.0  # deviations of the noise at which a pixel counts half, however fine the level
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +240,12 @@ class Rendered:
         return (view.kind == ELSEWHERE) & (view.depth < self.depth - before)
 
 
-def render(caster: SurfaceCaster, alignment: Alignment, view: DepthView, number: int) -> Rendered:
+def render(
+    caster: SurfaceCaster,
+    alignment: Alignment,
+    view: DepthView,
+    number: int,
+) -> Rendered:
     """Cast the rays of a view at all hypotheses.
 
     Args:
@@ -245,12 +262,20 @@ def render(caster: SurfaceCaster, alignment: Alignment, view: DepthView, number:
     origins = from_centre + caster.centres[alignment.things]
     turns = alignment.rotations.astype(np.float32)
 
-    depth, normals = caster.cast(alignment.things, origins.astype(np.float32), view.rays @ turns)
+    depth, normals = caster.cast(
+        alignment.things,
+        origins.astype(np.float32),
+        view.rays @ turns,
+    )
     radii = caster.radii[alignment.things]
     return Rendered(depth, normals @ turns.swapaxes(1, 2), radii)
 
 
-def centred(caster: SurfaceCaster, alignment: Alignment, views: Sequence[DepthView]) -> Alignment:
+def centred(
+    caster: SurfaceCaster,
+    alignment: Alignment,
+    views: Sequence[DepthView],
+) -> Alignment:
     """Move each hypothesis so that what shows of it lies about where the thing was measured.
 
     The centre of the object frame is that of what was seen, which need not be the centre of the
@@ -287,11 +312,16 @@ def centred(caster: SurfaceCaster, alignment: Alignment, views: Sequence[DepthVi
     for number, view in enumerate(views):
         after += _overlap(view, np.isfinite(render(caster, moved, view, number).depth))
     better = after > before
-    return replace(alignment, centres=np.where(better[:, None], moved.centres, alignment.centres))
+    return replace(
+        alignment,
+        centres=np.where(better[:, None], moved.centres, alignment.centres),
+    )
 
 
 def _heights_on_the_ground(
-    caster: SurfaceCaster, alignment: Alignment, views: Sequence[DepthView]
+    caster: SurfaceCaster,
+    alignment: Alignment,
+    views: Sequence[DepthView],
 ) -> Float | None:
     """Heights of the centres of hypotheses that stand on the ground, (H,); None if none is seen."""
     grounds = [view.ground for view in views if view.ground is not None]
@@ -334,7 +364,12 @@ class _PoseEquations:
 OUTLINE_PIXELS = 1.5  # deviation of an outline, pixels
 
 
-def _pulls(view: DepthView, rendered: Rendered, centres: Float, reach: Float32) -> _PoseEquations:
+def _pulls(
+    view: DepthView,
+    rendered: Rendered,
+    centres: Float,
+    reach: Float32,
+) -> _PoseEquations:
     """What draws the hypotheses whose centres are these, (H, 3), as this view sees them.
 
     ``reach`` is the deviation of each that is to be expected beside the noise, (H,), metres.
@@ -388,7 +423,10 @@ def _nearest_shown(view: DepthView, shows: Mask) -> tuple[Index, Float32, Float3
     # One transform for all hypotheses: other images are too far away to be nearest.
     apart = 2.0 * float((view.step * view.shape).sum()) + 1
     index = distance_transform_edt(
-        ~images, sampling=(apart, *view.step), return_distances=False, return_indices=True
+        ~images,
+        sampling=(apart, *view.step),
+        return_distances=False,
+        return_indices=True,
     )
     same = index[0] == np.arange(count)[:, None, None]
     rows, columns = np.indices(view.shape)
@@ -481,7 +519,10 @@ def _equations(
         rendered = render(caster, alignment, view, number)
         centres = alignment.centres + alignment.cameras[:, number]
         reach = level.reach(rendered.radii, displaced[number])
-        square, towards = _normal_equations(_pulls(view, rendered, centres, reach), prior)
+        square, towards = _normal_equations(
+            _pulls(view, rendered, centres, reach),
+            prior,
+        )
         left[:, :POSE, :POSE] += square
         right[:, :POSE] += towards
         if errors_too:
@@ -493,7 +534,13 @@ def _equations(
             left[:, own, :POSE] += square[:, PLACE, :]
             right[:, own] += towards[:, PLACE]
 
-    weights, so_far = _priors(caster, alignment, displaced if errors_too else None, level, prior)
+    weights, so_far = _priors(
+        caster,
+        alignment,
+        displaced if errors_too else None,
+        level,
+        prior,
+    )
     left += weights[:, :, None] * np.eye(unknowns)
     right -= weights * so_far
     return left, right
@@ -549,7 +596,9 @@ def pose_covariances(
     for number, view in enumerate(views):
         rendered = render(caster, alignment, view, number)
         centres = alignment.centres + alignment.cameras[:, number]
-        information = information + _normal_equations(_outline(view, rendered, centres), prior)[0]
+        information = (
+            information + _normal_equations(_outline(view, rendered, centres), prior)[0]
+        )
     return inverses(information)
 
 
@@ -560,7 +609,9 @@ def inverses(information: Float) -> Float:
     eigenvalue: it counts as determined as little as that precision tells.
     """
     scale = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), FREE_WEIGHT))
-    scaled = information / (scale[:, :, None] * scale[:, None])  # turns and places have other units
+    scaled = information / (
+        scale[:, :, None] * scale[:, None]
+    )  # turns and places have other units
     values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
     values = np.maximum(values, np.finfo(np.float32).eps)
     inverse = (vectors / values[:, None]) @ vectors.swapaxes(1, 2)
@@ -594,12 +645,23 @@ def _outline(view: DepthView, rendered: Rendered, centres: Float) -> _PoseEquati
     deviation = OUTLINE_PIXELS * view.pitch * shown
     weights = rim / (rendered.errors[:, None] ** 2 + deviation**2)
     directions = np.broadcast_to(aside, arms.shape)
-    return _PoseEquations(arms, directions, np.zeros_like(shown), weights.astype(np.float32))
+    return _PoseEquations(
+        arms,
+        directions,
+        np.zeros_like(shown),
+        weights.astype(np.float32),
+    )
 
 
-def _normal_equations(pulls: _PoseEquations, prior: RegistrationPrior) -> tuple[Float, Float]:
+def _normal_equations(
+    pulls: _PoseEquations,
+    prior: RegistrationPrior,
+) -> tuple[Float, Float]:
     """What one view says of turn and place: matrices, (H, 6, 6), and right-hand sides, (H, 6)."""
-    jacobian = np.concatenate([np.cross(pulls.arms, pulls.directions), pulls.directions], -1)
+    jacobian = np.concatenate(
+        [np.cross(pulls.arms, pulls.directions), pulls.directions],
+        -1,
+    )
     # Neighbouring pixels err together.
     used = np.count_nonzero(pulls.weights, axis=1)
     share = np.minimum(1, prior.pixels / np.maximum(used, 1)).astype(np.float32)

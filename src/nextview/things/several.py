@@ -60,7 +60,9 @@ class SeveralRecognisers:
                 memories[name] = member
             elif isinstance(member, TaughtRecogniser):
                 what = "knows no geometry of its things, by which they are told from others"
-                raise ModelError(f"{name}: {what}; teach them again from meshes with --unit")
+                raise ModelError(
+                    f"{name}: {what}; teach them again from meshes with --unit"
+                )
             else:
                 networks[name] = member
         if len(networks) > 1 or not memories:
@@ -88,10 +90,16 @@ class SeveralRecognisers:
     def __getstate__(self) -> dict[str, Any]:
         """All but what was said of observations so far, and what is made of the memories."""
         left_out = ("_said", "_novelties", "in_any_orientation")
-        return {name: value for name, value in vars(self).items() if name not in left_out}
+        return {
+            name: value for name, value in vars(self).items() if name not in left_out
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, _said=WeakKeyDictionary(), _novelties=WeakKeyDictionary())
+        vars(self).update(
+            state,
+            _said=WeakKeyDictionary(),
+            _novelties=WeakKeyDictionary(),
+        )
 
     @cached_property
     def in_any_orientation(self) -> SeveralRecognisers:
@@ -106,7 +114,9 @@ class SeveralRecognisers:
 
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
         """What each view speaks for, each collection being as likely: for policies alone."""
-        directions = np.stack([direction_of(observation.pose) for observation in observations])
+        directions = np.stack(
+            [direction_of(observation.pose) for observation in observations]
+        )
         azimuths = azimuth_of(directions)
         logits = []
         said: list[list[Floats]] = [[] for _ in observations]
@@ -124,7 +134,10 @@ class SeveralRecognisers:
         return Evidence(np.concatenate(logits, 1), seen=seen)
 
     def together(
-        self, observations: Sequence[Observation], total: Floats, counted: int
+        self,
+        observations: Sequence[Observation],
+        total: Floats,
+        counted: int,
     ) -> JointBelief:
         """What is believed of an object by all views of it.
 
@@ -133,7 +146,9 @@ class SeveralRecognisers:
             total: is not used: each collection sums its own evidence.
             counted: how many they are.
         """
-        unknown = [observation for observation in observations if observation not in self._said]
+        unknown = [
+            observation for observation in observations if observation not in self._said
+        ]
         if unknown:
             self(unknown)
         totals = [
@@ -144,15 +159,24 @@ class SeveralRecognisers:
             memory.together(observations, own, counted)
             for memory, own in zip(self.memories, totals, strict=False)
         ]
-        best = int(np.argmax([-1.0 if one.p_value is None else one.p_value for one in judged]))
-        explained = judged[best].p_value is not None and (judged[best].p_value or 0) >= EXPLAINED
+        best = int(
+            np.argmax([-1.0 if one.p_value is None else one.p_value for one in judged])
+        )
+        explained = (
+            judged[best].p_value is not None
+            and (judged[best].p_value or 0) >= EXPLAINED
+        )
         if explained or self.network is None:
             return self._placed(best, judged[best])
 
         network = self.network
         belief = network.calibration.belief(totals[-1], counted, len(network.classes))
         p_value = self._p_value_of_class(observations)
-        joint = JointBelief(belief, p_value=p_value, why_no_pose=_why_no_pose(judged[best]))
+        joint = JointBelief(
+            belief,
+            p_value=p_value,
+            why_no_pose=_why_no_pose(judged[best]),
+        )
         return self._placed(len(self.memories), joint)
 
     def outlook(self, observations: Sequence[Observation], joint: JointBelief) -> Any:
@@ -179,12 +203,16 @@ class SeveralRecognisers:
         belief[first : first + sizes[member]] = (
             (1 - OTHERS) * joint.belief if others else joint.belief
         )
+
         poses = []
         for candidate in joint.poses:
             poses.append(replace(candidate, label=first + candidate.label))
         is_memory = member < len(self.memories)
         return replace(
-            joint, belief=belief, poses=tuple(poses), found=(member, joint) if is_memory else None
+            joint,
+            belief=belief,
+            poses=tuple(poses),
+            found=(member, joint) if is_memory else None,
         )
 
     def _p_value_of_class(self, observations: Sequence[Observation]) -> float | None:
@@ -195,7 +223,11 @@ class SeveralRecognisers:
             return None
         asked = [one for one in observations if one not in self._novelties]
         scores = [ViewScore(one, network.novelty_scores) for one in asked]
-        for observation, value in zip(asked, values_of(scores, whole=True), strict=True):
+        for observation, value in zip(
+            asked,
+            values_of(scores, whole=True),
+            strict=True,
+        ):
             self._novelties[observation] = value
         return network.novelty.of_views([self._novelties[one] for one in observations])
 

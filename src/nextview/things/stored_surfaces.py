@@ -79,7 +79,12 @@ class StoredSurfaces:
             vertices = surface.vertices.astype(np.float64)
             low = vertices.min(0)
             extents = vertices.max(0) - low
-            steps = np.divide(vertices - low, extents, np.zeros_like(vertices), where=extents > 0)
+            steps = np.divide(
+                vertices - low,
+                extents,
+                np.zeros_like(vertices),
+                where=extents > 0,
+            )
             places.append(np.rint(steps * BOX_STEPS).astype(np.uint16))
             faces.append(surface.faces.astype(np.uint32))
             counts[number] = len(vertices), len(surface.faces)

@@ -14,12 +14,16 @@ from nextview.geometry.mesh import UNITS, Mesh
 from nextview.geometry.ray_caster import embree_scene
 from nextview.types import Float, Float32, Index
 
-FEWEST_FACES = 500  # a simplified surface has at least so many triangles, if it had as many
+FEWEST_FACES = (
+    500  # a simplified surface has at least so many triangles, if it had as many
+)
 # metres by which a simplified surface may be off: less than depth cameras measure
 FINEST_ERROR = 0.0004
 SURFACE_SAMPLES = 2000  # points at which the error of a simplified surface is measured
 LARGEST_ERROR = 5.0  # errors by which no point of a simplified surface is off
-NEARBY_SAMPLES = 50_000  # points of a simplified surface that others are looked for beside
+NEARBY_SAMPLES = (
+    50_000  # points of a simplified surface that others are looked for beside
+)
 MISSED = np.float32(np.inf)  # depth along a ray that meets nothing
 
 
@@ -53,7 +57,9 @@ class Surface:
             MeshError: the unit of the mesh is not known.
         """
         if mesh.unit is None:
-            raise MeshError(f"{mesh.name}: the unit of length is not known; say it with --unit")
+            raise MeshError(
+                f"{mesh.name}: the unit of length is not known; say it with --unit"
+            )
 
         in_file = mesh.vertices * mesh.radius + mesh.centre
         vertices = (in_file * UNITS[mesh.unit]).astype(np.float32)
@@ -114,7 +120,9 @@ class Surface:
         while count >= FEWEST_FACES:
             vertices, faces = simplify(self.vertices, self.faces, target_count=count)
             smaller = Surface(
-                self.name, vertices.astype(np.float32), np.ascontiguousarray(faces, np.int32)
+                self.name,
+                vertices.astype(np.float32),
+                np.ascontiguousarray(faces, np.int32),
             )
             if not len(faces) or not _near_enough(self, smaller, error):
                 break
@@ -161,7 +169,9 @@ class Surface:
         chosen = self.triangles_by_area(count, rng)
 
         shares = rng.random((count, 2))
-        outside = shares.sum(1) > 1  # of the triangle, in the other half of the parallelogram
+        outside = (
+            shares.sum(1) > 1
+        )  # of the triangle, in the other half of the parallelogram
         shares[outside] = 1 - shares[outside]
         return corners[chosen, 0] + (shares[:, :, None] * edges[chosen]).sum(1)
 
@@ -243,7 +253,10 @@ class SurfaceCaster:
         return self._scenes[thing]
 
     def cast(
-        self, things: NDArray[np.integer], origins: Float32, directions: Float32
+        self,
+        things: NDArray[np.integer],
+        origins: Float32,
+        directions: Float32,
     ) -> tuple[Float32, Float32]:
         """Cast the same number of rays at each of some surfaces.
 
@@ -259,7 +272,11 @@ class SurfaceCaster:
             float32, in the frame of the surface.
         """
         directions = np.ascontiguousarray(directions, np.float32)
-        starts = np.repeat(np.asarray(origins, np.float32)[:, None], directions.shape[1], 1)
+        starts = np.repeat(
+            np.asarray(origins, np.float32)[:, None],
+            directions.shape[1],
+            1,
+        )
         depth = np.empty(directions.shape[:2], np.float32)
         normals = np.empty(directions.shape, np.float32)
         for row, thing in enumerate(np.asarray(things).tolist()):

@@ -22,7 +22,9 @@ LEAST_TOLERANCE = 0.005
 SYMMETRY_TOLERANCE = 0.02  # of the diameter: a camera stands farther from a large thing
 COMPARED_SHARE = 0.95  # share of the surface that has to be that near: scans have spurs
 HIGHEST_ORDER = 8
-ANY_TURNS = np.arange(1, 24, 2) / 48  # of a full turn, that are tried for a symmetry of any angle
+ANY_TURNS = (
+    np.arange(1, 24, 2) / 48
+)  # of a full turn, that are tried for a symmetry of any angle
 SYMMETRY_POINTS = 20_000  # of the surface that is compared with
 TURNED_POINTS = 500  # of its turned copy
 STEP_ACROSS = np.radians(5)  # between axes that are tried across one of a symmetry
@@ -62,12 +64,20 @@ def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
     found.sort(key=lambda item: (item[0] != 0, -item[0], item[1]))
     symmetries = _distinct((axis, order) for order, _, axis in found)
     if len(symmetries) == 1:
-        symmetries += _half_turn_across(tree, points, np.array(symmetries[0].axis), tolerance)
+        symmetries += _half_turn_across(
+            tree,
+            points,
+            np.array(symmetries[0].axis),
+            tolerance,
+        )
     return tuple(symmetries)
 
 
 def _half_turn_across(
-    tree: cKDTree, points: Float, axis: Float, tolerance: float
+    tree: cKDTree,
+    points: Float,
+    axis: Float,
+    tolerance: float,
 ) -> list[Symmetry]:
     """A symmetry of half a turn about an axis across another one; its direction may be any."""
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
@@ -97,12 +107,20 @@ def _box_axes(surface: Surface) -> Float:
 
     try:
         to_box = oriented_bounds(surface.vertices)[0]
-    except (QhullError, ValueError):  # of points in one plane, and of such that nearly are
+    except (
+        QhullError,
+        ValueError,
+    ):  # of points in one plane, and of such that nearly are
         return np.zeros((0, 3))
     return np.asarray(to_box, np.float64)[:3, :3]
 
 
-def _order(tree: cKDTree, points: Float, axis: Float, tolerance: float) -> tuple[int, float]:
+def _order(
+    tree: cKDTree,
+    points: Float,
+    axis: Float,
+    tolerance: float,
+) -> tuple[int, float]:
     """The highest order of a symmetry about an axis, and how exact it is, metres.
 
     The order is 0 for any angle, and 1 for none.

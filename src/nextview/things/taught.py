@@ -68,12 +68,16 @@ class TaughtThings:
 
         memory = recogniser.memory
         number = {known[name]: k for k, name in enumerate(self.names)}
-        rows = [row for row, thing in enumerate(memory.thing.tolist()) if thing in number]
+        rows = [
+            row for row, thing in enumerate(memory.thing.tolist()) if thing in number
+        ]
         owners = np.array([number[int(memory.thing[row])] for row in rows])
         self.rows = np.array(rows)
         self.recogniser = recogniser
         self.residuals = residuals
-        self.symmetries = tuple(about.things[known[name]].symmetries for name in self.names)
+        self.symmetries = tuple(
+            about.things[known[name]].symmetries for name in self.names
+        )
         self.verifier = Verifier(surfaces, owners, memory.rotations[self.rows], weights)
         self.templates: ViewTemplates | None = None
 
@@ -129,17 +133,25 @@ class TaughtThings:
         """
         seen = [observation for observation in observations if observation.seen]
         if not seen:
-            raise ObservationError("no view shows the thing, so nothing can be recognised")
+            raise ObservationError(
+                "no view shows the thing, so nothing can be recognised"
+            )
         return self.verify(seen, self.log_evidence(seen))
 
     def log_evidence(self, observations: Sequence[Observation]) -> Floats:
         """What features and size say of each view, (V, D): it can be summed over views."""
         evidence = self.recogniser(observations)
-        directions = np.stack([direction_of(observation.pose) for observation in observations])
+        directions = np.stack(
+            [direction_of(observation.pose) for observation in observations]
+        )
         azimuths = np.arctan2(directions[:, 1], directions[:, 0])
         return log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuths)
 
-    def verify(self, observations: Sequence[Observation], log_evidence: Floats) -> Verified:
+    def verify(
+        self,
+        observations: Sequence[Observation],
+        log_evidence: Floats,
+    ) -> Verified:
         """Recognise the thing that some views show, of which the features have been looked at.
 
         Args:
@@ -171,7 +183,11 @@ class TaughtThings:
         known = joint[self.rows]
         return self.verifier(observations, known / known.sum())
 
-    def p_value(self, observations: Sequence[Observation], found: Verified) -> float | None:
+    def p_value(
+        self,
+        observations: Sequence[Observation],
+        found: Verified,
+    ) -> float | None:
         """Share of known things that are explained as badly by the likeliest hypothesis.
 
         What is of another order of size than the likeliest thing is none of them, whatever its
@@ -198,7 +214,11 @@ class TaughtThings:
         explained = float(found.explained[0].mean())
         noise_share = float(found.noise_share[0].mean())
         return self.residuals.of_real_camera(
-            found.residual, likeliest, views, explained, noise_share
+            found.residual,
+            likeliest,
+            views,
+            explained,
+            noise_share,
         )
 
 
@@ -212,9 +232,13 @@ def weights_of(verification: Verification, where: str) -> EvidenceWeights:
     Raises:
         ModelError: it names a weight that this version does not know, or one is out of its range.
     """
-    strange = sorted(set(verification.weights) - {field.name for field in fields(EvidenceWeights)})
+    strange = sorted(
+        set(verification.weights) - {field.name for field in fields(EvidenceWeights)}
+    )
     if strange:
-        raise ModelError(f"{where}: weighs {strange[0]}, which this version does not know")
+        raise ModelError(
+            f"{where}: weighs {strange[0]}, which this version does not know"
+        )
     for share in ("correlation", "doubt"):
         value = verification.weights.get(share, 0)
         if value > 1:
@@ -222,7 +246,10 @@ def weights_of(verification: Verification, where: str) -> EvidenceWeights:
     return EvidenceWeights(**verification.weights)
 
 
-def residuals_of(verification: Verification, things: Sequence[int]) -> KnownResiduals | None:
+def residuals_of(
+    verification: Verification,
+    things: Sequence[int],
+) -> KnownResiduals | None:
     """The residuals that a card holds, of some of its things; None if it holds none.
 
     Args:

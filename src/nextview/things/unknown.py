@@ -10,10 +10,16 @@ from nextview.types import Float
 # number of residuals that the mean of all things counts for, beside those of a thing
 SHRINKAGE = 2.0
 LEAST_RESIDUAL = 0.02  # below which residuals do not differ
-NOISE_RESIDUAL = 0.5  # of pixels that are off by just the noise: half a squared standard normal
+NOISE_RESIDUAL = (
+    0.5  # of pixels that are off by just the noise: half a squared standard normal
+)
 NOISE_SHARE = 0.8  # of a thing's pixels that the surface explains, if only the noise is in the way
-MOSTLY_NOISE = 0.5  # part of the noise in the variance of a depth, from which it is in the way
-NOISE_KNOWN = 1.5  # by what factor the noise of a real camera may be larger than it is measured
+MOSTLY_NOISE = (
+    0.5  # part of the noise in the variance of a depth, from which it is in the way
+)
+NOISE_KNOWN = (
+    1.5  # by what factor the noise of a real camera may be larger than it is measured
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +41,11 @@ class KnownResiduals:
 
     @classmethod
     def fit(
-        cls, things: NDArray[np.integer], residuals: Float, views: NDArray[np.integer], count: int
+        cls,
+        things: NDArray[np.integer],
+        residuals: Float,
+        views: NDArray[np.integer],
+        count: int,
     ) -> "KnownResiduals":
         """Fit to residuals of known things, each with its own thing as the likeliest hypothesis.
 
@@ -57,7 +67,11 @@ class KnownResiduals:
 
         excess = []
         for number in range(1, int(views.max()) + 1):
-            here = np.sort(over[views == number]) if (views == number).any() else np.sort(over)
+            here = (
+                np.sort(over[views == number])
+                if (views == number).any()
+                else np.sort(over)
+            )
             excess.append(here)
         return cls(usual, tuple(excess))
 
@@ -105,7 +119,9 @@ class KnownResiduals:
             Between 0 and 1; small for a thing that was not taught.
         """
         excess = self.excess[min(views, len(self.excess)) - 1]
-        exceeded = (max(residual, 0) + LEAST_RESIDUAL) / (self.usual[thing] + LEAST_RESIDUAL)
+        exceeded = (max(residual, 0) + LEAST_RESIDUAL) / (
+            self.usual[thing] + LEAST_RESIDUAL
+        )
         over = np.log(exceeded)
         as_bad = len(excess) - np.searchsorted(excess, over - 1e-12)
         return float((1 + as_bad) / (1 + len(excess)))

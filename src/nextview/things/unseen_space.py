@@ -14,7 +14,9 @@ from nextview.geometry.observation import Observation
 from nextview.types import Float, Float32, Mask
 
 SIGHT_STEPS = 10  # places on each line of sight that are looked up
-BEFORE = 0.01  # metres before a measured surface, from which on space is known to be free
+BEFORE = (
+    0.01  # metres before a measured surface, from which on space is known to be free
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +64,10 @@ class MeasuredDepth:
         column = in_camera[..., 0] / ahead * np.float32(k[0, 0]) + np.float32(k[0, 2])
         row = in_camera[..., 1] / ahead * np.float32(k[1, 1]) + np.float32(k[1, 2])
         height, width = self.depth.shape
-        inside = (away > 0) & (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        inside = (
+            (away > 0) & (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        )
+
         rows = np.where(inside, row, 0).astype(np.int32)
         columns = np.where(inside, column, 0).astype(np.int32)
         measured = self.depth[rows, columns]

@@ -61,7 +61,9 @@ class ViewLikelihood:
 
 
 def likelihood(
-    view: DepthView, rendered: Rendered, model: PixelModel = PixelModel()
+    view: DepthView,
+    rendered: Rendered,
+    model: PixelModel = PixelModel(),
 ) -> ViewLikelihood:
     """Judge every pixel of a view, given what it would show under each hypothesis.
 
@@ -91,13 +93,19 @@ def likelihood(
     variance = view.noise**2 + rendered.errors[:, None] ** 2 + sideways**2
     squared = (observed - depth) ** 2 / variance
     # A mixture of the sensor's noise and of outliers.
-    match = np.log(np.exp(-squared / 2) + np.exp(model.outlier)) - np.log1p(np.exp(model.outlier))
+    match = np.log(np.exp(-squared / 2) + np.exp(model.outlier)) - np.log1p(
+        np.exp(model.outlier)
+    )
 
     # Mismatches at an outline cost less, the nearer to it they are.
     inner = np.clip(np.abs(view.edge) / model.edge, 0.1, 1)
     deep = np.where(view.level, 0.1, inner)  # of the ground, more likely
     thing = view.kind == THING
-    through = shows & (view.kind == ELSEWHERE) & (~rendered.hidden(view) | rendered.sunk(view))
+    through = (
+        shows
+        & (view.kind == ELSEWHERE)
+        & (~rendered.hidden(view) | rendered.sunk(view))
+    )
     hole = shows & (view.kind == NOT_MEASURED)
 
     judged = np.zeros(shows.shape)
@@ -115,7 +123,9 @@ def likelihood(
     both = np.where(shows & thing, inner, 0)
     mismatch = -(both * match).sum(1) / np.maximum(both.sum(1), 1e-9)
     mismatch = np.where(both.any(1), mismatch, -model.outlier)
-    misfit = mismatch - model.outlier * (model.missing * missing + model.through * seen_through)
+    misfit = mismatch - model.outlier * (
+        model.missing * missing + model.through * seen_through
+    )
     return ViewLikelihood(
         total=judged.sum(1),
         pixels=counted.sum(1).astype(np.float64),

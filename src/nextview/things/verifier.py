@@ -33,12 +33,18 @@ from nextview.things.view_templates import ViewTemplates
 from nextview.things.weighing import EvidenceWeights, JudgedEpisode
 from nextview.types import Float, Floats, Index
 
-ANY_TILT = 0.3  # radians by which a thing in any orientation is off its proposal: hardly held
+ANY_TILT = (
+    0.3  # radians by which a thing in any orientation is off its proposal: hardly held
+)
 TILTED_PROPOSALS = 120  # of things in any orientation, of all views together
-AGAINST_FEATURES = 0.1  # misfit for each unit of log-belief that features hold against a thing
+AGAINST_FEATURES = (
+    0.1  # misfit for each unit of log-belief that features hold against a thing
+)
 TINY = 1e-300  # belief that has a logarithm
 LEAST_BY_FEATURES = 0.01  # belief by features below which it does not matter
-AROUND_LEVELS = (Level(1, 0.05, 0.5, False),)  # steps of the alignment at azimuths all around
+AROUND_LEVELS = (
+    Level(1, 0.05, 0.5, False),
+)  # steps of the alignment at azimuths all around
 AROUND_THINGS = 2  # likeliest things that are also judged at azimuths all around
 AROUND_STEPS = 24  # azimuths: a small part of a round body shows at one of them
 AROUND_PEAKS = 2  # of these azimuths that are aligned, for each thing
@@ -124,7 +130,12 @@ class Verified:
     def judged(self, truth: int) -> JudgedEpisode:
         """The same as an example of the thing of this number, to fit weights to."""
         return JudgedEpisode(
-            truth, self.things, self.mean, self.camera_costs, self.log_belief, self.by_features
+            truth,
+            self.things,
+            self.mean,
+            self.camera_costs,
+            self.log_belief,
+            self.by_features,
         )
 
     def alignment(self, rows: Index, verifier: "Verifier") -> Alignment:
@@ -141,7 +152,8 @@ class Verified:
             things=things,
             ups=verifier.rotations[self.resting[rows], 2],
             rotations=rotations,
-            centres=np.einsum("hij,hj->hi", rotations, own_centres) + self.poses[rows, :3, 3],
+            centres=np.einsum("hij,hj->hi", rotations, own_centres)
+            + self.poses[rows, :3, 3],
             cameras=self.cameras[rows],
         )
 
@@ -261,12 +273,16 @@ class Verifier:
         )
 
         images = _images(observations)
-        level = levelling([image.ground for image in images if image.ground is not None])
+        level = levelling(
+            [image.ground for image in images if image.ground is not None]
+        )
         images = [image.turned(level) for image in images]
         return self._settled(proposed, images, VERIFICATION_STAGES, self.prior, level)
 
     def in_any_orientation(
-        self, observations: Sequence[Observation], templates: ViewTemplates
+        self,
+        observations: Sequence[Observation],
+        templates: ViewTemplates,
     ) -> Verified:
         """The same for a thing that need not rest on anything: held, leaning or thrown.
 
@@ -286,7 +302,9 @@ class Verifier:
         found = [templates.propose(image, each) for image in images]
         things = np.concatenate([one.things for one in found])
         if not len(things):
-            raise ObservationError("no view shows enough of the thing to be compared with others")
+            raise ObservationError(
+                "no view shows enough of the thing to be compared with others"
+            )
 
         by_outline = np.mean([one.log_belief for one in found], axis=0)
         belief = np.exp(by_outline - by_outline.max())
@@ -326,16 +344,27 @@ class Verifier:
 
             order = np.argsort(-scores, kind="stable")
             order = order[scores[order] >= scores[order[0]] - stage.hopeless]
-            rows = order[different_poses(self.caster, alignment.select(order))][: stage.most]
+            rows = order[different_poses(self.caster, alignment.select(order))][
+                : stage.most
+            ]
             alignment = alignment.select(rows)
             proposed = proposed.select(rows)
             if stage.around:
                 turned, source = self._around(alignment, proposed, views, prior)
                 alignment = joined(alignment, turned)
-                proposed = proposed.select(np.concatenate([np.arange(len(rows)), source]))
+                proposed = proposed.select(
+                    np.concatenate([np.arange(len(rows)), source])
+                )
 
         aligned = alignment.turned(level.T)
-        return self._verified(proposed, aligned, scores[rows], costs[rows], judged, rows)
+        return self._verified(
+            proposed,
+            aligned,
+            scores[rows],
+            costs[rows],
+            judged,
+            rows,
+        )
 
     def _around(
         self,
@@ -357,7 +386,9 @@ class Verifier:
         Returns:
             Hypotheses at the best azimuths, and the rows from which each was turned, (N,).
         """
-        first = np.sort(np.unique(alignment.things, return_index=True)[1])[:AROUND_THINGS]
+        first = np.sort(np.unique(alignment.things, return_index=True)[1])[
+            :AROUND_THINGS
+        ]
         source = np.repeat(first, AROUND_STEPS)
         azimuths = 2 * np.pi * np.arange(AROUND_STEPS) / AROUND_STEPS
         turns = np.tile(rotation_z(azimuths), (len(first), 1, 1))
@@ -378,14 +409,19 @@ class Verifier:
         peak = (circles >= np.roll(circles, 1, 1)) & (circles > np.roll(circles, -1, 1))
         peak[:, 0] = False  # as they are
         best = np.argsort(-np.where(peak, circles, -np.inf), axis=1, kind="stable")[
-            :, :AROUND_PEAKS
+            :,
+            :AROUND_PEAKS,
         ]
         rows = (best + AROUND_STEPS * np.arange(len(first))[:, None])[
             np.take_along_axis(peak, best, 1)
         ]
         return some.select(rows), source[rows]
 
-    def _judge(self, alignment: Alignment, views: Sequence[DepthView]) -> list[ViewLikelihood]:
+    def _judge(
+        self,
+        alignment: Alignment,
+        views: Sequence[DepthView],
+    ) -> list[ViewLikelihood]:
         return [
             likelihood(view, render(self.caster, alignment, view, number), self.pixels)
             for number, view in enumerate(views)

@@ -116,7 +116,11 @@ class ViewTemplates:
         known = int(self.things.max()) + 1
         turned, look = seen(image)
         if turned is None:
-            return OrientedProposals(np.zeros(0, np.int64), np.zeros((0, 3, 3)), np.zeros(known))
+            return OrientedProposals(
+                np.zeros(0, np.int64),
+                np.zeros((0, 3, 3)),
+                np.zeros(known),
+            )
 
         costs = mismatch(turned, self.pictures)
         turn = costs.argmin(0)
@@ -127,7 +131,9 @@ class ViewTemplates:
         order = np.argsort(best, kind="stable")
         rank = _rank_within(self.things[order])
         order = order[rank < MOST_ORIENTATIONS][:count]
-        rotations = look @ rotation_z(2 * np.pi * turn[order] / TURNS) @ self.rotations[order]
+        rotations = (
+            look @ rotation_z(2 * np.pi * turn[order] / TURNS) @ self.rotations[order]
+        )
         return OrientedProposals(self.things[order], rotations, -of_things)
 
 
@@ -162,22 +168,29 @@ def looking_from(directions: Float) -> Float:
 
 
 def _rendered(
-    caster: SurfaceCaster, thing: int, looks: Float
+    caster: SurfaceCaster,
+    thing: int,
+    looks: Float,
 ) -> Iterator[tuple[Float, tuple[Float32, Float32, float]]]:
     """The pictures of one thing from cameras with these axes, (N, 3, 3)."""
     radius = float(caster.radii[thing])
     focal = RENDERING_PIXELS / 2 * np.sqrt(TEMPLATE_DISTANCE**2 - 1)
     lines = (np.arange(RENDERING_PIXELS) + 0.5 - RENDERING_PIXELS / 2) / focal
     rays = np.stack(
-        [*np.meshgrid(lines, lines), np.ones((RENDERING_PIXELS, RENDERING_PIXELS))], -1
+        [*np.meshgrid(lines, lines), np.ones((RENDERING_PIXELS, RENDERING_PIXELS))],
+        -1,
     ).reshape(-1, 3)
 
     origins = caster.centres[thing] - TEMPLATE_DISTANCE * radius * looks[:, 2]
     depth, _ = caster.cast(
-        np.full(len(looks), thing), origins.astype(np.float32), (rays @ looks).astype(np.float32)
+        np.full(len(looks), thing),
+        origins.astype(np.float32),
+        (rays @ looks).astype(np.float32),
     )
     for look, image in zip(
-        looks, depth.reshape(-1, RENDERING_PIXELS, RENDERING_PIXELS), strict=True
+        looks,
+        depth.reshape(-1, RENDERING_PIXELS, RENDERING_PIXELS),
+        strict=True,
     ):
         picture = _picture(image, np.isfinite(image), focal, np.zeros(1))
         if picture is not None:
@@ -214,7 +227,10 @@ def _from_z_to(direction: Float) -> Float:
 
 
 def _picture(
-    depth: NDArray, shown: Mask, focal: float, turns: Float
+    depth: NDArray,
+    shown: Mask,
+    focal: float,
+    turns: Float,
 ) -> tuple[Float32, Float32, float] | None:
     """Outlines and depths on grids that are turned by some angles, (A, C), and the size, metres.
 
@@ -229,10 +245,14 @@ def _picture(
     size = spread * middle / focal
 
     lines = (np.arange(TEMPLATE_SIDE) + 0.5) / TEMPLATE_SIDE * 2 - 1
-    cells = TEMPLATE_REACH * spread * np.stack(np.meshgrid(lines, lines), -1).reshape(-1, 2)
+    cells = (
+        TEMPLATE_REACH * spread * np.stack(np.meshgrid(lines, lines), -1).reshape(-1, 2)
+    )
     turned = np.einsum("aij,cj->aci", rotation_z(turns)[:, :2, :2], cells) + centre
     column, row = np.rint(turned).astype(np.int64).transpose(2, 0, 1)
-    inside = (row >= 0) & (row < shown.shape[0]) & (column >= 0) & (column < shown.shape[1])
+    inside = (
+        (row >= 0) & (row < shown.shape[0]) & (column >= 0) & (column < shown.shape[1])
+    )
     row = np.where(inside, row, 0)
     column = np.where(inside, column, 0)
 

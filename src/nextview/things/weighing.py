@@ -10,7 +10,9 @@ from nextview.errors import ModelError
 from nextview.types import Float, Index
 
 NEVER = -1e9  # log-likelihood of a thing that was not aligned
-LEAST_TRUE_BELIEF = 1e-9  # belief in the truth below which it is not told how wrong it was
+LEAST_TRUE_BELIEF = (
+    1e-9  # belief in the truth below which it is not told how wrong it was
+)
 
 GEOMETRY_WEIGHTS = (5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0)
 FEATURE_WEIGHTS = (0.2, 0.4, 0.6, 0.8, 1.0)
@@ -120,7 +122,12 @@ def fit_weights(episodes: Sequence[JudgedEpisode]) -> EvidenceWeights:
         raise ModelError("weights are fitted to episodes, and there is none")
 
     tried = []
-    for values in product(GEOMETRY_WEIGHTS, FEATURE_WEIGHTS, CAMERA_WEIGHTS, VIEW_CORRELATIONS):
+    for values in product(
+        GEOMETRY_WEIGHTS,
+        FEATURE_WEIGHTS,
+        CAMERA_WEIGHTS,
+        VIEW_CORRELATIONS,
+    ):
         weights = EvidenceWeights(*values)
         tried.append((_loss(weights, episodes), weights))
     best = min(tried, key=lambda pair: pair[0])[1]
@@ -131,5 +138,7 @@ def fit_weights(episodes: Sequence[JudgedEpisode]) -> EvidenceWeights:
 
 def _loss(weights: EvidenceWeights, episodes: Sequence[JudgedEpisode]) -> float:
     """Mean negative logarithm of the belief in the truth."""
-    believed = np.array([episode.belief(weights)[episode.truth] for episode in episodes])
+    believed = np.array(
+        [episode.belief(weights)[episode.truth] for episode in episodes]
+    )
     return float(-np.log(np.maximum(believed, LEAST_TRUE_BELIEF)).mean())

@@ -28,7 +28,15 @@ class Depthwise(nn.Conv2d):
     """A kernel for each channel, always in float32: in bfloat16 its gradient is slow on a CPU."""
 
     def __init__(self, width: int, kernel: int, stride: int) -> None:
-        super().__init__(width, width, kernel, stride, kernel // 2, groups=width, bias=False)
+        super().__init__(
+            width,
+            width,
+            kernel,
+            stride,
+            kernel // 2,
+            groups=width,
+            bias=False,
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         with torch.autocast(x.device.type, enabled=False):
@@ -39,11 +47,19 @@ class InvertedBottleneck(nn.Module):
     """Widen, filter each channel, narrow; with a shortcut where nothing changes its shape."""
 
     def __init__(
-        self, inputs: int, expansion: int, width: int, kernel: int, stride: int, skip: float = 0.0
+        self,
+        inputs: int,
+        expansion: int,
+        width: int,
+        kernel: int,
+        stride: int,
+        skip: float = 0.0,
     ) -> None:
         super().__init__()
         wide = inputs * expansion
-        self.expand = nn.Conv2d(inputs, wide, 1, bias=False) if expansion > 1 else nn.Identity()
+        self.expand = (
+            nn.Conv2d(inputs, wide, 1, bias=False) if expansion > 1 else nn.Identity()
+        )
         self.norm0 = _norm(wide) if expansion > 1 else nn.Identity()
         self.depthwise = Depthwise(wide, kernel, stride)
         self.norm1 = _norm(wide)
@@ -63,7 +79,11 @@ class InvertedBottleneck(nn.Module):
         if not self.has_shortcut:
             return x
         if self.training and self.skip:
-            x = x * (torch.rand(len(x), 1, 1, 1, device=x.device) >= self.skip) / (1 - self.skip)
+            x = (
+                x
+                * (torch.rand(len(x), 1, 1, 1, device=x.device) >= self.skip)
+                / (1 - self.skip)
+            )
         return x + past
 
 
@@ -90,7 +110,11 @@ class RecogniserNetwork(nn.Module):
         self.side = nn.Linear(features, classes * azimuths) if azimuths else None
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+                nn.init.kaiming_normal_(
+                    module.weight,
+                    mode="fan_out",
+                    nonlinearity="relu",
+                )
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         return self.answers(self.features(x))
@@ -101,7 +125,10 @@ class RecogniserNetwork(nn.Module):
         logits = self.fc(features)
         if self.side is None:
             return (logits,)
-        return logits, self.side(features).unflatten(1, (-1, self.azimuths)).log_softmax(2)
+        return logits, self.side(features).unflatten(
+            1,
+            (-1, self.azimuths),
+        ).log_softmax(2)
 
 
 class LiteNet(RecogniserNetwork):
@@ -110,7 +137,11 @@ class LiteNet(RecogniserNetwork):
     name = "EfficientNet-Lite0"
 
     def __init__(
-        self, classes: int, channels: int, azimuths: int = 0, dropout: float = 0.0
+        self,
+        classes: int,
+        channels: int,
+        azimuths: int = 0,
+        dropout: float = 0.0,
     ) -> None:
         super().__init__()
         self.dropout = dropout
@@ -123,7 +154,9 @@ class LiteNet(RecogniserNetwork):
             for index in range(length):
                 step = 1 if index else stride
                 skip = dropout * len(stages) / BLOCKS
-                stages.append(InvertedBottleneck(inputs, expansion, width, kernel, step, skip))
+                stages.append(
+                    InvertedBottleneck(inputs, expansion, width, kernel, step, skip)
+                )
                 inputs = width
         self.stages = nn.Sequential(*stages)
 
@@ -139,7 +172,10 @@ class LiteNet(RecogniserNetwork):
 
 
 def _norm(width: int) -> nn.BatchNorm2d:
-    return nn.BatchNorm2d(width, eps=1e-3)  # EfficientNet's epsilon: checkpoints count on it
+    return nn.BatchNorm2d(
+        width,
+        eps=1e-3,
+    )  # EfficientNet's epsilon: checkpoints count on it
 
 
 RESNETS = {
@@ -167,7 +203,8 @@ class Residual(nn.Module):
         before = inputs
         for k, (kernel, after, step) in enumerate(kernels, 1):
             self.add_module(
-                f"conv{k}", nn.Conv2d(before, after, kernel, step, kernel // 2, bias=False)
+                f"conv{k}",
+                nn.Conv2d(before, after, kernel, step, kernel // 2, bias=False),
             )
             self.add_module(f"bn{k}", nn.BatchNorm2d(after))
             before = after
@@ -175,7 +212,8 @@ class Residual(nn.Module):
         self.downsample = None
         if stride > 1 or inputs != outputs:
             self.downsample = nn.Sequential(
-                nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs)
+                nn.Conv2d(inputs, outputs, 1, stride, bias=False),
+                nn.BatchNorm2d(outputs),
             )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -189,7 +227,13 @@ class Residual(nn.Module):
 class ResNet(RecogniserNetwork):
     """A ResNet with torchvision's parameter names."""
 
-    def __init__(self, depth: int, classes: int, channels: int, azimuths: int = 0) -> None:
+    def __init__(
+        self,
+        depth: int,
+        classes: int,
+        channels: int,
+        azimuths: int = 0,
+    ) -> None:
         super().__init__()
         self.name = f"ResNet-{depth}"
         narrow = depth >= 50
@@ -201,7 +245,14 @@ class ResNet(RecogniserNetwork):
         for stage, length in enumerate(RESNETS[depth]):
             layer = []
             for index in range(length):
-                layer.append(Residual(inputs, 64 << stage, 2 if stage and not index else 1, narrow))
+                layer.append(
+                    Residual(
+                        inputs,
+                        64 << stage,
+                        2 if stage and not index else 1,
+                        narrow,
+                    )
+                )
                 inputs = (64 << stage) * (4 if narrow else 1)
             setattr(self, f"layer{stage + 1}", nn.Sequential(*layer))
         self.finish(inputs, classes, azimuths)
@@ -218,7 +269,11 @@ class ResNet(RecogniserNetwork):
         return self.avgpool(x).flatten(1)
 
 
-def recogniser_network(recipe: RecogniserRecipe, classes: int, azimuths: int) -> ResNet | LiteNet:
+def recogniser_network(
+    recipe: RecogniserRecipe,
+    classes: int,
+    azimuths: int,
+) -> ResNet | LiteNet:
     """Create the untrained network of a recipe.
 
     Args:
@@ -262,7 +317,11 @@ class Transform(nn.Module):
     def __init__(self, k: int) -> None:
         super().__init__()
         self.k = k
-        self.points = nn.Sequential(PointLayer(k, 64), PointLayer(64, 128), PointLayer(128, 1024))
+        self.points = nn.Sequential(
+            PointLayer(k, 64),
+            PointLayer(64, 128),
+            PointLayer(128, 1024),
+        )
         self.head = _dense(())
         self.matrix = nn.Linear(256, k * k)
         nn.init.zeros_(self.matrix.weight)
@@ -270,7 +329,10 @@ class Transform(nn.Module):
             self.matrix.bias.copy_(torch.eye(k).flatten())
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.matrix(self.head(self.points(x).amax(1))).unflatten(1, (self.k, self.k))
+        return self.matrix(self.head(self.points(x).amax(1))).unflatten(
+            1,
+            (self.k, self.k),
+        )
 
 
 class PointNet(nn.Module):
@@ -283,7 +345,9 @@ class PointNet(nn.Module):
         self.feature_transform = Transform(64)
         self.second = PointLayer(64, 128)
         self.third = PointLayer(128, 1024, relu=False)
-        self.head = _dense((nn.Dropout(dropout),)).append(nn.Linear(256, rings * columns))
+        self.head = _dense((nn.Dropout(dropout),)).append(
+            nn.Linear(256, rings * columns)
+        )
         # A ReLU whose input begins below zero stays dead: begin inside the range of the targets.
         nn.init.constant_(self.head[-1].bias, 0.5)
         self.shape = (rings, columns)
@@ -347,4 +411,9 @@ def orthogonality(matrix: Tensor) -> Tensor:
     It is the mean Frobenius norm of I - A A^T (thesis, equation 2).
     """
     gram = torch.bmm(matrix, matrix.transpose(1, 2))
-    return (gram - torch.eye(matrix.shape[1], device=matrix.device)).flatten(1).norm(dim=1).mean()
+    return (
+        (gram - torch.eye(matrix.shape[1], device=matrix.device))
+        .flatten(1)
+        .norm(dim=1)
+        .mean()
+    )

@@ -27,7 +27,12 @@ from nextview.recognition.belief import (
     of_true_class,
 )
 from nextview.recognition.model_card import ModelCard
-from nextview.training.fitting_set import blind_walks, card_to_fit, for_fitting, load_sensed
+from nextview.training.fitting_set import (
+    blind_walks,
+    card_to_fit,
+    for_fitting,
+    load_sensed,
+)
 from nextview.types import Float, Floats, Index, Mask
 
 # of promised error rates
@@ -82,8 +87,18 @@ def fit_calibration(
         table = _held_out(predictions, table, card, model)
         data = Predictions.joined([table, *load_sensed(sensed, table)])
         walks = 1 + 8000 // len(data)  # few objects are walked over more often
-        calibration = fit_temperature(data, np.random.default_rng([seed, 0]), walks=walks)
-        risk = fit_risk(data, calibration, np.random.default_rng([seed, 1]), delta, walks=walks)
+        calibration = fit_temperature(
+            data,
+            np.random.default_rng([seed, 0]),
+            walks=walks,
+        )
+        risk = fit_risk(
+            data,
+            calibration,
+            np.random.default_rng([seed, 1]),
+            delta,
+            walks=walks,
+        )
         calibration = replace(calibration, risk=risk)
         about = f"{len(table)} objects of the training split, classes weighted evenly"
         if sensed:
@@ -97,7 +112,12 @@ def fit_calibration(
     return FittedCalibration(calibration, len(data), before, after)
 
 
-def _held_out(path: Path, table: Predictions, card: Path, model: ModelCard) -> Predictions:
+def _held_out(
+    path: Path,
+    table: Predictions,
+    card: Path,
+    model: ModelCard,
+) -> Predictions:
     """The objects that a card calls held out of its training, without duplicates."""
     once = deduplicated(for_fitting(table).labels, table.depth_entropy)
     kept = once[np.isin(np.array(table.names)[once], model.held_out)]
@@ -108,14 +128,21 @@ def _held_out(path: Path, table: Predictions, card: Path, model: ModelCard) -> P
     return table.of_objects(kept)
 
 
-def _check_recogniser(path: Path, card: ModelCard, predictions: Path, table: Predictions) -> None:
+def _check_recogniser(
+    path: Path,
+    card: ModelCard,
+    predictions: Path,
+    table: Predictions,
+) -> None:
     """Refuse predictions by another recogniser than a card's.
 
     Those that name none are the user's word.
     """
     by = table.models.get("recogniser")
     if card.sha256 != by[1] if by else card.classes != table.classes:
-        raise PredictionsError(f"{predictions}: comes from another recogniser than {path}")
+        raise PredictionsError(
+            f"{predictions}: comes from another recogniser than {path}"
+        )
 
 
 @dataclass(frozen=True)
@@ -133,7 +160,13 @@ class Walks:
     totals: Float
 
     @classmethod
-    def draw(cls, data: Predictions, rng: Generator, n_views: int, walks: int) -> "Walks":
+    def draw(
+        cls,
+        data: Predictions,
+        rng: Generator,
+        n_views: int,
+        walks: int,
+    ) -> "Walks":
         """Draw random walks over every object.
 
         Args:
@@ -151,7 +184,9 @@ class Walks:
         for policy in (Random(data.sphere), RandomAll(data.sphere)):
             starts = rng.integers(len(data.sphere), size=walks * len(data))
             views.append(blind_walks(data.sphere, policy, starts, n_views, rng))
-        evidence = data.log_evidence[objects[:, None], np.concatenate(views)].astype(np.float64)
+        evidence = data.log_evidence[objects[:, None], np.concatenate(views)].astype(
+            np.float64
+        )
         return cls(data, objects, np.cumsum(evidence, axis=1))
 
     @property
@@ -171,7 +206,10 @@ class Walks:
 
 
 def fit_temperature(
-    data: Predictions, rng: Generator, n_views: int = 5, walks: int = 4
+    data: Predictions,
+    rng: Generator,
+    n_views: int = 5,
+    walks: int = 4,
 ) -> Calibration:
     """Fit the temperature of one view and the correlations of several by maximum likelihood.
 
@@ -189,7 +227,9 @@ def fit_temperature(
     def calibration(parameters: Float) -> Calibration:
         temperature, correlation, *of_bins = parameters.tolist()
         return Calibration(
-            temperature, correlation, bin_correlation=of_bins[0] if of_bins else None
+            temperature,
+            correlation,
+            bin_correlation=of_bins[0] if of_bins else None,
         )
 
     def lost(parameters: Float) -> float:
@@ -197,7 +237,9 @@ def fit_temperature(
 
     begin = np.array([1.0, 0.5] if data.azimuth_bins is None else [1.0, 0.5, 0.1])
     bounds = [(0.01, 100.0), (0.0, 5.0), (0.0, 5.0)][: len(begin)]
-    return calibration(np.round(minimize(lost, begin, method="L-BFGS-B", bounds=bounds).x, 4))
+    return calibration(
+        np.round(minimize(lost, begin, method="L-BFGS-B", bounds=bounds).x, 4)
+    )
 
 
 def calibration_of(data: Predictions, rng: Generator, walks: int = 4) -> Calibration:
@@ -219,7 +261,11 @@ def calibration_of(data: Predictions, rng: Generator, walks: int = 4) -> Calibra
 
 
 def loss(
-    data: Predictions, calibration: Calibration, rng: Generator, n_views: int = 5, walks: int = 4
+    data: Predictions,
+    calibration: Calibration,
+    rng: Generator,
+    n_views: int = 5,
+    walks: int = 4,
 ) -> float:
     """Return the mean negative log-likelihood of the true class; see ``fit_temperature``.
 
@@ -266,7 +312,10 @@ def fit_risk(
     halves = np.split(np.arange(len(walked.objects)), 2)
     promised = []
     for n in walked.numbers:
-        each = [_promise(sure[half, :n], wrong[half, :n], data.weights, delta) for half in halves]
+        each = [
+            _promise(sure[half, :n], wrong[half, :n], data.weights, delta)
+            for half in halves
+        ]
         promised.append(tuple(np.max(each, axis=0).round(5).tolist()))
     return RiskBounds(PROMISED_THRESHOLDS, tuple(promised), delta)
 
@@ -281,7 +330,9 @@ def _promise(sure: Float, wrong: Mask, weights: Float, delta: float) -> Float:
     for t in reversed(range(len(PROMISED_THRESHOLDS))):
         reached = sure >= PROMISED_THRESHOLDS[t]
         failed = wrong[np.arange(len(wrong)), reached.argmax(1)] & reached.any(1)
-        failed, stopped = (x.reshape(-1, len(weights)).mean(0) for x in (failed, reached.any(1)))
+        failed, stopped = (
+            x.reshape(-1, len(weights)).mean(0) for x in (failed, reached.any(1))
+        )
         if worst > 0 or weights @ stopped >= weights.sum() / 2:
             worst = max(worst, error_bound(failed, stopped, weights, delta))
             promised[t] = worst
@@ -309,7 +360,9 @@ def error_bound(failed: Float, stopped: Float, weights: Float, delta: float) -> 
     objects = total**2 / float(((weights * stopped) ** 2).sum())
     variance = float(((weights * (failed - rate * stopped)) ** 2).sum()) / total**2
     effective = min(objects, rate * (1 - rate) / variance) if variance > 0 else objects
-    return float(beta.ppf(1 - delta, effective * rate + 1, max(effective * (1 - rate), 1e-9)))
+    return float(
+        beta.ppf(1 - delta, effective * rate + 1, max(effective * (1 - rate), 1e-9))
+    )
 
 
 RADII = np.geomspace(0.02, 20, 93)  # metres; steps of 7.8 %
@@ -374,15 +427,22 @@ def fit_size(
         judged = views.rows_of(table.names)
 
         of_training = (
-            views.done & (views.splits == "train") & np.isin(views.attributes.labels, table.classes)
+            views.done
+            & (views.splits == "train")
+            & np.isin(views.attributes.labels, table.classes)
         )
         taught = np.setdiff1d(np.flatnonzero(of_training), rows)
 
         classes = np.array(
-            [table.classes.index(name) if name in table.classes else -1 for name in views.classes]
+            [
+                table.classes.index(name) if name in table.classes else -1
+                for name in views.classes
+            ]
         )
         log_density = densities(
-            views.radii[taught], classes[views.labels[taught]], len(table.classes)
+            views.radii[taught],
+            classes[views.labels[taught]],
+            len(table.classes),
         )
 
         size, before, after = fit_weight(data, views.radii[judged], log_density)
@@ -421,7 +481,9 @@ def densities(radii: Float, labels: Index, classes: int) -> Float:
 
 
 def fit_weight(
-    data: Predictions, radii: Float, log_density: Float
+    data: Predictions,
+    radii: Float,
+    log_density: Float,
 ) -> tuple[SizeEvidence, float, float]:
     """Fit the weight of the size beside the logits of single views.
 
@@ -440,11 +502,20 @@ def fit_weight(
     def loss(parameters: Float) -> float:
         temperature, weight = parameters
         logs = (data.logits + weight * of_size).astype(np.float64) / temperature
-        return -float(np.average(of_true_class(logs, data.labels).mean(1), weights=data.weights))
+        return -float(
+            np.average(of_true_class(logs, data.labels).mean(1), weights=data.weights)
+        )
 
-    fitted = minimize(loss, np.ones(2), method="L-BFGS-B", bounds=[(0.01, 100.0), (0.0, 10.0)])
+    fitted = minimize(
+        loss,
+        np.ones(2),
+        method="L-BFGS-B",
+        bounds=[(0.01, 100.0), (0.0, 10.0)],
+    )
     size = SizeEvidence.from_arrays(
-        RADII.round(5), log_density.round(3), round(float(fitted.x[1]), 4)
+        RADII.round(5),
+        log_density.round(3),
+        round(float(fitted.x[1]), 4),
     )
     return size, loss(np.array([1.0, 0.0])), float(fitted.fun)
 
@@ -489,7 +560,12 @@ def fit_valleys(
             raise PredictionsError(f"{predictions}: holds no maps by {card}")
 
         kept = _held_out(predictions, table, card, model)
-        by_class = valley_gains(kept.sphere, kept.logits, kept.maps[model.kind], kept.labels)
+        by_class = valley_gains(
+            kept.sphere,
+            kept.logits,
+            kept.maps[model.kind],
+            kept.labels,
+        )
         classes = tuple(table.classes[c] for c, gain in by_class.items() if gain > 0)
         gains = {table.classes[c]: round(gain, 4) for c, gain in by_class.items()}
         judge = table.models.get("recogniser", ("a recogniser without a card", ""))[0]
@@ -500,7 +576,10 @@ def fit_valleys(
 
 
 def valley_gains(
-    sphere: ViewSphere, logits: Floats, maps: Floats, labels: Index
+    sphere: ViewSphere,
+    logits: Floats,
+    maps: Floats,
+    labels: Index,
 ) -> dict[int, float]:
     """Return what the valley of a map gains over its peak for each class.
 
@@ -522,13 +601,20 @@ def valley_gains(
     visited = np.eye(v, dtype=bool)[first]
     evidence = Evidence(seen, {"map": maps[objects, first]})
     state = EpisodeState(
-        current=first, visited=visited, belief=fuse(seen[:, None]), evidence=evidence, step=1
+        current=first,
+        visited=visited,
+        belief=fuse(seen[:, None]),
+        evidence=evidence,
+        step=1,
     )
 
     def belief_in_truth(valley_classes: tuple[int, ...]) -> Float:
         policy = MapPeak(sphere, "map", valley_classes)
         second = policy.next_views(state, np.random.default_rng(0))  # it draws nothing
-        return fuse(np.stack([seen, logits[objects, second]], 1))[np.arange(n * v), labels[objects]]
+        return fuse(np.stack([seen, logits[objects, second]], 1))[
+            np.arange(n * v),
+            labels[objects],
+        ]
 
     gain = belief_in_truth(tuple(range(classes))) - belief_in_truth(())
     return {int(c): float(gain[labels[objects] == c].mean()) for c in np.unique(labels)}

@@ -30,7 +30,12 @@ from nextview.recognition.inference import (
 from nextview.recognition.map_names import CONFIDENCE, Good, map_name
 from nextview.recognition.model_card import ModelCard, Training, write_card
 from nextview.recognition.network_input import InputSpec, from_store
-from nextview.training.architectures import LiteNet, ResNet, map_network, recogniser_network
+from nextview.training.architectures import (
+    LiteNet,
+    ResNet,
+    map_network,
+    recogniser_network,
+)
 from nextview.training.inputs import load_inputs
 from nextview.training.map_training import target_of
 from nextview.training.recipes import MapRecipe, RecogniserRecipe
@@ -63,13 +68,19 @@ class ShippedRecogniser(nn.Module):
         x = x.float() / 255
         features = [network.features(x) for network in self.networks]
         outputs = [
-            network.answers(seen) for network, seen in zip(self.networks, features, strict=True)
+            network.answers(seen)
+            for network, seen in zip(self.networks, features, strict=True)
         ]
+
         logits = torch.stack([each[0] for each in outputs]).mean(0)
         joined = torch.cat(features, 1)
         if not self.azimuth_bins:
             return logits, joined
-        return logits, joined, torch.stack([each[1] for each in outputs]).mean(0).log_softmax(2)
+        return (
+            logits,
+            joined,
+            torch.stack([each[1] for each in outputs]).mean(0).log_softmax(2),
+        )
 
 
 class ShippedMap(nn.Module):
@@ -89,7 +100,12 @@ class ShippedMap(nn.Module):
 
 
 def export_onnx(
-    net: nn.Module, example: NDArray, inputs: str, outputs: list[str], path: Path, bits: int = 16
+    net: nn.Module,
+    example: NDArray,
+    inputs: str,
+    outputs: list[str],
+    path: Path,
+    bits: int = 16,
 ) -> None:
     """Write a network as ONNX with any batch size.
 
@@ -152,15 +168,25 @@ def _shrink(graph: onnx.GraphProto, bits: int) -> None:
 
         if bits == 16 or values.size < SMALL_WEIGHT:
             weight.CopyFrom(numpy_helper.from_array(values.astype(np.float16), small))
-            nodes.append(helper.make_node("Cast", [small], [name], to=TensorProto.FLOAT))
+            nodes.append(
+                helper.make_node("Cast", [small], [name], to=TensorProto.FLOAT)
+            )
             continue
 
         scale = np.abs(values).max(tuple(range(1, values.ndim)), keepdims=True) / 127
         scale[scale == 0] = 1
-        weight.CopyFrom(numpy_helper.from_array(np.rint(values / scale).astype(np.int8), small))
-        scales.append(numpy_helper.from_array(scale.astype(np.float32), f"{name}_scale"))
-        nodes.append(helper.make_node("Cast", [small], [f"{name}_steps"], to=TensorProto.FLOAT))
-        nodes.append(helper.make_node("Mul", [f"{name}_steps", f"{name}_scale"], [name]))
+        weight.CopyFrom(
+            numpy_helper.from_array(np.rint(values / scale).astype(np.int8), small)
+        )
+        scales.append(
+            numpy_helper.from_array(scale.astype(np.float32), f"{name}_scale")
+        )
+        nodes.append(
+            helper.make_node("Cast", [small], [f"{name}_steps"], to=TensorProto.FLOAT)
+        )
+        nodes.append(
+            helper.make_node("Mul", [f"{name}_steps", f"{name}_scale"], [name])
+        )
 
     nodes += list(graph.node)
     graph.initializer.extend(scales)
@@ -259,7 +285,8 @@ def export_recogniser(
         )
 
     networks = [
-        run_network(each, recipe, views) for each, recipe in zip(folders, recipes, strict=True)
+        run_network(each, recipe, views)
+        for each, recipe in zip(folders, recipes, strict=True)
     ]
     shipped = ShippedRecogniser(networks).eval()
 
@@ -274,17 +301,27 @@ def export_recogniser(
         training=_training(views, held_out, recipes),
         note=note,
         held_out=tuple(sorted(held_out)),
-    ).made_by(*views.commands, *(line for each in runs for line in each.commands), command())
+    ).made_by(
+        *views.commands,
+        *(line for each in runs for line in each.commands),
+        command(),
+    )
 
     inputs = load_inputs(store, spec.size, spec.kind)
     judging = deduplicate(views, validation)
-    sample = np.stack([inputs[i, 5] for i in validation[:: max(1, len(validation) // 8)][:8]])
+    sample = np.stack(
+        [inputs[i, 5] for i in validation[:: max(1, len(validation) // 8)][:8]]
+    )
     scores = partial(recogniser_scores, labels=views.labels[judging])
     made = _Candidate(card, shipped, sample, judging, lambda i: inputs[i], scores)
     return _export(made, out, bits, overwrite, track)
 
 
-def run_network(run: Path, recipe: RecogniserRecipe, views: ViewStore) -> ResNet | LiteNet:
+def run_network(
+    run: Path,
+    recipe: RecogniserRecipe,
+    views: ViewStore,
+) -> ResNet | LiteNet:
     """Load the recogniser of a finished run.
 
     Args:
@@ -327,14 +364,21 @@ def export_map(
     noted = read_run(run)
     kind = map_name(recipe.measure)
     shape = (-1, views.sphere.rings, 3)
-    good: Good = "peak" if recipe.measure == CONFIDENCE else find_measure(recipe.measure).good
+    good: Good = (
+        "peak" if recipe.measure == CONFIDENCE else find_measure(recipe.measure).good
+    )
 
     values, there = target_of(
-        recipe.measure, views, None if predictions is None else Predictions.load(predictions)
+        recipe.measure,
+        views,
+        None if predictions is None else Predictions.load(predictions),
     )
 
     validation = np.flatnonzero(
-        views.done & there & (views.splits == "train") & np.isin(views.names, noted.held_out)
+        views.done
+        & there
+        & (views.splits == "train")
+        & np.isin(views.names, noted.held_out)
     )
     if len(validation) == 0:
         raise ModelError(f"{run}: was not trained on {store}")
@@ -347,7 +391,9 @@ def export_map(
         spec,
         "",
         network=(
-            "PointNet with both transforms" if spec.kind == "cloud" else f"ResNet-{recipe.layers}"
+            "PointNet with both transforms"
+            if spec.kind == "cloud"
+            else f"ResNet-{recipe.layers}"
         ),
         measure=recipe.measure,
         good=good,
@@ -362,23 +408,40 @@ def export_map(
     seen = partial(from_store, spec, views)
     sample = seen(int(validation[0]))[3:11]
     made = _Candidate(
-        card, shipped, sample, judging, seen, lambda maps: map_scores(maps.reshape(shape), true)
+        card,
+        shipped,
+        sample,
+        judging,
+        seen,
+        lambda maps: map_scores(maps.reshape(shape), true),
     )
     return _export(made, out, bits, overwrite, track)
 
 
 def _training(
-    views: ViewStore, held_out: Iterable[str], recipes: Sequence[Any], usable: Any = True
+    views: ViewStore,
+    held_out: Iterable[str],
+    recipes: Sequence[Any],
+    usable: Any = True,
 ) -> Training:
     learned = (
-        views.done & usable & (views.splits == "train") & ~np.isin(views.names, list(held_out))
+        views.done
+        & usable
+        & (views.splits == "train")
+        & ~np.isin(views.names, list(held_out))
     )
-    about = f"{learned.sum()} objects of the training split, {len(views.sphere)} views each"
+    about = (
+        f"{learned.sum()} objects of the training split, {len(views.sphere)} views each"
+    )
     return Training(about, tuple(asdict(recipe) for recipe in recipes))
 
 
 def _export(
-    candidate: _Candidate, out: Path, bits: int, overwrite: bool, track: TrackProgress
+    candidate: _Candidate,
+    out: Path,
+    bits: int,
+    overwrite: bool,
+    track: TrackProgress,
 ) -> Exported:
     """Write ONNX file and card once the file agrees with the network; both or neither."""
     name = candidate.card.name
@@ -392,7 +455,14 @@ def _export(
         weights = folder / f"{name}.onnx"
         example = np.resize(sample, (2, *sample.shape[1:]))
         limit, end = (0.1, "input") if candidate.card.is_recogniser else (0.02, "seen")
-        export_onnx(candidate.network, example, end, candidate.network.outputs, weights, bits)
+        export_onnx(
+            candidate.network,
+            example,
+            end,
+            candidate.network.outputs,
+            weights,
+            bits,
+        )
         card = replace(candidate.card, sha256=sha256_of(weights))
         write_card(part, card)
         answers = candidate.answers(part)
@@ -418,6 +488,11 @@ def _export(
             )
         }
         write_card(
-            part, replace(card, scores=scores, largest_difference_to_torch=round(difference, 4))
+            part,
+            replace(
+                card,
+                scores=scores,
+                largest_difference_to_torch=round(difference, 4),
+            ),
         )
     return Exported(out / part.name, difference)

@@ -98,7 +98,11 @@ def load_sensed(paths: Sequence[Path], table: Predictions) -> list[Predictions]:
 
 
 def blind_walks(
-    sphere: ViewSphere, policy: Policy, starts: Index, n_views: int, rng: np.random.Generator
+    sphere: ViewSphere,
+    policy: Policy,
+    starts: Index,
+    n_views: int,
+    rng: np.random.Generator,
 ) -> Index:
     """Return the views of a policy that knows only where it has been.
 
@@ -117,13 +121,19 @@ def blind_walks(
         return Evidence(np.zeros((len(episodes), 1)))
 
     return run_episodes(
-        nothing, sphere, policy, starts, FixedLength(max_views=n_views), rng
+        nothing,
+        sphere,
+        policy,
+        starts,
+        FixedLength(max_views=n_views),
+        rng,
     ).outcome.views
 
 
 @contextmanager
 def card_to_fit(
-    path: Path, recogniser: bool = True
+    path: Path,
+    recogniser: bool = True,
 ) -> Iterator[tuple[ModelCard, Callable[..., None]]]:
     """Open a card for a fit; only one run may do so at a time.
 
@@ -145,11 +155,16 @@ def card_to_fit(
             raise ModelError(f"{path}: is a {card.kind}, not a recogniser")
 
         def write(
-            name: str, about: str, sources: Sequence[Predictions | ViewStore], **fields: Any
+            name: str,
+            about: str,
+            sources: Sequence[Predictions | ViewStore],
+            **fields: Any,
         ) -> None:
             nonlocal known
             fitted = msgspec.structs.replace(
-                card, **fields, fitted_to={**card.fitted_to, name: about}
+                card,
+                **fields,
+                fitted_to={**card.fitted_to, name: about},
             )
             lines = (line for source in sources for line in source.commands)
             if path.read_bytes() != known:

@@ -51,7 +51,10 @@ with extras():
     import torch
     from torch import Tensor, nn
 
-Best = tuple[tuple[Gain, ...], Value]  # policies, one for each fold, and their mean value
+Best = tuple[
+    tuple[Gain, ...],
+    Value,
+]  # policies, one for each fold, and their mean value
 BOUND = 1e-5
 """Largest difference of the file's answers from those of the networks in double precision, relative
 to the largest answer beyond 1. For gains a fiftieth of the lowest travel weight that is tried."""
@@ -76,14 +79,16 @@ class Perceptrons(nn.Module):
     def each(self, x: Tensor) -> Tensor:
         """Of each perceptron, without the mirror image, (E, B, V)."""
         x = x.expand(len(self.weights[0]), *x.shape)
-        for i, (weights, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+        for i, (weights, bias) in enumerate(
+            zip(self.weights, self.biases, strict=True)
+        ):
             x = torch.baddbmm(bias, torch.relu(x) if i else x, weights)
         return x
 
     def forward(self, x: Tensor) -> Tensor:
-        return (self.each(x) + self.each(x[:, self.features_flip])[..., self.cells_flip]).mean(
-            0
-        ) / 2
+        return (
+            self.each(x) + self.each(x[:, self.features_flip])[..., self.cells_flip]
+        ).mean(0) / 2
 
 
 class RowByRow(nn.Module):
@@ -99,7 +104,13 @@ class RowByRow(nn.Module):
         for i, (weights, bias) in enumerate(zip(n.weights, n.biases, strict=True)):
             # Twice the weights: with one perceptron they would be a matrix, and all rows one
             # product.
-            x = torch.matmul(torch.relu(x) if i else x, weights.expand(2, *weights.shape)) + bias
+            x = (
+                torch.matmul(
+                    torch.relu(x) if i else x,
+                    weights.expand(2, *weights.shape),
+                )
+                + bias
+            )
         return (x[:, 0, :, 0] + x[:, 1, :, 0][..., n.cells_flip]).mean(1) / 2
 
 
@@ -121,7 +132,10 @@ class Score:
 
 
 def walk(
-    table: ReplayTable, policies: list[Policy], recipe: GainRecipe, rng: np.random.Generator
+    table: ReplayTable,
+    policies: list[Policy],
+    recipe: GainRecipe,
+    rng: np.random.Generator,
 ) -> list[NDArray]:
     """Collect the states that policies meet when each is followed once over every object.
 
@@ -140,17 +154,33 @@ def walk(
     parts = []
     for policy in policies:
         for moment in rollout(
-            table, policy, recipe.max_views - 1, rng, VISIBILITY in recipe.inputs
+            table,
+            policy,
+            recipe.max_views - 1,
+            rng,
+            VISIBILITY in recipe.inputs,
         ):
             state = moment.state
             view = cells_from(sphere)[origin(sphere, state, recipe.frame)]
-            value = np.take_along_axis(candidate_values(table, moment, recipe.objective), view, 1)
+            value = np.take_along_axis(
+                candidate_values(table, moment, recipe.objective),
+                view,
+                1,
+            )
             free = np.take_along_axis(state.free, view, 1)
-            mean = (value * free).sum(1, keepdims=True) / np.maximum(free.sum(1, keepdims=True), 1)
+            mean = (value * free).sum(1, keepdims=True) / np.maximum(
+                free.sum(1, keepdims=True),
+                1,
+            )
 
             seen = features(sphere, state, recipe.inputs, recipe.frame)
             parts.append(
-                (seen.astype(np.float32), (value - mean).astype(np.float32), free, state.episodes)
+                (
+                    seen.astype(np.float32),
+                    (value - mean).astype(np.float32),
+                    free,
+                    state.episodes,
+                )
             )
     return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
 
@@ -175,7 +205,9 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
 
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     features_flip = mirrored_features(sphere, c, recipe.inputs, recipe.frame)
-    widths = list(pairwise([len(features_flip), recipe.hidden, recipe.hidden, len(sphere)]))
+    widths = list(
+        pairwise([len(features_flip), recipe.hidden, recipe.hidden, len(sphere)])
+    )
     scales = [(2 / inputs) ** 0.5 for inputs, _ in widths[:-1]] + [0.0]
 
     first = [
@@ -188,14 +220,20 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
     drawn = rng.multinomial(n, np.full(n, 1 / n), size=e)
     weights = torch.from_numpy(drawn * data.weights).float()
     optimiser = torch.optim.AdamW(
-        networks.parameters(), recipe.lr, weight_decay=recipe.weight_decay
+        networks.parameters(),
+        recipe.lr,
+        weight_decay=recipe.weight_decay,
     )
 
     batches = -(-recipe.episodes * (recipe.max_views - 1) * n // recipe.batch)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, recipe.lr, total_steps=recipe.epochs * batches
+        optimiser,
+        recipe.lr,
+        total_steps=recipe.epochs * batches,
     )
-    policies: list[Policy] = [(Random, RandomAll)[i % 2](sphere) for i in range(recipe.episodes)]
+    policies: list[Policy] = [
+        (Random, RandomAll)[i % 2](sphere) for i in range(recipe.episodes)
+    ]
 
     for _ in range(recipe.epochs):
         *states, objects = walk(table, policies, recipe, rng)
@@ -204,24 +242,33 @@ def train(table: ReplayTable, recipe: GainRecipe, fold: int = 0) -> Iterator[Gai
             flipped = torch.from_numpy(rng.random(len(batch)) < 0.5)[:, None]
             seen = torch.where(flipped, seen[:, networks.features_flip], seen)
             value, free = (
-                torch.where(flipped, a[:, networks.cells_flip], a) for a in (value, free)
+                torch.where(flipped, a[:, networks.cells_flip], a)
+                for a in (value, free)
             )
 
-            error = (((networks.each(seen) - value) ** 2) * free).sum(-1) / free.sum(-1).clamp(
-                min=1
-            )
+            error = (((networks.each(seen) - value) ** 2) * free).sum(-1) / free.sum(
+                -1
+            ).clamp(min=1)
             optimiser.zero_grad()
             ((weights[:, objects[batch]] * error).sum() / len(batch)).backward()
             optimiser.step()
             schedule.step()
 
-        policy = Gain(sphere, c, Score(deepcopy(networks)), recipe.inputs, frame=recipe.frame)
+        policy = Gain(
+            sphere,
+            c,
+            Score(deepcopy(networks)),
+            recipe.inputs,
+            frame=recipe.frame,
+        )
         policies[::2] = [policy] * len(policies[::2])
         yield policy
 
 
 def best_epoch(
-    folds: Sequence[Iterable[Gain]], tables: Sequence[ReplayTable], recipe: GainRecipe
+    folds: Sequence[Iterable[Gain]],
+    tables: Sequence[ReplayTable],
+    recipe: GainRecipe,
 ) -> Iterator[Best]:
     """Follow the trainings of all folds and keep the best epoch.
 
@@ -237,7 +284,13 @@ def best_epoch(
     best = None
     for policies in zip(*folds, strict=True):
         judged = list(zip(tables, policies, strict=True))
-        value = judge_all(judged, recipe.max_views, recipe.objective, [recipe.seed, 2], rounds=4)
+        value = judge_all(
+            judged,
+            recipe.max_views,
+            recipe.objective,
+            [recipe.seed, 2],
+            rounds=4,
+        )
         if best is None or value.mean.mean() > best[1].mean.mean():
             best = policies, value
         yield best
@@ -245,14 +298,24 @@ def best_epoch(
 
 def averaged(policies: Sequence[Gain]) -> Gain:
     """One policy whose networks are those of all."""
-    networks = [policy.score.networks for policy in policies if isinstance(policy.score, Score)]
+    networks = [
+        policy.score.networks for policy in policies if isinstance(policy.score, Score)
+    ]
     weights = [
-        torch.cat(layers).detach() for layers in zip(*(n.weights for n in networks), strict=True)
+        torch.cat(layers).detach()
+        for layers in zip(*(n.weights for n in networks), strict=True)
     ]
     biases = [
-        torch.cat(layers).detach() for layers in zip(*(n.biases for n in networks), strict=True)
+        torch.cat(layers).detach()
+        for layers in zip(*(n.biases for n in networks), strict=True)
     ]
-    joined = Perceptrons(weights, biases, networks[0].features_flip, networks[0].cells_flip)
+    joined = Perceptrons(
+        weights,
+        biases,
+        networks[0].features_flip,
+        networks[0].cells_flip,
+    )
+
     return replace(policies[0], score=Score(joined))
 
 
@@ -286,7 +349,8 @@ def write_gain(card: Path, policy: Gain, about: PolicyCard, features: Float32) -
 
         sha256 = sha256_of(made)
         answers = open_onnx(made, sha256, threads=1).run(
-            ["cells"], {FEATURES_INPUT: features.astype(np.float32)}
+            ["cells"],
+            {FEATURES_INPUT: features.astype(np.float32)},
         )[0]
 
         # what is written has to answer as what was trained
@@ -298,7 +362,12 @@ def write_gain(card: Path, policy: Gain, about: PolicyCard, features: Float32) -
         table = msgspec.to_builtins(
             GainTable(policy.classes, policy.inputs, policy.travel_weight, policy.frame)
         )
-        about = msgspec.structs.replace(about, sha256=sha256, table=table, scope=policy.scope)
+        about = msgspec.structs.replace(
+            about,
+            sha256=sha256,
+            table=table,
+            scope=policy.scope,
+        )
         write_policy_card(part / card.name, about)
     return difference
 
@@ -372,22 +441,39 @@ def train_gain(
     best: list[Best] = []
 
     def epochs() -> Iterator[int]:
-        trainings = [train(part, recipe, fold) for fold, part in enumerate(data.learned)]
+        trainings = [
+            train(part, recipe, fold) for fold, part in enumerate(data.learned)
+        ]
         for policies in best_epoch(trainings, data.validated, recipe):
             best.append(policies)
             yield len(best)
 
     track(epochs(), recipe.epochs, "training")
     chosen, value = best[-1]
-    policies = [replace(policy, scope="local" if local else "global") for policy in chosen]
+    policies = [
+        replace(policy, scope="local" if local else "global") for policy in chosen
+    ]
     if travel_weight is None:
         judged = list(zip(data.validated, policies, strict=True))
-        travel_weight = fit_travel_weight(judged, recipe.max_views, recipe.objective, recipe.seed)
+        travel_weight = fit_travel_weight(
+            judged,
+            recipe.max_views,
+            recipe.objective,
+            recipe.seed,
+        )
     policy = replace(averaged(policies), travel_weight=travel_weight)
-    states = np.concatenate([walk(part, [policy], recipe, data.rng)[0] for part in data.validated])
+    states = np.concatenate(
+        [walk(part, [policy], recipe, data.rng)[0] for part in data.validated]
+    )
     difference = write_gain(out, policy, data.about, states)
     return TrainedGain(
-        out, data.objects, data.validated_on, value.mean, travel_weight, len(states), difference
+        out,
+        data.objects,
+        data.validated_on,
+        value.mean,
+        travel_weight,
+        len(states),
+        difference,
     )
 
 
@@ -408,7 +494,10 @@ class _Data:
 
 
 def _sources(
-    predictions: Path, validation: Path | None, sensed: Sequence[Path], recipe: GainRecipe
+    predictions: Path,
+    validation: Path | None,
+    sensed: Sequence[Path],
+    recipe: GainRecipe,
 ) -> tuple[Predictions, Predictions, list[Predictions], list[tuple[Path, Predictions]]]:
     """Open and check what is learned from and what it is judged on."""
     table = Predictions.load(predictions).deduplicate()
@@ -458,8 +547,12 @@ def _load(
     rng = np.random.default_rng([recipe.seed, 1])
     scenes = scenes_of(table)
     others = scenes if validation is None else scenes_of(other)
-    learned = [ReplayTable.select(table, part, rng, variants, scenes) for part in learning]
-    validated = [ReplayTable.select(other, part, rng, variants, others) for part in validating]
+    learned = [
+        ReplayTable.select(table, part, rng, variants, scenes) for part in learning
+    ]
+    validated = [
+        ReplayTable.select(other, part, rng, variants, others) for part in validating
+    ]
     objects = len(np.unique(np.concatenate(learning)))
     learned_from = f"{objects} objects of the training split"
     if sensed:
@@ -479,7 +572,11 @@ def _load(
             for part in learned
         ),
         asdict(recipe),
-        tuple(dict.fromkeys((*(line for _, p in sources for line in p.commands), command()))),
+        tuple(
+            dict.fromkeys(
+                (*(line for _, p in sources for line in p.commands), command())
+            )
+        ),
     )
     return _Data(learned, validated, objects, validated_on, about, rng)
 
@@ -507,12 +604,16 @@ def _check(path: Path, p: Predictions, recipe: GainRecipe) -> None:
         raise PredictionsError(
             f"{path}: holds no map {lacking[0]!r}; predict it, or choose --inputs among {known}"
         )
+
     if VISIBILITY in recipe.inputs and scenes_of(p) is None:
         raise PredictionsError(
             f"{path}: contains no scenes, and without them everything is visible; choose other"
             " --inputs"
         )
-    if p.azimuth_bins is None and (recipe.frame == "object" or "azimuth_bin" in recipe.inputs):
+
+    if p.azimuth_bins is None and (
+        recipe.frame == "object" or "azimuth_bin" in recipe.inputs
+    ):
         other = "give --frame camera and --inputs without azimuth_bin"
         hint = f"train the recogniser with --azimuth-bins-weight, or {other}"
         raise PredictionsError(f"{path}: holds no azimuth bins; {hint}")

@@ -16,7 +16,12 @@ from nextview.data.progress import TrackProgress, silently
 from nextview.data.store import ViewStore
 from nextview.errors import DAMAGED, DatasetError
 from nextview.files import new_folder, only_one
-from nextview.recognition.network_input import CHANNELS_OF, InputKind, InputSpec, from_store
+from nextview.recognition.network_input import (
+    CHANNELS_OF,
+    InputKind,
+    InputSpec,
+    from_store,
+)
 from nextview.types import Index
 
 # views are mostly background and flat faces: a sixth is left, or less
@@ -50,7 +55,9 @@ class PackedViews:
         places = self.places[at]
         views = np.zeros((*places.shape[:-1], *self.size), np.uint8)
         for (start, count), view in zip(
-            places.reshape(-1, 2), views.reshape(-1, *self.size), strict=True
+            places.reshape(-1, 2),
+            views.reshape(-1, *self.size),
+            strict=True,
         ):
             if count:
                 PACKING.decode(self.packed[start : start + count], view)
@@ -68,12 +75,19 @@ def inputs_path(store: Path, size: int, kind: InputKind = "geometry") -> Path:
     Returns:
         The folder.
     """
-    store = Path(os.path.realpath(store)) if store.name in ("", "..") else store  # "." has no name
-    return store.with_name(f"{store.name}.{'inputs' if kind == 'geometry' else kind}{size}")
+    store = (
+        Path(os.path.realpath(store)) if store.name in ("", "..") else store
+    )  # "." has no name
+    return store.with_name(
+        f"{store.name}.{'inputs' if kind == 'geometry' else kind}{size}"
+    )
 
 
 def ready_inputs(
-    path: Path, size: int, kind: InputKind = "geometry", track: TrackProgress = silently
+    path: Path,
+    size: int,
+    kind: InputKind = "geometry",
+    track: TrackProgress = silently,
 ) -> PackedViews:
     """Return the inputs of a store and compute them if they are not there.
 
@@ -93,7 +107,11 @@ def ready_inputs(
     if is_first() and not target.exists():
         with only_one(target):
             objects = int(ViewStore.open(path).done.sum())
-            track(_compute(path, target, InputSpec(kind, size)), objects, f"inputs of {path.name}")
+            track(
+                _compute(path, target, InputSpec(kind, size)),
+                objects,
+                f"inputs of {path.name}",
+            )
     while not target.exists():
         time.sleep(1)
     return load_inputs(path, size, kind)
@@ -104,18 +122,26 @@ def _compute(path: Path, target: Path, spec: InputSpec) -> Iterator[int]:
     store = ViewStore.open(path)
     chosen = np.flatnonzero(store.done).tolist()
 
-    for first in chosen[:1]:  # a size that the views do not have is refused before anything is made
+    for first in chosen[
+        :1
+    ]:  # a size that the views do not have is refused before anything is made
         from_store(spec, store, first)
     places = np.zeros((len(store), len(store.sphere), 2), np.int64)
     with new_folder(target) as part:
         with open(part / "views.lz4", "wb") as file:
-            for done, (i, packed) in enumerate(each(partial(_packed, path, spec), chosen), 1):
+            for done, (i, packed) in enumerate(
+                each(partial(_packed, path, spec), chosen),
+                1,
+            ):
                 if isinstance(packed, WorkerDied):
                     raise DatasetError(
                         f"{path}: the inputs of {store.names[i]} cannot be computed: {packed}"
                     )
                 counts = np.array([len(view) for view in packed])
-                places[i] = np.stack([file.tell() + np.cumsum(counts) - counts, counts], 1)
+                places[i] = np.stack(
+                    [file.tell() + np.cumsum(counts) - counts, counts],
+                    1,
+                )
                 file.writelines(packed)
                 yield done
         size = (CHANNELS_OF[spec.kind], spec.size, spec.size)
@@ -151,7 +177,11 @@ def load_inputs(path: Path, size: int, kind: InputKind = "geometry") -> PackedVi
         with np.load(target / "index.npz") as index:
             places = index["places"]
             shape = tuple(index["size"].tolist())
-        packed = np.memmap(file, np.uint8, "r") if file.stat().st_size else np.zeros(0, np.uint8)
+        packed = (
+            np.memmap(file, np.uint8, "r")
+            if file.stat().st_size
+            else np.zeros(0, np.uint8)
+        )
         if len(packed) != places[..., 1].sum():
             raise ValueError(f"{len(packed)} bytes of {places[..., 1].sum()}")
     except DAMAGED as error:

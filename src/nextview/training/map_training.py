@@ -36,7 +36,9 @@ with extras():
     from torch import Tensor, nn
     from torch.nn import functional as F
 
-NetworkViews = NDArray[Any] | PackedViews  # of N objects from V views, what the network sees
+NetworkViews = (
+    NDArray[Any] | PackedViews
+)  # of N objects from V views, what the network sees
 
 
 class Windows(OwnBatches):
@@ -76,7 +78,10 @@ class Windows(OwnBatches):
         # every object as often as any other, and each of its views before one comes again
         if self.training:
             turns = np.argsort(rng.random((v, len(self.objects))), axis=0)
-            views = np.resize(turns, (self.recipe.views_per_object, len(self.objects))).flatten()
+            views = np.resize(
+                turns,
+                (self.recipe.views_per_object, len(self.objects)),
+            ).flatten()
             objects = np.tile(self.objects, self.recipe.views_per_object)
             order = rng.permutation(len(views))[:n]
             objects = objects[order]
@@ -87,12 +92,16 @@ class Windows(OwnBatches):
         mirrored = rng.random(n) < 0.5 * (self.training and self.recipe.mirror)
         for here in np.arange(n).reshape(-1, batch)[:, self.share]:
             points = (
-                rng.permutation(1024)[: self.recipe.points] if self.training else np.arange(1024)
+                rng.permutation(1024)[: self.recipe.points]
+                if self.training
+                else np.arange(1024)
             )
             o = objects[here]
             w = views[here]
             m = mirrored[here]
-            seen: NDArray[Any] = np.stack([self.seen[i, k] for i, k in zip(o, w, strict=True)])
+            seen: NDArray[Any] = np.stack(
+                [self.seen[i, k] for i, k in zip(o, w, strict=True)]
+            )
             target = self.values[o[:, None, None], self.around[w]]
             if self.recipe.input == "cloud":
                 seen = cloud_input(seen[:, points].astype(np.float32), self.poses[w])
@@ -159,12 +168,23 @@ class MapModule(L.LightningModule):
         near = predicted[..., self.window]
         goal = true[..., self.window]
         error = F.mse_loss(near, goal)
-        self.log("mse", error, prog_bar=True, on_step=False, on_epoch=True, sync_dist=True)
+        self.log(
+            "mse",
+            error,
+            prog_bar=True,
+            on_step=False,
+            on_epoch=True,
+            sync_dist=True,
+        )
 
         if self.recipe.extent == "sphere":
             error = (error + F.mse_loss(predicted, true)) / 2
         if self.recipe.peak_weight:
-            lost = peak_loss(near / self.recipe.peak_sharpness, goal, self.recipe.peak_reach)
+            lost = peak_loss(
+                near / self.recipe.peak_sharpness,
+                goal,
+                self.recipe.peak_reach,
+            )
             error = error + self.recipe.peak_weight * lost
 
         return error + self.recipe.orthogonality_weight * sum(
@@ -178,8 +198,17 @@ class MapModule(L.LightningModule):
             batch: inputs, (B, ...), and true maps, (B, rings, columns).
             _: number of the batch.
         """
-        error = F.mse_loss(self(batch[0])[0].float()[..., self.window], batch[1][..., self.window])
-        self.log("validation_mse", error, prog_bar=True, batch_size=len(batch[1]), sync_dist=True)
+        error = F.mse_loss(
+            self(batch[0])[0].float()[..., self.window],
+            batch[1][..., self.window],
+        )
+        self.log(
+            "validation_mse",
+            error,
+            prog_bar=True,
+            batch_size=len(batch[1]),
+            sync_dist=True,
+        )
 
     def configure_optimizers(self) -> dict[str, Any]:
         return optimiser(self.parameters(), self.recipe, self.steps, 0.1)
@@ -216,19 +245,32 @@ def train_map(
     values, there = target_of(recipe.measure, views, predicted)
     aside = split_training(views, recipe.validation_share, recipe.seed)
     training, validation = (part[there[part]] for part in aside)
-    check_any(views, training, validation, "" if there.all() else ": of the others no map is known")
+    check_any(
+        views,
+        training,
+        validation,
+        "" if there.all() else ": of the others no map is known",
+    )
     held_out = [views.names[i] for i in aside[1]]  # those without values too
-    run = new_run(recipe, weights, held_out, [views] if predicted is None else [views, predicted])
+    run = new_run(
+        recipe,
+        weights,
+        held_out,
+        [views] if predicted is None else [views, predicted],
+    )
     parts = training, deduplicate(views, validation)  # copies of one mesh count once
 
     def fitted() -> nn.Module:
         cloud = recipe.input == "cloud"
         seen = (
-            views.rows("points") if cloud else ready_inputs(store, recipe.size, recipe.input, track)
+            views.rows("points")
+            if cloud
+            else ready_inputs(store, recipe.size, recipe.input, track)
         )
 
         windows, judging = (
-            Windows(seen, values, views.sphere, part, recipe, part is training) for part in parts
+            Windows(seen, values, views.sphere, part, recipe, part is training)
+            for part in parts
         )
 
         L.seed_everything(recipe.seed, verbose=False)
@@ -242,14 +284,24 @@ def train_map(
                 head=weights.is_dir() and "measure" in read_run(weights).recipe,
             )
 
-        return fit(module, windows, judging, out, "validation_mse", "min", hardware).net.eval()
+        return fit(
+            module,
+            windows,
+            judging,
+            out,
+            "validation_mse",
+            "min",
+            hardware,
+        ).net.eval()
 
     train_once(out, run, fitted)
     return [out]
 
 
 def target_of(
-    measure: str, store: ViewStore, predictions: Predictions | None = None
+    measure: str,
+    store: ViewStore,
+    predictions: Predictions | None = None,
 ) -> tuple[NDArray, NDArray]:
     """Return the values that a map network learns.
 
@@ -271,7 +323,8 @@ def target_of(
             f" {CONFIDENCE}"
         )
         of_them = (
-            "a map of the confidence is learned from predictions: give those of the recogniser"
+            "a map of the confidence is learned from predictions: "
+            "give those of the recogniser"
         )
         raise UsageError(of_them if predictions is None else alone)
 
@@ -280,8 +333,12 @@ def target_of(
 
     here = store.rows_of(predictions.names)
     if (here < 0).all() or predictions.sphere != store.sphere:
-        raise PredictionsError(f"these predictions are not of the views of {store.path}")
+        raise PredictionsError(
+            f"these predictions are not of the views of {store.path}"
+        )
 
     values = np.zeros((len(store), len(store.sphere)), np.float32)
-    values[here[here >= 0]] = confidence_maps(predictions.logits, predictions.labels)[here >= 0]
+    values[here[here >= 0]] = confidence_maps(predictions.logits, predictions.labels)[
+        here >= 0
+    ]
     return values, values.any(1) & store.done

@@ -25,11 +25,21 @@ class Hardware:
     precision: Literal["bf16-mixed", "16-mixed", "32-true"] = "bf16-mixed"
 
 
-POLICY_INPUTS = ("belief", "view", "place", "lem-sphere", "azimuth_bin")  # of the bundled policy
+POLICY_INPUTS = (
+    "belief",
+    "view",
+    "place",
+    "lem-sphere",
+    "azimuth_bin",
+)  # of the bundled policy
 Layers = Literal[18, 34, 50, 101, 152]
 
 
-def _check(recipe: Any, at_least_one: tuple[str, ...], shares: tuple[str, ...] = ()) -> None:
+def _check(
+    recipe: Any,
+    at_least_one: tuple[str, ...],
+    shares: tuple[str, ...] = (),
+) -> None:
     for name in at_least_one:
         whole(getattr(recipe, name), f"--{name.replace('_', '-')}", 1)
     for name in shares:
@@ -175,7 +185,9 @@ class MapRecipe:
 
     def __post_init__(self) -> None:
         _check(
-            self, ("size", "points", "epochs", "views_per_object", "batch"), ("validation_share",)
+            self,
+            ("size", "points", "epochs", "views_per_object", "batch"),
+            ("validation_share",),
         )
 
 

@@ -18,7 +18,14 @@ from nextview.errors import DatasetError
 from nextview.training.architectures import recogniser_network
 from nextview.training.inputs import PackedViews, ready_inputs
 from nextview.training.recipes import Hardware, RecogniserRecipe
-from nextview.training.runs import OwnBatches, fit, new_run, optimiser, start_from, train_once
+from nextview.training.runs import (
+    OwnBatches,
+    fit,
+    new_run,
+    optimiser,
+    start_from,
+    train_once,
+)
 from nextview.types import Float, Float32, Index
 
 with extras():
@@ -71,7 +78,9 @@ class Views(OwnBatches):
         return self.drawn // self.batch
 
     def __iter__(self) -> Iterator[tuple[Tensor, ...]]:
-        rng = np.random.default_rng([self.recipe.seed, self.epoch, self.recipe.ensemble_seed])
+        rng = np.random.default_rng(
+            [self.recipe.seed, self.epoch, self.recipe.ensemble_seed]
+        )
         n = len(self) * self.batch
         v = self.sources[0].inputs.shape[1]
         if self.recipe.balanced:
@@ -81,19 +90,28 @@ class Views(OwnBatches):
             objects, views = np.divmod(rng.permutation(len(self.objects) * v)[:n], v)
             objects = self.objects[objects]
             turn = (views + 0.5) / v
-        deformed = (rng.random(n) < self.recipe.deformed_share) & (len(self.sources) > 1)
+        deformed = (rng.random(n) < self.recipe.deformed_share) & (
+            len(self.sources) > 1
+        )
         source = np.where(deformed, rng.integers(1, max(2, len(self.sources)), n), 0)
         rows = np.stack([own.row for own in self.sources])
         source[rows[source, objects] < 0] = 0
         row = rows[source, objects]
-        view = (turn * np.array([own.inputs.shape[1] for own in self.sources])[source]).astype(int)
+        view = (
+            turn * np.array([own.inputs.shape[1] for own in self.sources])[source]
+        ).astype(int)
 
         for batch in np.arange(n).reshape(-1, self.batch)[:, self.share]:
             images = [self.sources[source[k]].inputs[row[k], view[k]] for k in batch]
             drawn = [np.stack(images), self.labels[objects[batch]]]
             if self.sources[0].azimuth_bins is not None:
                 drawn.append(
-                    np.array([self.sources[source[k]].azimuth_bins[row[k], view[k]] for k in batch])
+                    np.array(
+                        [
+                            self.sources[source[k]].azimuth_bins[row[k], view[k]]
+                            for k in batch
+                        ]
+                    )
                 )
             yield tuple(map(torch.from_numpy, drawn))
 
@@ -116,7 +134,9 @@ def augment(x: Tensor) -> tuple[Tensor, Tensor]:
     theta[:, 1, 1] = scale[:, 1] * roll.cos()
     theta[:, :, 2] = torch.empty(b, 2, **on).uniform_(-0.1, 0.1)
     x = F.grid_sample(
-        x, F.affine_grid(theta, list(x.shape), align_corners=False), align_corners=False
+        x,
+        F.affine_grid(theta, list(x.shape), align_corners=False),
+        align_corners=False,
     )
     # A rectangle of background, in half of the images, as if something stood in front.
     side = torch.empty(b, 2, **on).uniform_(0.1, 0.4)
@@ -124,7 +144,9 @@ def augment(x: Tensor) -> tuple[Tensor, Tensor]:
     grid = (torch.arange(s, **on) + 0.5) / s
     rows = (grid > corner[:, :1]) & (grid < corner[:, :1] + side[:, :1])
     columns = (grid > corner[:, 1:]) & (grid < corner[:, 1:] + side[:, 1:])
-    hidden = (rows[:, :, None] & columns[:, None, :] & (torch.rand(b, 1, 1, **on) < 0.5))[:, None]
+    hidden = (
+        rows[:, :, None] & columns[:, None, :] & (torch.rand(b, 1, 1, **on) < 0.5)
+    )[:, None]
     seen = (x > 0) & ~hidden
     return torch.where(seen, x + 0.02 * torch.randn_like(x), 0.0), mirrored
 
@@ -133,7 +155,11 @@ class RecogniserModule(L.LightningModule):
     """AdamW on cross-entropy; validates on the class mean of single-view accuracy."""
 
     def __init__(
-        self, recipe: RecogniserRecipe, classes: int, steps: int, azimuths: int = 0
+        self,
+        recipe: RecogniserRecipe,
+        classes: int,
+        steps: int,
+        azimuths: int = 0,
     ) -> None:
         super().__init__()
         self.recipe = recipe
@@ -164,7 +190,11 @@ class RecogniserModule(L.LightningModule):
         x = x.to(memory_format=torch.channels_last)
         logits, *likely = self.net(x)
 
-        loss = F.cross_entropy(logits.float(), label, label_smoothing=self.recipe.smoothing)
+        loss = F.cross_entropy(
+            logits.float(),
+            label,
+            label_smoothing=self.recipe.smoothing,
+        )
         if likely:
             lost = side_loss(
                 likely[0].float(),
@@ -172,7 +202,12 @@ class RecogniserModule(L.LightningModule):
                 torch.where(mirrored, -batch[2] % likely[0].shape[2], batch[2]),
             )
             self.log(
-                "side_loss", lost, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(x)
+                "side_loss",
+                lost,
+                on_step=False,
+                on_epoch=True,
+                sync_dist=True,
+                batch_size=len(x),
             )
             loss = loss + self.recipe.azimuth_bins_weight * lost
 
@@ -200,7 +235,11 @@ class RecogniserModule(L.LightningModule):
         right = (logits.argmax(1) == label).float()
         self.hits.scatter_add_(0, label, right)
         self.seen.scatter_add_(0, label, torch.ones_like(right))
-        self.lost.scatter_add_(0, label, F.cross_entropy(logits, label, reduction="none"))
+        self.lost.scatter_add_(
+            0,
+            label,
+            F.cross_entropy(logits, label, reduction="none"),
+        )
 
     def on_validation_epoch_end(self) -> None:
         hits, seen, lost = (
@@ -225,7 +264,10 @@ class ValidationViews(OwnBatches):
     """Every fifth view of the validation objects, shifted by one from object to object."""
 
     def __init__(
-        self, inputs: NDArray[np.uint8] | PackedViews, objects: Index, labels: Index
+        self,
+        inputs: NDArray[np.uint8] | PackedViews,
+        objects: Index,
+        labels: Index,
     ) -> None:
         self.inputs = inputs
         self.objects = objects
@@ -234,7 +276,10 @@ class ValidationViews(OwnBatches):
     def __iter__(self) -> Iterator[tuple[Tensor, Tensor]]:
         for k, i in list(enumerate(self.objects))[self.share]:
             views = self.inputs[i, k % 5 :: 5]
-            yield torch.from_numpy(views), torch.full((len(views),), int(self.labels[i]))
+            yield (
+                torch.from_numpy(views),
+                torch.full((len(views),), int(self.labels[i])),
+            )
 
 
 def fit_recogniser(
@@ -267,7 +312,12 @@ def fit_recogniser(
     own = np.random.SeedSequence([recipe.seed, recipe.ensemble_seed])
     L.seed_everything(int(own.generate_state(1)[0]), verbose=False)
     views = Views(sources, parts[0], labels, recipe)
-    module = RecogniserModule(recipe, int(labels.max()) + 1, recipe.epochs * len(views), azimuths)
+    module = RecogniserModule(
+        recipe,
+        int(labels.max()) + 1,
+        recipe.epochs * len(views),
+        azimuths,
+    )
     if weights:
         start_from(module.net, weights)
     start = {name: values.clone() for name, values in module.net.state_dict().items()}
@@ -297,10 +347,14 @@ def mirror_planes(store: ViewStore, objects: Index) -> Float:
     n = store.sphere.azimuths
     measured = store.measure()[objects].reshape(len(objects), -1, n).astype(np.float64)
     measured -= measured.mean((1, 2), keepdims=True)
-    planes = range(max(1, n // 2))  # the plane through a view also holds the one opposite
+    planes = range(
+        max(1, n // 2)
+    )  # the plane through a view also holds the one opposite
     mirrored = [measured[:, :, (2 * plane - np.arange(n)) % n] for plane in planes]
     symmetry = np.stack([(measured * image).sum((1, 2)) for image in mirrored], 1)
-    of_class = [symmetry[store.labels[objects] == c].sum(0) for c in range(len(store.classes))]
+    of_class = [
+        symmetry[store.labels[objects] == c].sum(0) for c in range(len(store.classes))
+    ]
     return np.argmax(of_class, 1).astype(np.float64)
 
 
@@ -338,7 +392,9 @@ def side_loss(likely: Tensor, label: Tensor, side: Tensor) -> Tensor:
     low = side.floor().long()[:, None]
     n = own.shape[1]
     share = side[:, None] - low
-    return -((1 - share) * own.gather(1, low % n) + share * own.gather(1, (low + 1) % n)).mean()
+    return -(
+        (1 - share) * own.gather(1, low % n) + share * own.gather(1, (low + 1) % n)
+    ).mean()
 
 
 def train_recogniser(
@@ -379,7 +435,16 @@ def train_recogniser(
     stores = [views, *map(ViewStore.open, deformed)]
     run = new_run(recipe, weights, [views.names[i] for i in validation], stores)
     sources = [_source(each, views, training, recipe, planes, track) for each in stores]
-    fitted = sources, views.labels, (training, validating), recipe, out, weights, hardware, azimuths
+    fitted = (
+        sources,
+        views.labels,
+        (training, validating),
+        recipe,
+        out,
+        weights,
+        hardware,
+        azimuths,
+    )
     train_once(out, run, partial(fit_recogniser, *fitted))
 
     return [out]
@@ -399,5 +464,7 @@ def _source(
         raise DatasetError(f"{store.path}: holds none of the training objects")
     inputs = ready_inputs(store.path, recipe.size, recipe.input, track)
     return StoredInputs(
-        inputs, rows, None if planes is None else azimuth_bins(store, views.sphere.azimuths, planes)
+        inputs,
+        rows,
+        None if planes is None else azimuth_bins(store, views.sphere.azimuths, planes),
     )

@@ -68,7 +68,10 @@ class ReplayTable:
         data = Predictions.joined(parts)
         scenes = scenes or scenes_of(predictions)
         data = replace(data, calibration=calibration_of(data, rng))
-        return cls(data, None if scenes is None else scenes.of_scenes(np.tile(kept, len(parts))))
+        return cls(
+            data,
+            None if scenes is None else scenes.of_scenes(np.tile(kept, len(parts))),
+        )
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,11 @@ class DecisionState:
 
 
 def rollout(
-    table: ReplayTable, policy: Policy, n_views: int, rng: Generator, visibility: bool = False
+    table: ReplayTable,
+    policy: Policy,
+    n_views: int,
+    rng: Generator,
+    visibility: bool = False,
 ) -> Iterator[DecisionState]:
     """Follow a policy once over every object from a random first view.
 
@@ -110,13 +117,23 @@ def rollout(
     starts = rng.integers(len(sphere), size=len(data))
     if table.scenes is not None:
         starts = np.where(
-            table.scenes.reachable, rng.random(table.scenes.reachable.shape), -1
+            table.scenes.reachable,
+            rng.random(table.scenes.reachable.shape),
+            -1,
         ).argmax(1)
 
     constrain, visible = sight_of(table.scenes, everything)
     length = FixedLength(max_views=n_views)
     run = run_episodes(
-        data.evidence, sphere, policy, starts, length, rng, data.calibration, constrain, visible
+        data.evidence,
+        sphere,
+        policy,
+        starts,
+        length,
+        rng,
+        data.calibration,
+        constrain,
+        visible,
     )
 
     visited = np.zeros((len(data), len(sphere)), bool)
@@ -125,18 +142,36 @@ def rollout(
         visited[step.episodes, step.views] = True
         azimuth = sphere.azimuth[step.views]
         seen = np.maximum(step.seen, 1)
-        azimuth_bins = data.calibration.azimuth_bins(step.total, seen, len(data.classes), azimuth)
-        state = EpisodeState(
-            step.views, visited.copy(), step.belief, step.evidence, k, step.episodes, azimuth_bins
+        azimuth_bins = data.calibration.azimuth_bins(
+            step.total,
+            seen,
+            len(data.classes),
+            azimuth,
         )
-        state = constrain(replace(state, visibility=visible(state) if visibility else None))
+        state = EpisodeState(
+            step.views,
+            visited.copy(),
+            step.belief,
+            step.evidence,
+            k,
+            step.episodes,
+            azimuth_bins,
+        )
+        state = constrain(
+            replace(state, visibility=visible(state) if visibility else None)
+        )
         yield DecisionState(state, step.total, travel, step.seen)
 
         if k < len(run.steps):
             travel = travel + sphere.travel[step.views, step.next_views]
 
 
-def value_after(table: ReplayTable, total: Float, n_views: NDArray | int, kind: str) -> Float:
+def value_after(
+    table: ReplayTable,
+    total: Float,
+    n_views: NDArray | int,
+    kind: str,
+) -> Float:
     """Return the value of sums of log-evidence.
 
     Args:
@@ -187,7 +222,10 @@ def candidate_values(table: ReplayTable, moment: DecisionState, kind: str) -> Fl
     counts = table.data.seen.astype(np.float64)
     n_views = np.maximum(moment.seen[:, None] + counts, 1)
     return value_after(
-        table, moment.total[:, None] + counts[..., None] * table.data.log_evidence, n_views, kind
+        table,
+        moment.total[:, None] + counts[..., None] * table.data.log_evidence,
+        n_views,
+        kind,
     )
 
 
@@ -204,7 +242,12 @@ class Value(NamedTuple):
 
 
 def judge(
-    table: ReplayTable, policy: Policy, n_views: int, kind: str, rng: Generator, rounds: int = 8
+    table: ReplayTable,
+    policy: Policy,
+    n_views: int,
+    kind: str,
+    rng: Generator,
+    rounds: int = 8,
 ) -> Value:
     """Follow a policy several times over every object and return its value.
 
@@ -225,7 +268,12 @@ def judge(
         for moment in rollout(table, policy, n_views, rng):
             k = moment.state.step
             if k > 1:
-                value = value_after(table, moment.total, np.maximum(moment.seen, 1), kind)
+                value = value_after(
+                    table,
+                    moment.total,
+                    np.maximum(moment.seen, 1),
+                    kind,
+                )
                 reached[:, k - 2] += weights @ value, weights @ moment.travel
     return Value(*reached)
 
@@ -252,7 +300,11 @@ TRAVEL_WEIGHTS = (
 
 
 def judge_all(
-    judged: Judged, n_views: int, kind: str, seed: int | list[int], rounds: int = 8
+    judged: Judged,
+    n_views: int,
+    kind: str,
+    seed: int | list[int],
+    rounds: int = 8,
 ) -> Value:
     """Return the mean value over the objects of several tables; see ``judge``.
 
@@ -266,12 +318,18 @@ def judge_all(
     Returns:
         Mean value and travel after 2, 3, ... views.
     """
-    values = [judge(*pair, n_views, kind, np.random.default_rng(seed), rounds) for pair in judged]
+    values = [
+        judge(*pair, n_views, kind, np.random.default_rng(seed), rounds)
+        for pair in judged
+    ]
     return Value(*np.average(values, 0, [len(table.data) for table, _ in judged]))
 
 
 def fit_travel_weight(
-    judged: Sequence[tuple[ReplayTable, Gain]], n_views: int, kind: str, seed: int
+    judged: Sequence[tuple[ReplayTable, Gain]],
+    n_views: int,
+    kind: str,
+    seed: int,
 ) -> float:
     """Choose the lowest travel weight at which policies travel no farther than a random walk.
 
@@ -287,10 +345,15 @@ def fit_travel_weight(
         The weight, value per grid cell; the largest one if all travel farther.
     """
     limit = judge_all(
-        [(table, Random(table.data.sphere)) for table, _ in judged], n_views, kind, seed
+        [(table, Random(table.data.sphere)) for table, _ in judged],
+        n_views,
+        kind,
+        seed,
     ).travel
     for weight in TRAVEL_WEIGHTS:
-        paying = [(table, replace(policy, travel_weight=weight)) for table, policy in judged]
+        paying = [
+            (table, replace(policy, travel_weight=weight)) for table, policy in judged
+        ]
         if (judge_all(paying, n_views, kind, seed).travel <= limit).all():
             return weight
     return TRAVEL_WEIGHTS[-1]

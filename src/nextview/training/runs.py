@@ -62,7 +62,9 @@ class Batches(L.LightningDataModule):
 
     def setup(self, stage: str) -> None:
         self.training.share = self.validation.share = slice(
-            self.trainer.global_rank, None, self.trainer.world_size
+            self.trainer.global_rank,
+            None,
+            self.trainer.world_size,
         )
 
     def train_dataloader(self) -> DataLoader:
@@ -86,7 +88,11 @@ class StepSeed(L.Callback):
     """Seeds torch by epoch, step and device, so that a resumed run draws the same."""
 
     def on_train_batch_start(
-        self, trainer: L.Trainer, pl_module: Any, batch: Any, batch_idx: int
+        self,
+        trainer: L.Trainer,
+        pl_module: Any,
+        batch: Any,
+        batch_idx: int,
     ) -> None:
         """Seed the draws of a batch by its number, so that a resumed run repeats them.
 
@@ -96,8 +102,15 @@ class StepSeed(L.Callback):
             batch: the batch.
             batch_idx: number of the batch in its epoch.
         """
-        step = [pl_module.recipe.seed, trainer.current_epoch, batch_idx, trainer.global_rank]
-        torch.manual_seed(int(np.random.SeedSequence(step).generate_state(1, np.uint64)[0]))
+        step = [
+            pl_module.recipe.seed,
+            trainer.current_epoch,
+            batch_idx,
+            trainer.global_rank,
+        ]
+        torch.manual_seed(
+            int(np.random.SeedSequence(step).generate_state(1, np.uint64)[0])
+        )
 
 
 class WholeCheckpoints(TorchCheckpointIO):
@@ -107,7 +120,10 @@ class WholeCheckpoints(TorchCheckpointIO):
     """
 
     def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
+        self,
+        checkpoint: dict[str, Any],
+        path: str | Path,
+        storage_options: Any = None,
     ) -> None:
         """Write a checkpoint, complete or not at all.
 
@@ -127,7 +143,10 @@ def save_whole(values: dict[str, Any], path: Path) -> None:
         path: of the file, which is replaced.
     """
     written = io.BytesIO()
-    torch.save(values, written)  # into a file it would turn a full disk into a RuntimeError
+    torch.save(
+        values,
+        written,
+    )  # into a file it would turn a full disk into a RuntimeError
     with new_file(path, overwrite=True) as part:
         part.write_bytes(written.getbuffer())
 
@@ -155,7 +174,11 @@ class Log(L.Callback):
         self.path = out / "log/metrics.csv"
         self.rows = list[dict[str, float]]()
 
-    def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_train_epoch_start(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+    ) -> None:
         """Start the clock of an epoch.
 
         Args:
@@ -164,7 +187,11 @@ class Log(L.Callback):
         """
         self.began = time.perf_counter()
 
-    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_train_epoch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+    ) -> None:
         """Append a row with the scores and the duration of an epoch.
 
         Args:
@@ -195,8 +222,20 @@ class Log(L.Callback):
 class Checkpoint(ModelCheckpoint):
     """Keeps the best epoch by a score, or the last one; the folder may have been moved since."""
 
-    def __init__(self, out: Path, name: str, select: str | None = None, mode: str = "min") -> None:
-        super().__init__(out, name, monitor=select, mode=mode, enable_version_counter=False)
+    def __init__(
+        self,
+        out: Path,
+        name: str,
+        select: str | None = None,
+        mode: str = "min",
+    ) -> None:
+        super().__init__(
+            out,
+            name,
+            monitor=select,
+            mode=mode,
+            enable_version_counter=False,
+        )
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         super().load_state_dict(state_dict | {"dirpath": self.dirpath})
@@ -247,7 +286,9 @@ def fit(
         Checkpoint(out, "last"),
     ]
     if recipe.patience:
-        callbacks.append(Patience(select, patience=recipe.patience, mode=mode, verbose=False))
+        callbacks.append(
+            Patience(select, patience=recipe.patience, mode=mode, verbose=False)
+        )
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     with warnings.catch_warnings():
         # All of them describe what is meant here: a run that resumes, and data sets that make their
@@ -287,7 +328,9 @@ def fit(
             torch.set_flush_denormal(False)  # it holds for the whole process
     # Too few objects for one batch of validation leave nothing to choose by: the last epoch is
     # kept.
-    module.load_state_dict(read_checkpoint(best if best.exists() else last)["state_dict"])
+    module.load_state_dict(
+        read_checkpoint(best if best.exists() else last)["state_dict"]
+    )
     return module
 
 
@@ -307,10 +350,22 @@ def optimiser(parameters: Any, recipe: Any, steps: int, falls: float) -> dict[st
     """
     adam = torch.optim.AdamW(parameters, lr=recipe.lr, weight_decay=recipe.weight_decay)
     if recipe.lr_schedule == "one-cycle":
-        cycle = torch.optim.lr_scheduler.OneCycleLR(adam, recipe.lr, steps, pct_start=0.2)
-        return {"optimizer": adam, "lr_scheduler": {"scheduler": cycle, "interval": "step"}}
+        cycle = torch.optim.lr_scheduler.OneCycleLR(
+            adam,
+            recipe.lr,
+            steps,
+            pct_start=0.2,
+        )
+        return {
+            "optimizer": adam,
+            "lr_scheduler": {"scheduler": cycle, "interval": "step"},
+        }
+
     stairs = torch.optim.lr_scheduler.StepLR(adam, step_size=5, gamma=falls)
-    return {"optimizer": adam, "lr_scheduler": {"scheduler": stairs, "interval": "epoch"}}
+    return {
+        "optimizer": adam,
+        "lr_scheduler": {"scheduler": stairs, "interval": "epoch"},
+    }
 
 
 def is_first() -> bool:
@@ -379,7 +434,13 @@ def new_run(
 
     sha256 = None if weights is None else sha256_of(weights)
     names = tuple(held_out)
-    return Run(asdict(recipe), sha256, names, names, tuple(dict.fromkeys((*before, command()))))
+    return Run(
+        asdict(recipe),
+        sha256,
+        names,
+        names,
+        tuple(dict.fromkeys((*before, command()))),
+    )
 
 
 def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
@@ -401,7 +462,11 @@ def train_once(out: Path, run: Run, train: Callable[[], nn.Module]) -> None:
             before = read_record(out / "run.json", Run, "a training run")
             recipe = msgspec.to_builtins(run.recipe)
 
-            changed = [name for name, value in recipe.items() if before.recipe.get(name) != value]
+            changed = [
+                name
+                for name, value in recipe.items()
+                if before.recipe.get(name) != value
+            ]
             faults = [
                 f"another recipe ({name} was {before.recipe.get(name)}, not {recipe[name]})"
                 for name in changed
@@ -437,7 +502,9 @@ def read_run(out: Path) -> Run:
         raise ModelError(f"{out}: holds no training run")
     run = read_record(out / "run.json", Run, "a training run")
     if not (out / "network.pt").exists():
-        raise ModelError(f"{out}: the training is not done; give its command again to go on")
+        raise ModelError(
+            f"{out}: the training is not done; give its command again to go on"
+        )
     return run
 
 
@@ -457,7 +524,12 @@ def read_recipe(out: Path, kind: type[Recipe]) -> Recipe:
     recipe = read_run(out).recipe
     if set(recipe) != set(kind.__annotations__):
         raise ModelError(f"{out}: holds no run of a {kind.__name__} of this version")
-    return decode_record(recipe, kind, f"{out}: not a recipe of such a network", ModelError)
+    return decode_record(
+        recipe,
+        kind,
+        f"{out}: not a recipe of such a network",
+        ModelError,
+    )
 
 
 def load_run(network: N, run: Path) -> N:
@@ -476,7 +548,9 @@ def load_run(network: N, run: Path) -> N:
     path = run / "network.pt"
     try:
         network.load_state_dict(_read_state(path))
-    except RuntimeError:  # names every parameter that is missing, foreign or of another shape
+    except (
+        RuntimeError
+    ):  # names every parameter that is missing, foreign or of another shape
         raise ModelError(
             f"{path}: not the weights of the network that {run}/run.json describes"
         ) from None
@@ -507,7 +581,9 @@ def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> N
         ModelError: the parameters are of another network.
     """
     path = weights / "network.pt" if weights.is_dir() else weights
-    state = {name.removeprefix("resnet."): value for name, value in _read_state(path).items()}
+    state = {
+        name.removeprefix("resnet."): value for name, value in _read_state(path).items()
+    }
     lite = isinstance(network, LiteNet)
     for theirs, ours in LITE_NAMES.items() if lite and path == weights else ():
         state = {re.sub(theirs, ours, name): value for name, value in state.items()}
@@ -515,14 +591,22 @@ def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> N
     first = "stem.weight" if lite else "conv1.weight"
     for name, value in own.items():
         # Files from before PyTorch 0.4.1, some of torchvision's among them, do not count batches.
-        lacks = name not in state and (name.endswith("_tracked") or name.startswith("side."))
+        lacks = name not in state and (
+            name.endswith("_tracked") or name.startswith("side.")
+        )
         other = name in state and state[name].shape != value.shape
         if lacks or (name.startswith(("fc.", "side.")) and (other or not head)):
             state[name] = value
     state = {
-        name: value for name, value in state.items() if name in own or not name.startswith("side.")
+        name: value
+        for name, value in state.items()
+        if name in own or not name.startswith("side.")
     }
-    if first in state and state[first].ndim == 4 and state[first].shape != own[first].shape:
+    if (
+        first in state
+        and state[first].ndim == 4
+        and state[first].shape != own[first].shape
+    ):
         colours = state[first].shape[1]
         channels = own[first].shape[1]
         # each colour's kernel is dealt out to the channels in turn
@@ -532,14 +616,23 @@ def start_from(network: ResNet | LiteNet, weights: Path, head: bool = True) -> N
         share /= share.sum(1, keepdim=True)
         state[first] = torch.einsum("okhw,kc->ochw", state[first], share)
     wanted, given = (
-        {name: tuple(value.shape) for name, value in values.items()} for values in (own, state)
+        {name: tuple(value.shape) for name, value in values.items()}
+        for values in (own, state)
     )
     faults = [f"it lacks {name}" for name in sorted(wanted.keys() - given.keys())]
     faults += [f"it holds {name}" for name in sorted(given.keys() - wanted.keys())]
-    both = ((name, shape, given[name]) for name, shape in wanted.items() if name in given)
-    faults += [f"{name} is {there}, not {shape}" for name, shape, there in both if there != shape]
+    both = (
+        (name, shape, given[name]) for name, shape in wanted.items() if name in given
+    )
+    faults += [
+        f"{name} is {there}, not {shape}"
+        for name, shape, there in both
+        if there != shape
+    ]
     if faults:
-        raise ModelError(f"{path}: not the weights of this {network.name} ({faults[0]})")
+        raise ModelError(
+            f"{path}: not the weights of this {network.name} ({faults[0]})"
+        )
     for name, value in state.items():
         if not torch.isfinite(value).all():
             raise ModelError(
@@ -553,5 +646,7 @@ def _read_state(path: Path) -> dict[str, Tensor]:
     if not isinstance(state, dict) or not all(
         isinstance(value, Tensor) for value in state.values()
     ):
-        raise ModelError(f"{path}: not a state dict: it should map names of parameters to tensors")
+        raise ModelError(
+            f"{path}: not a state dict: it should map names of parameters to tensors"
+        )
     return dict(state)

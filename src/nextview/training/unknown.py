@@ -85,7 +85,9 @@ def fit_unknown(
     sensor_named(sensor)  # refused here, not by every object
     with card_to_fit(card) as (model, write):
         entries = [
-            e for e in list_dataset(meshes) if e.split != "test" and e.label in model.classes
+            e
+            for e in list_dataset(meshes)
+            if e.split != "test" and e.label in model.classes
         ]
         look = partial(_looked_at, frozenset(model.held_out), sensor, seed)
         seen: dict[Entry, Float32] = {}
@@ -111,7 +113,11 @@ def fit_unknown(
             )
 
         labels = np.array([model.classes.index(e.label) for e in held_out])
-        novelty = fit_novelty(np.concatenate(known), np.stack([seen[e] for e in held_out]), labels)
+        novelty = fit_novelty(
+            np.concatenate(known),
+            np.stack([seen[e] for e in held_out]),
+            labels,
+        )
         about = (
             f"{len(known)} objects of the training split, calibrated on {len(held_out)} others,"
             " turned at random and half of them stretched, half of the views through the sensor"
@@ -129,7 +135,12 @@ def fit_unknown(
     return FittedUnknown(len(known), len(held_out), len(left_out))
 
 
-def _looked_at(held_out: frozenset[str], sensor: str, seed: int, entry: Entry) -> Float32 | str:
+def _looked_at(
+    held_out: frozenset[str],
+    sensor: str,
+    seed: int,
+    entry: Entry,
+) -> Float32 | str:
     """Embeddings of views of a mesh, or why there are none.
 
     Of a held-out object, (CONDITIONS, views, F). Of any other, clean views of each deformation,
@@ -177,7 +188,10 @@ def _random_views(camera: Camera, wanted: int, rng: Generator) -> Float32:
 
 
 def fit_novelty(
-    known: Float32, held_out: Float32, labels: Index, n_views: int = CALIBRATION_VIEWS
+    known: Float32,
+    held_out: Float32,
+    labels: Index,
+    n_views: int = CALIBRATION_VIEWS,
 ) -> Novelty:
     """Returns a novelty score of views, calibrated on objects that are not among the known ones.
 
@@ -199,7 +213,11 @@ def fit_novelty(
     )
 
     objects, conditions, views = scores.shape
-    ways = scores.reshape(objects, 2, conditions // 2 * views)  # through a sensor, and without one
+    ways = scores.reshape(
+        objects,
+        2,
+        conditions // 2 * views,
+    )  # through a sensor, and without one
     standard = np.stack([ways.mean((0, 2)), ways.std((0, 2))], 1).astype(np.float32)
 
     of_condition = standard[np.repeat([0, 1], conditions // 2)]
@@ -229,5 +247,7 @@ def quantiles(scores: Float, labels: Index, n_views: int) -> Float32:
         order = np.argsort(means, axis=None)
         weight = np.repeat(share_of, draws)[order]
         share = (np.cumsum(weight) - weight / 2) / weight.sum()
-        levels.append(np.interp(np.linspace(0, 1, QUANTILES_FITTED), share, means.ravel()[order]))
+        levels.append(
+            np.interp(np.linspace(0, 1, QUANTILES_FITTED), share, means.ravel()[order])
+        )
     return np.array(levels, np.float32)

@@ -49,7 +49,11 @@ def walk_card(walk: Walk) -> str:
     best = int(view.belief.argmax())
     believed = f"{escape(classes[best])} <small>{view.belief[best]:.1%}</small>"
     believed = believed if view.observation.seen else "Nothing is seen"
-    goes_on = "It would stop here." if walk.stopped else "Not sure enough yet: it would look again."
+    goes_on = (
+        "It would stop here."
+        if walk.stopped
+        else "Not sure enough yet: it would look again."
+    )
 
     parts = [
         f"<h3>{believed}</h3><p>{goes_on}</p>",
@@ -101,34 +105,37 @@ def preview_card(observation: Observation, walk: Walk) -> str:
 
 def class_card(label: str) -> str:
     """What the object is."""
-    return (
-        f'{CARD_STYLE}<div class="nv">Its class is <b>{escape(label)}</b>; no policy knows.</div>'
-    )
+    return f'{CARD_STYLE}<div class="nv">Its class is <b>{escape(label)}</b>; no policy knows.</div>'
 
 
 def warm(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Colour a grey picture, (H, W), as (H, W, 3): things on a ground; black is empty."""
-    wood = np.minimum(np.array(rgb(WOOD)) * np.minimum(picture[..., None] / 200, 1.15), 255)
+    wood = np.minimum(
+        np.array(rgb(WOOD)) * np.minimum(picture[..., None] / 200, 1.15),
+        255,
+    )
     return np.where(picture[..., None] > 0, wood, rgb(GROUND)).astype(np.uint8)
 
 
 def _image(pixels: NDArray[np.uint8], width: int) -> str:
     file = BytesIO()
     Image.fromarray(warm(pixels) if pixels.ndim == 2 else pixels).save(file, "png")
-    return (
-        f'<img width="{width}" src="data:image/png;base64,{b64encode(file.getvalue()).decode()}">'
-    )
+    return f'<img width="{width}" src="data:image/png;base64,{b64encode(file.getvalue()).decode()}">'
 
 
 def _figures(walk: Walk, view: View) -> str:
     """The image, and the value of each view where they lie on rings; the highest ring on top."""
     elevation, azimuth = view.angles
-    where = f"from view {view.index}, {elevation:.0f}° up, {round(azimuth) % 360}° around"
+    where = (
+        f"from view {view.index}, {elevation:.0f}° up, {round(azimuth) % 360}° around"
+    )
     found = [(where, _image(view.observation.picture, 160))]
     if view.values is not None and isinstance(walk.sphere, ViewSphere):
         grid = view.values.reshape(walk.sphere.rings, walk.sphere.azimuths)
         order = np.argsort(walk.sphere.elevations)[::-1]
-        found.append(("value of each view", _image(heat(grid[order]), MAP_CELL * grid.shape[1])))
+        found.append(
+            ("value of each view", _image(heat(grid[order]), MAP_CELL * grid.shape[1]))
+        )
     return _captioned(found)
 
 
@@ -137,7 +144,9 @@ def _maps(view: View) -> str:
         (name, _image(heat(values[::-1]), MAP_CELL * values.shape[1]))
         for name, values in view.maps.items()
     ]
-    return f"<p>Maps of the views around this one:</p>{_captioned(found)}" if found else ""
+    return (
+        f"<p>Maps of the views around this one:</p>{_captioned(found)}" if found else ""
+    )
 
 
 def _captioned(images: Iterable[tuple[str, str]]) -> str:
@@ -171,7 +180,8 @@ def geometry_card(walk: Walk, direction: Float, what: str) -> str:
     if names[0] == names[1]:
         names = [f"{names[0]}, likeliest pose", f"{names[1]}, second pose"]
     both = [
-        (name, _image(picture, 128)) for name, picture in zip(names, rivals.pictures, strict=True)
+        (name, _image(picture, 128))
+        for name, picture in zip(names, rivals.pictures, strict=True)
     ]
     both.append(("where they differ", _image(differing(rivals), 128)))
 
@@ -203,14 +213,19 @@ def rivals_card(walk: Walk, view: int | None = None) -> str:
     if rivals is None or at is None:
         return ""
 
-    both = [(name, _image(picture, 96)) for name, picture in walk.remembered(rivals, at)]
+    both = [
+        (name, _image(picture, 96)) for name, picture in walk.remembered(rivals, at)
+    ]
     differ = 1 - rivals.alike
     if isinstance(walk.sphere, ViewSphere):
         grid = differ.reshape(walk.sphere.rings, walk.sphere.azimuths)[
             np.argsort(walk.sphere.elevations)[::-1]
         ]
         both.append(
-            ("how much they differ from each view", _image(heat(grid), MAP_CELL * grid.shape[1]))
+            (
+                "how much they differ from each view",
+                _image(heat(grid), MAP_CELL * grid.shape[1]),
+            )
         )
 
     known = not np.isnan(differ[at])
@@ -228,7 +243,9 @@ def _beliefs(walk: Walk) -> str:
     classes = walk.session.models.classes
     rows = []
     before = (
-        walk.views[-2].belief if len(walk.views) > 1 else np.full(len(classes), 1 / len(classes))
+        walk.views[-2].belief
+        if len(walk.views) > 1
+        else np.full(len(classes), 1 / len(classes))
     )
     highest = np.maximum(view.belief, before) if len(walk.views) > 1 else view.belief
     counted = sum(view.observation.seen for view in walk.views)

@@ -17,7 +17,12 @@ from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.geometry.mesh import Mesh, load_mesh, make_mesh
 from nextview.geometry.observation import Camera, Observation
 from nextview.geometry.resting import rotated
-from nextview.geometry.viewsphere import azimuth_of, direction_of, level_pose, look_at_origin
+from nextview.geometry.viewsphere import (
+    azimuth_of,
+    direction_of,
+    level_pose,
+    look_at_origin,
+)
 from nextview.policies.discriminate import Discriminate, Rivals
 from nextview.recognition.belief import FixedLength, log_evidence_of
 from nextview.session.session import Session
@@ -44,7 +49,13 @@ class StoredViews:
     def observe(self, pose: Float) -> Observation:
         """The stored view nearest to a pose, (4, 4), object frame; its own pose comes with it."""
         k, _ = self.sphere.nearest(direction_of(pose))
-        seen = self._depth[k], self.sphere.poses[k], self._intrinsics, self._radius, self._image[k]
+        seen = (
+            self._depth[k],
+            self.sphere.poses[k],
+            self._intrinsics,
+            self._radius,
+            self._image[k],
+        )
         return Observation(*seen, exact=self._exact)
 
 
@@ -64,7 +75,9 @@ class ShownObject:
 
 
 def shown_objects(
-    path: Path | None = None, up: str | None = None, unit: str | None = None
+    path: Path | None = None,
+    up: str | None = None,
+    unit: str | None = None,
 ) -> tuple[ShownObject, ...]:
     """List the objects of a path.
 
@@ -80,7 +93,10 @@ def shown_objects(
         DatasetError: there is no object.
     """
     if path is None:
-        return tuple(ShownObject(name, partial(sample_mesh, name), name) for name in SAMPLE_MESHES)
+        return tuple(
+            ShownObject(name, partial(sample_mesh, name), name)
+            for name in SAMPLE_MESHES
+        )
     if not path.is_dir():
         return (ShownObject(path.stem, partial(load_mesh, path, up, unit)),)
     if (path / "zarr.json").exists():
@@ -90,7 +106,8 @@ def shown_objects(
             raise DatasetError(f"{path}: no object in it is rendered yet")
         labels = [store.classes[label] for label in store.labels]
         return tuple(
-            ShownObject(store.names[k], partial(StoredViews, store, k), labels[k]) for k in rows
+            ShownObject(store.names[k], partial(StoredViews, store, k), labels[k])
+            for k in rows
         )
     # A mesh of its own, outside of class folders, has no label.
     return tuple(
@@ -109,7 +126,13 @@ class Walk:
     It ends after all views only.
     """
 
-    def __init__(self, system: System, camera: Camera, start: int, seed: int = 0) -> None:
+    def __init__(
+        self,
+        system: System,
+        camera: Camera,
+        start: int,
+        seed: int = 0,
+    ) -> None:
         self.system = system
         self.camera = camera
         self.start = start
@@ -117,7 +140,8 @@ class Walk:
         self.sphere = system.sphere
         self.stopping = system.stopping
         self.session: Session = replace(
-            system, stopping=FixedLength(max_views=len(system.sphere))
+            system,
+            stopping=FixedLength(max_views=len(system.sphere)),
         ).session(start, seed)
 
     @property
@@ -133,7 +157,9 @@ class Walk:
         seen = np.array([view.observation.seen for view in self.views])
         beliefs = np.stack([view.belief for view in self.views])
         reached = self.stopping.reached_along(beliefs, np.maximum(seen.cumsum(), 1))
-        return bool((reached & seen).any()) or len(self.views) >= self.stopping.max_views
+        return (
+            bool((reached & seen).any()) or len(self.views) >= self.stopping.max_views
+        )
 
     @property
     def next_view(self) -> int | None:
@@ -157,20 +183,33 @@ class Walk:
             return None
 
         evidence = recogniser([view.observation for view in seen])
-        azimuths = azimuth_of(np.stack([view.direction for view in [*seen, self.views[-1]]]))
-        total = log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuths[:-1]).sum(
-            0, keepdims=True
+        azimuths = azimuth_of(
+            np.stack([view.direction for view in [*seen, self.views[-1]]])
         )
+        total = log_evidence_of(
+            evidence.logits,
+            evidence.azimuth_bins,
+            azimuths[:-1],
+        ).sum(0, keepdims=True)
         joint = recogniser.calibration.joint(
-            total, len(seen), len(recogniser.classes), azimuths[-1:]
+            total,
+            len(seen),
+            len(recogniser.classes),
+            azimuths[-1:],
         )
 
         things = Discriminate(
-            self.sphere, recogniser.memory.views, np.array(recogniser.calibration.hypotheses)
+            self.sphere,
+            recogniser.memory.views,
+            np.array(recogniser.calibration.hypotheses),
         )
         return things.rivals(joint[0], float(azimuths[-1]))
 
-    def remembered(self, rivals: Rivals, view: int) -> list[tuple[str, NDArray[np.uint8]]]:
+    def remembered(
+        self,
+        rivals: Rivals,
+        view: int,
+    ) -> list[tuple[str, NDArray[np.uint8]]]:
         """Return the rivals' names and their remembered pictures from a candidate view.
 
         Args:
@@ -182,10 +221,19 @@ class Walk:
         """
         recogniser = self.session.models.recogniser
         assert isinstance(recogniser, TaughtRecogniser)
-        seen_from = zip(rivals.classes, rivals.hypotheses, rivals.azimuths[:, view], strict=True)
+        seen_from = zip(
+            rivals.classes,
+            rivals.hypotheses,
+            rivals.azimuths[:, view],
+            strict=True,
+        )
+
         ring = int(rivals.rings[view])
         return [
-            (recogniser.classes[c], remembered_picture(recogniser, int(h), ring, int(a)))
+            (
+                recogniser.classes[c],
+                remembered_picture(recogniser, int(h), ring, int(a)),
+            )
             for c, h, a in seen_from
         ]
 
@@ -197,7 +245,11 @@ class Walk:
             geometry, or there is one hypothesis only.
         """
         outlook = self.session.outlook
-        return None if outlook is None else outlook.rivals(outlook.cameras(direction[None])[0])
+        return (
+            None
+            if outlook is None
+            else outlook.rivals(outlook.cameras(direction[None])[0])
+        )
 
     @property
     def visited(self) -> list[int]:
@@ -215,7 +267,9 @@ class Walk:
         if self.session.done:
             raise UsageError("every candidate view was taken: start over")
         return self.session.update(
-            self.camera.observe(self.sphere.poses[where] if isinstance(where, int) else where)
+            self.camera.observe(
+                self.sphere.poses[where] if isinstance(where, int) else where
+            )
         )
 
     def step(self) -> View:
@@ -232,7 +286,10 @@ class Walk:
 
 @lru_cache(maxsize=256)
 def remembered_picture(
-    recogniser: TaughtRecogniser, hypothesis: int, ring: int, azimuth: int
+    recogniser: TaughtRecogniser,
+    hypothesis: int,
+    ring: int,
+    azimuth: int,
 ) -> NDArray[np.uint8]:
     """Draw a taught thing in a resting pose.
 
@@ -286,11 +343,15 @@ class Exploration:
         self.objects = {shown.name: shown for shown in objects}
         self.sensor = sensor
         self.seed = seed
-        self._load = lru_cache(maxsize=None)(lambda policy: load(policy=policy, **options))
+        self._load = lru_cache(maxsize=None)(
+            lambda policy: load(policy=policy, **options)
+        )
         self.systems: list[System] = [self._load(policy) for policy in policies]
         views = len(self.systems[0].sphere)
         drawn = int(np.random.default_rng(seed).integers(views))
-        self.start = drawn if start is None else whole(start, "the first view", 0, views - 1)
+        self.start = (
+            drawn if start is None else whole(start, "the first view", 0, views - 1)
+        )
         self.show(objects[0].name)
 
     @property
@@ -315,9 +376,16 @@ class Exploration:
         """Forget all views; a sensor errs anew in the same way."""
         self.use_sensor(self.sensor)
 
-    def _begin(self, shown: ShownObject, opened: Mesh | Camera, sensor: str | None) -> None:
+    def _begin(
+        self,
+        shown: ShownObject,
+        opened: Mesh | Camera,
+        sensor: str | None,
+    ) -> None:
         if sensor is not None and not isinstance(opened, Mesh):
-            raise UsageError(f"{shown.name} has only stored views: no sensor can look at it")
+            raise UsageError(
+                f"{shown.name} has only stored views: no sensor can look at it"
+            )
         walks = [
             Walk(system, self._camera(opened, sensor), self.start, self.seed)
             for system in self.systems
@@ -328,7 +396,9 @@ class Exploration:
         self.walks = walks
 
     def _camera(self, opened: Mesh | Camera, sensor: str | None = None) -> Camera:
-        return simulated(opened, sensor, self.seed) if isinstance(opened, Mesh) else opened
+        return (
+            simulated(opened, sensor, self.seed) if isinstance(opened, Mesh) else opened
+        )
 
     def compare(self, policies: Sequence[str | None]) -> None:
         """Use one policy, or two side by side; those that walked before keep their views."""
@@ -348,7 +418,9 @@ class Exploration:
 
     def walk_on(self) -> bool:
         """Let each policy that has not stopped take its next view. Returns whether any did."""
-        walks = [walk for walk in self.walks if not walk.stopped and not walk.session.done]
+        walks = [
+            walk for walk in self.walks if not walk.stopped and not walk.session.done
+        ]
         for walk in walks:
             walk.step()
         return bool(walks)

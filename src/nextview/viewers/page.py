@@ -34,7 +34,9 @@ NO_ANSWER = "nothing"
 CLEAN = "clean renders"
 APART = 8.5  # between two objects side by side, object radii
 LAMP_PLACE = (-4.0, -5.0, 8.0)  # where it hangs
-PAUSE = 0.5  # between the views of a policy that walks, seconds: long enough to see each
+PAUSE = (
+    0.5  # between the views of a policy that walks, seconds: long enough to see each
+)
 HELP = """Click a **ball** to look from there, or drag the **arrows**. The large **red** ball is where the policy would
 look next. Yellow views promise most, violet ones least; small dark ones are done."""
 _starting = threading.Lock()
@@ -46,7 +48,12 @@ class Page:
     All who open it see and drive the same.
     """
 
-    def __init__(self, exploration: Exploration, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(
+        self,
+        exploration: Exploration,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+    ) -> None:
         self.exploration = exploration
         self.server = serve(host, port)
         self.stop = self.server.stop
@@ -57,18 +64,33 @@ class Page:
         self._panels: list[viser.PanelHandle] = []
         gui = self.server.gui
         scene = self.server.scene
-        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(209, 73, 91))
+        gui.configure_theme(
+            show_logo=False,
+            show_share_button=False,
+            brand_color=(209, 73, 91),
+        )
         gui.set_panel_label("nextview explore")
         scene.set_up_direction("+z")
-        sky = np.linspace(rgb(PAPER), rgb(SAND), 256)  # darkens a little towards the ground
+        sky = np.linspace(
+            rgb(PAPER),
+            rgb(SAND),
+            256,
+        )  # darkens a little towards the ground
         scene.set_background_image(sky.astype(np.uint8)[:, None])
         scene.configure_default_lights(False)
         scene.configure_environment_map(None)
         scene.add_light_hemisphere(
-            "/sky", sky_color=rgb(PAPER), ground_color=rgb(GROUND), intensity=3.0
+            "/sky",
+            sky_color=rgb(PAPER),
+            ground_color=rgb(GROUND),
+            intensity=3.0,
         )
         scene.add_light_directional(
-            "/lamp", color=rgb(GROUND), intensity=2.0, cast_shadow=True, position=LAMP_PLACE
+            "/lamp",
+            color=rgb(GROUND),
+            intensity=2.0,
+            cast_shadow=True,
+            position=LAMP_PLACE,
         )
         self._controls(gui)
         self._rebuild()
@@ -84,9 +106,13 @@ class Page:
 
     def _controls(self, gui: viser.GuiApi) -> None:
         exploration = self.exploration
-        by_map = map_policy_names(find_models(exploration.systems[0].loaded["models"]).maps)
+        by_map = map_policy_names(
+            find_models(exploration.systems[0].loaded["models"]).maps
+        )
         policies = list(
-            dict.fromkeys([*exploration.policies, *bundled_policies(), *policy_names(), *by_map])
+            dict.fromkeys(
+                [*exploration.policies, *bundled_policies(), *policy_names(), *by_map]
+            )
         )
         self._policies = [NO_ANSWER, *policies]
         self._sensors = [CLEAN, *SENSORS, "mix"]
@@ -94,25 +120,50 @@ class Page:
         gui.main_panel.dock_left()
         gui.add_markdown(HELP)
         self._object = gui.add_dropdown(
-            "Object", list(exploration.objects), initial_value=exploration.shown.name
+            "Object",
+            list(exploration.objects),
+            initial_value=exploration.shown.name,
         )
-        self._label = gui.add_html("")  # and no Markdown: viser would take a name for HTML
-        self._policy = gui.add_dropdown("Policy", policies, initial_value=exploration.policies[0])
-        self._second = gui.add_dropdown("Compare with", self._policies, initial_value=second)
+        self._label = gui.add_html(
+            ""
+        )  # and no Markdown: viser would take a name for HTML
+        self._policy = gui.add_dropdown(
+            "Policy",
+            policies,
+            initial_value=exploration.policies[0],
+        )
+        self._second = gui.add_dropdown(
+            "Compare with",
+            self._policies,
+            initial_value=second,
+        )
         name, _, strength = (exploration.sensor or "").partition(":")
-        self._sensor = gui.add_dropdown("Sensor", self._sensors, initial_value=name or CLEAN)
+        self._sensor = gui.add_dropdown(
+            "Sensor",
+            self._sensors,
+            initial_value=name or CLEAN,
+        )
         given = float(strength or 1)
         self._strength = gui.add_slider(
-            "Noise strength", 0.0, max(4.0, given), 0.25, initial_value=given
+            "Noise strength",
+            0.0,
+            max(4.0, given),
+            0.25,
+            initial_value=given,
         )
-        self._hide = gui.add_checkbox("Only what was seen", initial_value=exploration.mesh is None)
+        self._hide = gui.add_checkbox(
+            "Only what was seen",
+            initial_value=exploration.mesh is None,
+        )
         step = gui.add_button("Take the next view")
         walk = gui.add_button("Go on until it is sure")
         restart = gui.add_button("Start over")
         self._preview = gui.add_html("", visible=False)
 
         def on(handle: Any, act: Callable[[], None]) -> None:
-            handle.on_update(lambda event: None if self._quiet else self._act(act, event.client))
+            handle.on_update(
+                lambda event: None if self._quiet else self._act(act, event.client)
+            )
 
         on(self._object, self._show_object)
         on(self._policy, self._use_policies)
@@ -120,10 +171,14 @@ class Page:
         on(self._sensor, self._use_sensor)
         on(self._strength, self._use_sensor)
         on(self._hide, self._draw)
-        step.on_click(lambda event: self._act(lambda: self._drawn(exploration.step), event.client))
+        step.on_click(
+            lambda event: self._act(lambda: self._drawn(exploration.step), event.client)
+        )
         walk.on_click(lambda event: self._walk(event.client))
         restart.on_click(
-            lambda event: self._act(lambda: self._changed(exploration.restart), event.client)
+            lambda event: self._act(
+                lambda: self._changed(exploration.restart), event.client
+            )
         )
 
     def _act(self, act: Callable[[], Any], client: viser.ClientHandle | None) -> Any:
@@ -137,9 +192,16 @@ class Page:
             except NextviewError as error:
                 with self._silence():
                     self._show_choices()
-                for one in [client] if client is not None else self.server.get_clients().values():
+                for one in (
+                    [client]
+                    if client is not None
+                    else self.server.get_clients().values()
+                ):
                     one.add_notification(
-                        "This cannot be done", str(error), color="red", auto_close_seconds=8
+                        "This cannot be done",
+                        str(error),
+                        color="red",
+                        auto_close_seconds=8,
                     )
                 return None
 
@@ -169,7 +231,9 @@ class Page:
         first = _listed(self._policy.value, self._policies[1:])
         second = _listed(self._second.value, self._policies)
         self._changed(
-            lambda: self.exploration.compare([first] if second == NO_ANSWER else [first, second])
+            lambda: self.exploration.compare(
+                [first] if second == NO_ANSWER else [first, second]
+            )
         )
 
     def _use_sensor(self) -> None:
@@ -189,7 +253,9 @@ class Page:
         return taken
 
     def _look(self, walk: int, where: int | Float) -> None:
-        self._act(lambda: self._drawn(lambda: self.exploration.walks[walk].look(where)), None)
+        self._act(
+            lambda: self._drawn(lambda: self.exploration.walks[walk].look(where)), None
+        )
 
     def _drag(self, walk: int, place: Float, let_go: bool) -> None:
         """Show a preview while a camera is dragged, and take the view where it is released."""
@@ -199,7 +265,8 @@ class Page:
         elif self._lock.acquire(blocking=False):
             try:
                 self._preview.content = preview_card(
-                    self.exploration.preview(place), self.exploration.walks[walk]
+                    self.exploration.preview(place),
+                    self.exploration.walks[walk],
                 )
                 self._preview.visible = True
             finally:
@@ -225,7 +292,15 @@ class Page:
             look = partial(self._look, k)
             drag = partial(self._drag, k)
             self._scenes.append(
-                WalkScene(self.server, f"/walk{k}", place, walk, self.exploration.mesh, look, drag)
+                WalkScene(
+                    self.server,
+                    f"/walk{k}",
+                    place,
+                    walk,
+                    self.exploration.mesh,
+                    look,
+                    drag,
+                )
             )
 
             panel = self.server.gui.add_panel()
@@ -253,7 +328,10 @@ class Page:
     def _draw(self) -> None:
         with self.server.atomic():
             for walk, scene, card in zip(
-                self.exploration.walks, self._scenes, self._cards, strict=True
+                self.exploration.walks,
+                self._scenes,
+                self._cards,
+                strict=True,
             ):
                 scene.draw(walk, bool(self._hide.value))
                 card.content = walk_card(walk)
@@ -282,7 +360,12 @@ def serve(host: str, port: int) -> viser.ViserServer:
     _check_address(host, port)
     plain = websocket.serve
 
-    def guarded(handler: Any, *address: Any, process_request: Any, **options: Any) -> Any:
+    def guarded(
+        handler: Any,
+        *address: Any,
+        process_request: Any,
+        **options: Any,
+    ) -> Any:
         def check(connection: Any, request: Any) -> Any:
             headers = request.headers
             reason = refused(headers.get_all("Host"), headers.get_all("Origin"), host)
@@ -297,7 +380,12 @@ def serve(host: str, port: int) -> viser.ViserServer:
     with _starting:  # viser has no option for a check of requests
         websocket.serve = guarded  # type: ignore[assignment, misc]
         try:
-            server = viser.ViserServer(host, port, label="nextview explore", verbose=False)
+            server = viser.ViserServer(
+                host,
+                port,
+                label="nextview explore",
+                verbose=False,
+            )
         finally:
             websocket.serve = plain  # type: ignore[misc]
     server.request_share_url = lambda verbose=True: None  # no visitor opens a tunnel
@@ -354,10 +442,14 @@ def _check_address(host: str, port: int) -> None:
         if not host:
             raise OSError("there is no name")
         family, kind, protocol, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM
+            host,
+            port,
+            type=socket.SOCK_STREAM,
         )[0]
         with socket.socket(family, kind, protocol) as tried:
             tried.bind(address)
     except (OSError, UnicodeError) as error:
         if getattr(error, "errno", None) != errno.EADDRINUSE:
-            raise UsageError(f"no page can be served at {host!r}, port {port} ({error})") from None
+            raise UsageError(
+                f"no page can be served at {host!r}, port {port} ({error})"
+            ) from None

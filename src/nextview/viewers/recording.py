@@ -88,17 +88,34 @@ class Recorder:
     def _log_place(self, step: int, view: "View") -> None:
         observation = view.observation
         height, width = observation.depth.shape
-        pose = rr.Transform3D(translation=observation.pose[:3, 3], mat3x3=observation.pose[:3, :3])
+        pose = rr.Transform3D(
+            translation=observation.pose[:3, 3],
+            mat3x3=observation.pose[:3, :3],
+        )
         how = {"camera_xyz": rr.ViewCoordinates.RDF, "image_plane_distance": 0.4}
         pinhole = rr.Pinhole(
-            image_from_camera=observation.intrinsics, resolution=(width, height), **how
+            image_from_camera=observation.intrinsics,
+            resolution=(width, height),
+            **how,
         )
+
         for name in (f"world/views/{step}", "world/camera"):
             self._stream.log(name, pose, pinhole)
-        points = observation.points if observation.seen else np.zeros((0, 3), np.float32)
-        self._stream.log(f"world/seen/{step}", rr.Points3D(points, colors=rgb(ACCENT), radii=0.006))
-        self._stream.log("world/camera/depth", rr.DepthImage(observation.depth, meter=1.0))
-        self._stream.log("world/camera/image", rr.Image(observation.picture, color_model="L"))
+        points = (
+            observation.points if observation.seen else np.zeros((0, 3), np.float32)
+        )
+        self._stream.log(
+            f"world/seen/{step}",
+            rr.Points3D(points, colors=rgb(ACCENT), radii=0.006),
+        )
+        self._stream.log(
+            "world/camera/depth",
+            rr.DepthImage(observation.depth, meter=1.0),
+        )
+        self._stream.log(
+            "world/camera/image",
+            rr.Image(observation.picture, color_model="L"),
+        )
 
     def _log_surface(self, session: "Session") -> None:
         """The scan of the thing that is believed most, where it was found."""
@@ -108,29 +125,42 @@ class Recorder:
                 self._stream.log("world/thing", rr.Clear(recursive=False))
             self._shows_surface = False
             return
+
         vertices, faces = posed
         colours = np.tile([*rgb(ACCENT), 90], (len(vertices), 1)).astype(np.uint8)
-        mesh = rr.Mesh3D(vertex_positions=vertices, triangle_indices=faces, vertex_colors=colours)
+        mesh = rr.Mesh3D(
+            vertex_positions=vertices,
+            triangle_indices=faces,
+            vertex_colors=colours,
+        )
         self._stream.log("world/thing", mesh)
         self._shows_surface = True
 
     def _log_belief(self, session: "Session", view: "View", step: int) -> None:
         for name, belief in zip(session.models.classes, view.belief, strict=True):
             self._stream.log(
-                f"belief/{rr.escape_entity_path_part(name)}", rr.Scalars(float(belief))
+                f"belief/{rr.escape_entity_path_part(name)}",
+                rr.Scalars(float(belief)),
             )
 
         self._stream.log("belief_now", rr.BarChart(view.belief))
         self._stream.log("this_view_alone", rr.BarChart(view.alone))
-        self._stream.log("threshold", rr.Scalars(float(session.stopping.threshold_at(step))))
+        self._stream.log(
+            "threshold",
+            rr.Scalars(float(session.stopping.threshold_at(step))),
+        )
         self._stream.log("travel/cells", rr.Scalars(view.travel))
         self._stream.log("travel/radians", rr.Scalars(view.arc))
 
         for name, values in view.maps.items():
-            self._stream.log(f"maps/{name}", rr.Tensor(values, dim_names=("ring", "azimuth")))
+            self._stream.log(
+                f"maps/{name}",
+                rr.Tensor(values, dim_names=("ring", "azimuth")),
+            )
         for warning in view.warnings:
             self._log_text(
-                f"step {step}: warning ({warning.name}): {warning.message}", rr.TextLogLevel.WARN
+                f"step {step}: warning ({warning.name}): {warning.message}",
+                rr.TextLogLevel.WARN,
             )
 
     def _log_choice(self, session: "Session", view: "View", step: int) -> None:
@@ -143,7 +173,11 @@ class Recorder:
         colours[visited] = rgb(INK)
         names = [f"view {k}" for k in range(len(places))]
         candidates = rr.Points3D(
-            places, colors=colours, radii=0.07, labels=names, show_labels=False
+            places,
+            colors=colours,
+            radii=0.07,
+            labels=names,
+            show_labels=False,
         )
         self._stream.log("world/candidates", candidates)
 
@@ -154,7 +188,11 @@ class Recorder:
         to = view.next_view
         self._stream.log(
             "world/next",
-            rr.Points3D(places[[] if to is None else [to]], colors=rgb(ACCENT), radii=0.1),
+            rr.Points3D(
+                places[[] if to is None else [to]],
+                colors=rgb(ACCENT),
+                radii=0.1,
+            ),
         )
 
         onward = "the end" if to is None else f"next view {to}"
@@ -171,15 +209,23 @@ class Recorder:
 def blueprint() -> rrb.Blueprint:
     """How the viewer arranges a recording at first."""
     camera = "world/camera"
-    bars = {"belief": "belief_now", "this view alone": "this_view_alone", "values": "values"}
+    bars = {
+        "belief": "belief_now",
+        "this view alone": "this_view_alone",
+        "values": "values",
+    }
 
     images = [
         rrb.Spatial2DView(origin=camera, contents=[f"{camera}/{k}"], name=k)
         for k in ("image", "depth")
     ]
-    charts = [rrb.BarChartView(origin=origin, name=name) for name, origin in bars.items()]
+    charts = [
+        rrb.BarChartView(origin=origin, name=name) for name, origin in bars.items()
+    ]
     belief = rrb.TimeSeriesView(
-        origin="/", contents=["belief/**", "threshold"], name="belief over the steps"
+        origin="/",
+        contents=["belief/**", "threshold"],
+        name="belief over the steps",
     )
 
     rows = images, charts, [belief, rrb.TimeSeriesView(origin="travel", name="travel")]
@@ -189,5 +235,7 @@ def blueprint() -> rrb.Blueprint:
     right = rrb.Vertical(*(rrb.Horizontal(*row) for row in rows))
 
     return rrb.Blueprint(
-        rrb.Horizontal(left, right), rrb.TimePanel(timeline=TIMELINE), collapse_panels=True
+        rrb.Horizontal(left, right),
+        rrb.TimePanel(timeline=TIMELINE),
+        collapse_panels=True,
     )

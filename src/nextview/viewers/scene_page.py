@@ -67,7 +67,10 @@ PANEL = f"""<style>
 
 
 def write_scene_page(
-    scene: Scene, path: str | Path, title: str = "On the table", overwrite: bool = False
+    scene: Scene,
+    path: str | Path,
+    title: str = "On the table",
+    overwrite: bool = False,
 ) -> None:
     """Write what a scene knows as a page: the scans in place, cameras, beliefs.
 
@@ -83,10 +86,14 @@ def write_scene_page(
         ResultsError: the page exists, or cannot be written.
     """
     if not scene.frames:
-        raise SessionError("there is nothing to show before the first frame: update with one")
+        raise SessionError(
+            "there is nothing to show before the first frame: update with one"
+        )
     if Path(path).suffix != ".html":
         raise UsageError(f"{path}: a page is called .html")
-    with redirect_stdout(StringIO()):  # viser would tell of a server that nobody is to open
+    with redirect_stdout(
+        StringIO()
+    ):  # viser would tell of a server that nobody is to open
         server = serve("127.0.0.1", 0)
         try:
             draw_scene_in_3d(server, scene)
@@ -95,7 +102,10 @@ def write_scene_page(
             server.stop()
     before, end, after = page.rpartition("</body>")
     with new_file(Path(path), overwrite) as part:
-        part.write_text(f"{before}{scene_card(scene, title)}{end}{after}", encoding="utf-8")
+        part.write_text(
+            f"{before}{scene_card(scene, title)}{end}{after}",
+            encoding="utf-8",
+        )
 
 
 def scene_card(scene: Scene, title: str) -> str:
@@ -131,7 +141,9 @@ def _object_card(thing: SceneObject) -> str:
     if thing.touches:
         where += f", touches {', '.join(str(number) for number in thing.touches)}"
 
-    beliefs = sorted(thing.result.beliefs.items(), key=lambda pair: -pair[1])[:PAGE_CANDIDATES]
+    beliefs = sorted(thing.result.beliefs.items(), key=lambda pair: -pair[1])[
+        :PAGE_CANDIDATES
+    ]
     rows = "".join(
         f'<tr><td>{escape(name.replace("_", " "))}</td><td><div class="bar">'
         f'<b style="width:{100 * belief:.1f}%;background:{colour}"></b></div></td>'
@@ -161,7 +173,9 @@ def draw_scene_in_3d(server: viser.ViserServer, scene: Scene) -> None:
     objects = scene.objects
     corners = [thing.seen_points for thing in objects]
     cameras = [frame.camera_to_world for frame in scene.frames]
-    everything = np.concatenate(corners) if corners else np.stack([c[:3, 3] for c in cameras])
+    everything = (
+        np.concatenate(corners) if corners else np.stack([c[:3, 3] for c in cameras])
+    )
     middle = (everything.min(0) + everything.max(0)) / 2
     radius = float(np.linalg.norm(everything - middle, axis=1).max()) + AROUND
 
@@ -170,10 +184,18 @@ def draw_scene_in_3d(server: viser.ViserServer, scene: Scene) -> None:
     three.configure_environment_map(None)
     three.configure_default_lights(False)
     three.add_light_hemisphere(
-        "/sky", sky_color=rgb(PAPER), ground_color=rgb(GROUND), intensity=3.0
+        "/sky",
+        sky_color=rgb(PAPER),
+        ground_color=rgb(GROUND),
+        intensity=3.0,
     )
     lamp = middle + radius * (3 * top.up + np.array([-1.0, -1.5, 0.0]))
-    three.add_light_directional("/lamp", color=(255, 255, 255), intensity=1.6, position=tuple(lamp))
+    three.add_light_directional(
+        "/lamp",
+        color=(255, 255, 255),
+        intensity=1.6,
+        position=tuple(lamp),
+    )
 
     _draw_table(server, scene, middle, radius)
     for thing in objects:
@@ -187,7 +209,12 @@ def draw_scene_in_3d(server: viser.ViserServer, scene: Scene) -> None:
     _look_at_it(server, scene, middle, radius)
 
 
-def _look_at_it(server: viser.ViserServer, scene: Scene, middle: Float, radius: float) -> None:
+def _look_at_it(
+    server: viser.ViserServer,
+    scene: Scene,
+    middle: Float,
+    radius: float,
+) -> None:
     """Look at it first from beside the last camera, farther away and above."""
     up = scene.tops[0].up
     back = scene.frames[-1].camera_to_world[:3, 3] - middle
@@ -200,7 +227,12 @@ def _look_at_it(server: viser.ViserServer, scene: Scene, middle: Float, radius: 
     server.initial_camera.look_at = tuple(middle)
 
 
-def _draw_table(server: viser.ViserServer, scene: Scene, middle: Float, radius: float) -> None:
+def _draw_table(
+    server: viser.ViserServer,
+    scene: Scene,
+    middle: Float,
+    radius: float,
+) -> None:
     """The plane on which all stands, as a disc."""
     top = scene.tops[0]
     normal = top.plane.normal
@@ -229,18 +261,34 @@ def _draw_object(server: viser.ViserServer, scene: Scene, thing: SceneObject) ->
             vertices,
             faces,
             color=colour,
-            opacity=HULL if thing.name == UNKNOWN_NAME else None if thing.confident else UNSURE,
+            opacity=HULL
+            if thing.name == UNKNOWN_NAME
+            else None
+            if thing.confident
+            else UNSURE,
             flat_shading=False,
             side="double",
         )
+
     if thing.name == UNKNOWN_NAME:
         points = points_of(scene, thing)
-        server.scene.add_point_cloud(f"{name}/seen", points, rgb(INK), point_size=0.0012)
+        server.scene.add_point_cloud(
+            f"{name}/seen",
+            points,
+            rgb(INK),
+            point_size=0.0012,
+        )
+
     top = thing.place + np.array([0.0, 0.0, thing.size[2] / 2 + 0.02])
     server.scene.add_label(f"{name}/name", named(thing), position=tuple(top))
 
 
-def _draw_frame(server: viser.ViserServer, scene: Scene, number: int, pose: Float) -> None:
+def _draw_frame(
+    server: viser.ViserServer,
+    scene: Scene,
+    number: int,
+    pose: Float,
+) -> None:
     """A camera where it stood, with its picture."""
     frame = scene.frames[number]
     height, width = frame.shape
@@ -258,4 +306,5 @@ def _draw_frame(server: viser.ViserServer, scene: Scene, number: int, pose: Floa
         position=tuple(pose[:3, 3]),
         line_width=1.5,
     )
+
     server.scene.add_label(f"/cameras/{number + 1}/number", str(number + 1))

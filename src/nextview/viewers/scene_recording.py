@@ -108,8 +108,13 @@ class SceneRecorder:
         points = seen_points(scene, number)
         cloud = rr.Points3D(points, colors=rgb(GREY), radii=0.0008)
         self._stream.log(f"world/seen/{number + 1}", cloud)
-        way = np.stack([each.camera_to_world[:3, 3] for each in scene.frames[: number + 1]])
-        self._stream.log("world/way", rr.LineStrips3D([way], colors=rgb(INK), radii=0.001))
+        way = np.stack(
+            [each.camera_to_world[:3, 3] for each in scene.frames[: number + 1]]
+        )
+        self._stream.log(
+            "world/way",
+            rr.LineStrips3D([way], colors=rgb(INK), radii=0.001),
+        )
 
     def _log_object(self, thing: SceneObject) -> None:
         """An object where it was found, its name, and the belief in it."""
@@ -119,13 +124,23 @@ class SceneRecorder:
             self._stream.log(name, rr.Clear(recursive=False))
         else:
             vertices, faces = shape
-            colours = np.tile([*rgb(colour_of(thing)), 255], (len(vertices), 1)).astype(np.uint8)
+            colours = np.tile([*rgb(colour_of(thing)), 255], (len(vertices), 1)).astype(
+                np.uint8
+            )
             mesh = rr.Mesh3D(
-                vertex_positions=vertices, triangle_indices=faces, vertex_colors=colours
+                vertex_positions=vertices,
+                triangle_indices=faces,
+                vertex_colors=colours,
             )
             self._stream.log(name, mesh)
+
         top = thing.place + np.array([0, 0, thing.size[2] / 2 + LABEL_ABOVE])
-        label = rr.Points3D([top], labels=[named(thing)], colors=rgb(colour_of(thing)), radii=0.002)
+        label = rr.Points3D(
+            [top],
+            labels=[named(thing)],
+            colors=rgb(colour_of(thing)),
+            radii=0.002,
+        )
         self._stream.log(f"{name}/name", label)
         if thing.name != UNKNOWN_NAME:
             entity = rr.escape_entity_path_part(f"{thing.number} {thing.name}")
@@ -135,7 +150,10 @@ class SceneRecorder:
         """Where to look next; nowhere once all is sure."""
         target = None if scene.done else scene.target
         places = np.zeros((0, 3)) if target is None else target[None, :3, 3]
-        self._stream.log("world/next", rr.Points3D(places, colors=rgb(ACCENT), radii=0.012))
+        self._stream.log(
+            "world/next",
+            rr.Points3D(places, colors=rgb(ACCENT), radii=0.012),
+        )
 
     def _log_text(self, scene: Scene) -> None:
         """What is known after the last frame, in words."""

@@ -19,7 +19,9 @@ with extras():
 
 BALL = 0.09  # radius of a candidate view, object radii
 TABLE_RADIUS = 2.4  # radius of what the object stands on
-SMOOTH = 10_000  # faces of a mesh from which its vertices are shaded, not its faces: scans
+SMOOTH = (
+    10_000  # faces of a mesh from which its vertices are shaded, not its faces: scans
+)
 
 
 class WalkScene:
@@ -42,7 +44,11 @@ class WalkScene:
         self._scene = server.scene
         self._name = name
         self._drag = drag
-        self.remove = server.scene.add_frame(name, show_axes=False, position=place).remove
+        self.remove = server.scene.add_frame(
+            name,
+            show_axes=False,
+            position=place,
+        ).remove
 
         self._drawn = 0
         self._object: viser.MeshHandle | None = None
@@ -70,10 +76,24 @@ class WalkScene:
         )
 
         places = walk.sphere.poses[:, :3, 3]
-        server.scene.add_line_segments(f"{name}/rings", _rings(places), rgb(FAINT), thickness=0.015)
-        plain: dict[str, Any] = {"subdivisions": 2, "cast_shadow": False, "receive_shadow": False}
+        server.scene.add_line_segments(
+            f"{name}/rings",
+            _rings(places),
+            rgb(FAINT),
+            thickness=0.015,
+        )
+        plain: dict[str, Any] = {
+            "subdivisions": 2,
+            "cast_shadow": False,
+            "receive_shadow": False,
+        }
         self._balls = [
-            server.scene.add_icosphere(f"{name}/views/{view}", BALL, position=place, **plain)
+            server.scene.add_icosphere(
+                f"{name}/views/{view}",
+                BALL,
+                position=place,
+                **plain,
+            )
             for view, place in enumerate(places)
         ]
         for view, ball in enumerate(self._balls):
@@ -106,7 +126,11 @@ class WalkScene:
         points = walk.points
         name = self._name
         self._scene.add_point_cloud(
-            f"{name}/seen", points, rgb(ACCENT), point_size=0.012, visible=len(points) > 0
+            f"{name}/seen",
+            points,
+            rgb(ACCENT),
+            point_size=0.012,
+            visible=len(points) > 0,
         )
         self._draw_path(walk)
 
@@ -131,9 +155,15 @@ class WalkScene:
 
     def _colour(self, walk: Walk) -> None:
         """Colour the candidates by value; visited ones dark and small, the next one large."""
-        values = np.full(len(walk.sphere), np.nan) if walk.values is None else walk.values.copy()
+        values = (
+            np.full(len(walk.sphere), np.nan)
+            if walk.values is None
+            else walk.values.copy()
+        )
         values[walk.visited] = np.nan
-        for view, (ball, colour) in enumerate(zip(self._balls, heat(values), strict=True)):
+        for view, (ball, colour) in enumerate(
+            zip(self._balls, heat(values), strict=True)
+        ):
             visited = view in walk.visited
             asked = view == walk.next_view
             ball.color = tuple(int(c) for c in colour)
@@ -154,12 +184,20 @@ class WalkScene:
         for step in range(self._drawn, len(places)):
             name = f"{self._name}/path/{step + 1}"
             self._scene.add_label(
-                f"{name}/number", str(step + 1), position=1.1 * distance * places[step]
+                f"{name}/number",
+                str(step + 1),
+                position=1.1 * distance * places[step],
             )
             if step:
                 line = distance * great_circle(places[step - 1], places[step])
                 segments = np.stack([line[:-1], line[1:]], 1)
-                self._scene.add_line_segments(f"{name}/way", segments, rgb(ACCENT), thickness=0.03)
+                self._scene.add_line_segments(
+                    f"{name}/way",
+                    segments,
+                    rgb(ACCENT),
+                    thickness=0.03,
+                )
+
         self._drawn = len(places)
 
 
@@ -172,6 +210,13 @@ def _rings(places: Float) -> Float32:
     heights = np.unique(np.round(places[:, 2], 3))
     heights = heights[: 0 if len(heights) > 12 else None]
     radius = np.sqrt(np.maximum((places[0] ** 2).sum() - heights**2, 0))[:, None]
-    height = np.broadcast_to(heights[:, None] - BALL, (len(heights), 97))  # the balls lie on them
+    height = np.broadcast_to(
+        heights[:, None] - BALL,
+        (len(heights), 97),
+    )  # the balls lie on them
     circles = np.stack([radius * np.cos(around), radius * np.sin(around), height], -1)
-    return np.stack([circles[:, :-1], circles[:, 1:]], 2).reshape(-1, 2, 3).astype(np.float32)
+    return (
+        np.stack([circles[:, :-1], circles[:, 1:]], 2)
+        .reshape(-1, 2, 3)
+        .astype(np.float32)
+    )
