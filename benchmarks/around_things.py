@@ -2,7 +2,7 @@
 own ways.
 
     python benchmarks/around_things.py ModelNet10 docs/images/around_things.png [--target chair_0917
-    --level heavy]
+        --level heavy]
 
 Each row is a session through a simulated depth camera: its views in order, with the share of the
 target that shows and what is believed after each; and the table from above, with the way of the

@@ -2,7 +2,7 @@
 pictures that lack a part.
 
     python benchmarks/conditions.py DATASET/ModelNet10 [--objects 150] [--models OLD modelnet10]
-    [--figure out.png]
+        [--figure out.png]
 
 "clean" is a render without a sensor. The next conditions are renders with one error each, of the
 strength that their name tells: depth noise and holes; a vertical that is wrong by 20 degrees, a

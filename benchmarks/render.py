@@ -1,8 +1,8 @@
 """Views a second from mesh files to a store on disk, beside the bare ray casts and other renderers,
 on the same meshes.
 
-    python benchmarks/render.py MODELNET10 [--objects 100] [--workers 2] [--python
-    RIVALS/bin/python]
+    python benchmarks/render.py MODELNET10 [--objects 100] [--workers 2]
+        [--python RIVALS/bin/python]
 
 Open3D and pyrender are no part of this project: give a Python that has them, and rows without one
 are reported as such. Every row runs in processes of its own, as many side by side as there are

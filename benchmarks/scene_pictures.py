@@ -1,7 +1,7 @@
 """Draw a contact sheet of scenes: one object at three levels, seen from some of the 40 views.
 
     python benchmarks/scene_pictures.py ModelNet10 docs/images/scenes.png [--target chair_0917
-    --seed 0]
+        --seed 0]
 
 The target is orange, what stands around it grey, the table light. Above each picture is the share
 of the target that shows; a view to which no camera can be brought is crossed out.

@@ -2,10 +2,13 @@
 are confused most.
 
     nextview render THINGS shown.zarr --sensor wrist --rotated --seed 7
-    nextview render THINGS again.zarr --sensor wrist --rotated --seed 7 --noise-seed 1     # the
-    same, with other errors nextview predict shown.zarr shown.npz --models MINE; nextview predict
-    again.zarr again.npz --models MINE python benchmarks/things.py MINE/memory.json things shown.npz
-    again.npz [--by-shape] [--policies MODULE:CLASS]
+    nextview render THINGS again.zarr --sensor wrist --rotated --seed 7 --noise-seed 1
+    nextview predict shown.zarr shown.npz --models MINE
+    nextview predict again.zarr again.npz --models MINE
+    python benchmarks/things.py MINE/memory.json things shown.npz again.npz [--by-shape]
+        [--policies MODULE:CLASS]
+
+The second store shows the same views with other errors of the sensor.
 
 Each predictions file is a draw of the sensor's noise: all are judged. Writes things.md (the table)
 and things.csv (every number) into the folder. The bootstrap is over things, whose runs and draws

@@ -1,7 +1,7 @@
 """Taught things recognised by features alone and verified by their geometry, at true size.
 
     python benchmarks/verified_things.py SCANS [--models ycb] [--draws 0 1] [--every 3] [--resting]
-    [--clutter 5] [--any-orientation] [--known even] [--save FOLDER]
+        [--clutter 5] [--any-orientation] [--known even] [--save FOLDER]
 
 SCANS holds the scans of the things that the memory knows, in metres, by their names: they are what
 is looked at. Surfaces, weights and views are those of the memory. Each draw shows every thing once,

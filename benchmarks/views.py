@@ -1,8 +1,8 @@
 """``nextview benchmark --views`` with a choice of policies and references of its own, and its
 figure.
 
-    python benchmarks/views.py test.npz views [--policies gain@0.01 ...] [--views 2 3 5] [--against
-    lem ...]
+    python benchmarks/views.py test.npz views [--policies gain@0.01 ...] [--views 2 3 5]
+        [--against lem ...]
 
 Writes views.md (the table), views.csv (every number in a row of its own) and front.png (accuracy
 against travel) into the folder, and prints the table. The gap is that between random and

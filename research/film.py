@@ -1,8 +1,9 @@
 """A film: twelve household things on a table, told apart by a wrist camera, beside one whose next
 views are random.
 
-    python -m research.film FOLDER OUT      # FOLDER: the YCB scans (NAME.ply, metres); OUT:
-    things.mp4, things.gif
+    python -m research.film FOLDER OUT
+
+FOLDER holds the YCB scans (NAME.ply, metres); OUT receives things.mp4 and things.gif.
 
 The things are the six pairs of scans whose surfaces are most alike, see
 ``benchmark.confusable``, no thing twice: the rule is printed with its result. They stand at their

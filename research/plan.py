@@ -2,7 +2,7 @@
 into a store.
 
     python -m research.plan views.zarr research.volumetric:Volumetric research.volumetric:coverage
-    [--split test]
+        [--split test]
 
 The replay of predictions holds no depth. But the way of such a policy depends on nothing else: not
 on what the models say, nor on a threshold. So it is found once, by the episode loop itself, and the

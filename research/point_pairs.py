@@ -1,7 +1,7 @@
 """Point-pair features as a recogniser of taught things, on the same frames as the package's own.
 
     python -m research.point_pairs YCB [--things mug bowl ...] [--draws 1 2 3] [--every 1]
-    [--resting] [--any-orientation]
+        [--resting] [--any-orientation]
 
 Drost et al., "Model globally, match locally: Efficient and robust 3D object recognition", CVPR
 2010, as OpenCV's contributed module ``ppf_match_3d`` has it: ``pip install './research[ppf]'``. Its

@@ -2,7 +2,7 @@
 what they say.
 
     python -m research.thing_features data/ModelNet10 efficientnet-lite0-57934424.pth features
-    [--things 600]
+        [--things 600]
 
 The networks are the two of the bundled recogniser and an EfficientNet-Lite0 with the weights of
 ImageNet. The projection to 256 numbers begins as a linear discriminant of the same view without and
