@@ -236,6 +236,8 @@ def outlook_of(belief, taken=1) -> Outlook:
         weights=EvidenceWeights(),
         pixels=PixelModel(),
         prior=RegistrationPrior(),
+        likeliest=start(np.array([0]), np.eye(3)[None], 0),
+        views=(),
     )
 
 
@@ -277,7 +279,7 @@ def test_the_policy_goes_where_the_knob_shows_and_can_be_reached():
 
 @pytest.mark.parametrize("near", [1, 7])
 def test_among_views_that_are_worth_the_same_the_nearer_one_is_taken(near, monkeypatch):
-    def the_same(outlook, cameras):
+    def the_same(outlook, cameras, goal):
         divergence = np.tile(5.0 * (1 - np.eye(2)), (len(cameras), 1, 1))
         some = np.ones(len(divergence))
         return ExpectedViews(outlook.hypotheses, divergence, divergence, some, 0 * some)

@@ -322,11 +322,13 @@ def test_foresight_goes_where_the_truth_is_believed_most():
 # Statistics
 
 
-def runs_of(thing, right, confidence, views, draw=0, policy="random"):
+def runs_of(thing, right, confidence, views, p_value=None, policy="random"):
     pose = [1.0 if each else None for each in right]
     times = [0.01] * (len(views) - 1)
-    made = ThingRun(views, right, confidence, times, [0.1] * len(views), pose)
-    return EpisodeRuns(thing, draw, {policy: [made]})
+    explained = p_value or [None] * len(views)
+    spent = [0.1] * len(views)
+    made = ThingRun(views, right, confidence, explained, times, spent, pose)
+    return EpisodeRuns(thing, 0, {policy: [made]})
 
 
 def both(thing, random, other):
@@ -335,6 +337,23 @@ def both(thing, random, other):
     for policy, given in (("random", random), ("spread", other)):
         runs |= runs_of(thing, *given, policy=policy).runs
     return EpisodeRuns(thing, 0, runs)
+
+
+def test_what_is_explained_badly_is_not_sure_as_in_a_session():
+    episode = runs_of(
+        "a_x",
+        [False, True, True],
+        [0.99, 0.99, 0.99],
+        [0, 4, 1],
+        p_value=[0.05, 0.3, 0.01],
+    )
+    alike = Alikeness(("a_x",), ("a_x",), np.array([np.inf]))
+    how = Compared(("random",), (1, 2, 3), 0.97, False, 100)
+    measures = summarise_things([episode], alike, how).measures
+    values = measures.set_index("measure")["value"]
+    assert values["views until sure"] == 2
+    assert values["sure"] == 1
+    assert values["wrong, of the sure"] == 0
 
 
 def test_measures_are_those_of_a_hand_count():

@@ -5,24 +5,21 @@ A folder of results holds ``episodes``, all that was sensed and verified, a fold
 says how it was run; and the tables and figures, which every run writes anew.
 """
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache, partial
 from pathlib import Path
-from zlib import crc32
 
 import msgspec
 import numpy as np
 
-from nextview.benchmark.confusable import how_alike
+from nextview.benchmark.confusable import Alikeness, how_alike
 from nextview.benchmark.thing_episodes import (
     EPISODE_SPHERE,
     Occlusion,
     Setting,
-    ThingEpisode,
 )
+from nextview.benchmark.thing_jobs import ThingJob, opened, work
 from nextview.benchmark.thing_policies import THING_POLICIES, policies_of
-from nextview.benchmark.thing_replay import EpisodeRuns, ThingRun, policies_in, run
+from nextview.benchmark.thing_replay import EpisodeRuns, policies_in
 from nextview.benchmark.thing_results import write_results
 from nextview.benchmark.thing_tables import Compared, ThingTables, summarise_things
 from nextview.checks import number, whole
@@ -30,17 +27,15 @@ from nextview.data import pool
 from nextview.data.progress import TrackProgress, silently
 from nextview.errors import DatasetError, ResultsError, UsageError
 from nextview.files import check_new, command, only_one, read_record, write_record
-from nextview.geometry.mesh import UNITS, Mesh, load_mesh
-from nextview.policies.base import Policy
-from nextview.recognition.model_card import find_models
+from nextview.geometry.mesh import UNITS
 from nextview.simulation.sensor import sensor_named
 from nextview.teaching.learn import learn_things
 from nextview.teaching.thing_sources import find_things
 from nextview.teaching.thing_views import TeachingOptions
-from nextview.things.memory import TaughtRecogniser
 from nextview.things.taught import TaughtThings
 
 EPISODES_FILE = "episodes.json"  # how the episodes of a folder are shown
+ALIKE_FILE = "alike.json"  # how alike the things of the memory are
 MEMORY = "memory"  # folder of what is taught, where no models are given
 
 
@@ -58,7 +53,8 @@ class ThingSettings:
         views: numbers of views after which the policies are compared; episodes have the largest.
         policies: names, or MODULE:CLASS for your own; all by default. Only missing results are
             computed; your own policies always run again.
-        threshold: belief from which an answer counts as confident.
+        threshold: belief from which an answer counts as confident, unless the thing is explained
+            worse than nine in ten known ones: then a session goes on, too.
         repeats: runs of the policy random in each episode.
         unit: unit of length of the scan files.
         families: things whose names are equal up to the first _, such as variants of one scan, are
@@ -111,37 +107,6 @@ class _Made(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     views: int
     repeats: int
     seed: int
-
-
-@dataclass(frozen=True)
-class _Job:
-    """One episode, and the policies that are replayed in it."""
-
-    models: str
-    scan: Path
-    unit: str
-    thing: int
-    draw: int
-    setting: Setting
-    views: int
-    repeats: int
-    policies: tuple[str, ...]
-    out: Path
-
-    @property
-    def name(self) -> str:
-        """Of its files."""
-        return f"{self.thing:04d}_{self.draw:02d}"
-
-    @property
-    def scan_name(self) -> str:
-        """Of the thing."""
-        return self.scan.stem
-
-    @property
-    def runs_file(self) -> Path:
-        """Where its runs are written."""
-        return self.out / "runs" / f"{self.name}.json"
 
 
 def benchmark_things(
@@ -199,7 +164,7 @@ def benchmark_things(
             read_record(job.runs_file, EpisodeRuns, "runs", ResultsError)
             for job in jobs
         ]
-        alike = how_alike(things).of({job.scan_name for job in jobs})
+        alike = _alike(out, things).of({job.scan_name for job in jobs})
         how = Compared(
             policies_in(runs),
             settings.views,
@@ -242,22 +207,6 @@ def _taught(
     return str(memory)
 
 
-@lru_cache(maxsize=1)
-def opened(models: str) -> TaughtThings:
-    """The things of a memory whose geometry is known.
-
-    Raises:
-        UsageError: it knows the geometry of none.
-    """
-    recogniser = TaughtRecogniser(find_models(models).recogniser, threads=1)
-    things = TaughtThings.of(recogniser)
-    if things is None:
-        raise UsageError(
-            f"{models}: knows the geometry of no thing; teach it with --unit"
-        )
-    return things
-
-
 def _check_same(out: Path, settings: ThingSettings, things: TaughtThings) -> None:
     """See that episodes which are there are of the same memory, sensor and seed."""
     made = _Made(
@@ -283,18 +232,48 @@ def _check_same(out: Path, settings: ThingSettings, things: TaughtThings) -> Non
             )
 
 
+class _Alike(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How alike the things of a memory are, see ``Alikeness``.
+
+    Attributes:
+        nearest: name of the thing that is most like each.
+        distance: of the two surfaces; None for infinity.
+    """
+
+    nearest: tuple[str, ...]
+    distance: tuple[float | None, ...]
+
+
+def _alike(out: Path, things: TaughtThings) -> Alikeness:
+    """How alike the things are. It takes seconds, and is the same for all runs of a folder."""
+    file = out / ALIKE_FILE
+    if not file.exists():
+        found = how_alike(things)
+        distance = [
+            apart if apart < np.inf else None for apart in found.distance.tolist()
+        ]
+        write_record(file, _Alike(found.nearest, tuple(distance)))
+        return found
+
+    kept = read_record(file, _Alike, "how alike things are", ResultsError)
+    distances = np.array(
+        [np.inf if apart is None else apart for apart in kept.distance]
+    )
+    return Alikeness(things.names, kept.nearest, distances)
+
+
 def _jobs(
     models: str,
     scans: dict[str, Path],
     out: Path,
     settings: ThingSettings,
     things: TaughtThings,
-) -> list[_Job]:
+) -> list[ThingJob]:
     """All episodes of a run."""
     setting = Setting(settings.sensor, settings.occlusion, settings.seed)
 
     return [
-        _Job(
+        ThingJob(
             models=models,
             scan=scans[name],
             unit=settings.unit,
@@ -312,60 +291,10 @@ def _jobs(
     ]
 
 
-def _left(job: _Job) -> _Job | None:
+def _left(job: ThingJob) -> ThingJob | None:
     """The job with the policies that are not done; None if all are. Your own are done anew."""
     if not job.runs_file.exists():
         return job
     done = read_record(job.runs_file, EpisodeRuns, "runs", ResultsError).runs
     left = tuple(name for name in job.policies if name not in done or ":" in name)
     return replace(job, policies=left) if left else None
-
-
-def work(job: _Job) -> None:
-    """Replay the policies of a job, and write down what they made of it."""
-    things = opened(job.models)
-    chosen = policies_of(job.policies, things)
-    folder = job.out / "episodes" / job.name
-    episode = ThingEpisode(
-        things,
-        partial(_mesh, job.scan, job.unit),
-        job.thing,
-        job.draw,
-        job.setting,
-        folder,
-    )
-    runs: dict[str, list[ThingRun]] = {}
-    if job.runs_file.exists():
-        runs |= read_record(job.runs_file, EpisodeRuns, "runs", ResultsError).runs
-    # Foresight verifies what others need, too.
-    for name in sorted(job.policies, key=lambda name: name != "foresight"):
-        runs[name] = replayed(episode, name, chosen[name], job)
-    episode.save()
-    job.runs_file.parent.mkdir(parents=True, exist_ok=True)
-    done = EpisodeRuns(things.names[job.thing], job.draw, runs)
-    write_record(job.runs_file, done, overwrite=True)
-
-
-def _mesh(scan: Path, unit: str) -> Mesh:
-    return load_mesh(scan, unit=unit)
-
-
-def replayed(
-    episode: ThingEpisode,
-    name: str,
-    make: Callable[[ThingEpisode], Policy],
-    job: _Job,
-) -> list[ThingRun]:
-    """The runs of one policy in one episode.
-
-    Args:
-        episode: what is sensed and verified.
-        name: of the policy.
-        make: the policy for an episode.
-        job: starts, views and rules of all episodes.
-    """
-    rng = np.random.default_rng(
-        (job.setting.seed, job.thing, job.draw, crc32(name.encode()))
-    )
-    times = job.repeats if name == "random" else 1
-    return [run(episode, make(episode), job.views, rng) for _ in range(times)]

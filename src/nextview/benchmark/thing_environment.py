@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from nextview.benchmark.environments import Rules, rows
-from nextview.benchmark.thing_benchmark import opened
 from nextview.benchmark.thing_episodes import (
     EPISODE_SPHERE,
     Occlusion,
     Setting,
     ThingEpisode,
 )
+from nextview.benchmark.thing_jobs import opened
 from nextview.checks import extras, whole
 from nextview.errors import DatasetError, SessionError
 from nextview.geometry.mesh import load_mesh

@@ -117,7 +117,12 @@ class ThingEpisode:
     def stage(self) -> "_Stage":
         """The thing as it stands before the camera."""
         if self._stage is None:
-            self._stage = _Stage.of(self._mesh(), self._setting, self._seed)
+            self._stage = _Stage.of(
+                self._mesh(),
+                self._setting,
+                self._seed,
+                self._kept,
+            )
         return self._stage
 
     def _first_view(self) -> int:
@@ -186,6 +191,11 @@ class ThingEpisode:
     def belief_in_truth(self, views: Sequence[int]) -> float:
         """Belief in the true thing after some views."""
         return float(self.verified(views)[0].belief[self.thing])
+
+    def p_value(self, views: Sequence[int]) -> float | None:
+        """Share of known things that are explained as badly, see ``TaughtThings.p_value``."""
+        observations = [self.observation(view) for view in sorted(self.seen(views))]
+        return self.things.p_value(observations, self.verified(views)[0])
 
     def pose_error(self, views: Sequence[int]) -> float | None:
         """How far the surface is from where it is found (ADD-S), millimetres, in the last view.
@@ -288,13 +298,20 @@ class _Stage:
     in_truth: Float
 
     @classmethod
-    def of(cls, mesh: Mesh, setting: Setting, seed: tuple[int, ...]) -> "_Stage":
+    def of(
+        cls,
+        mesh: Mesh,
+        setting: Setting,
+        seed: tuple[int, ...],
+        kept: "KeptArrays",
+    ) -> "_Stage":
         """Turn a thing, draw its sensor and what stands around it.
 
         Args:
             mesh: the thing, metres.
             setting: sensor, distance and occlusion.
             seed: of all draws of the episode.
+            kept: where the boxes are kept: they are searched for.
         """
         rng = np.random.default_rng(seed)
         turn = rotation_z(rng.uniform(0, 2 * np.pi))
@@ -309,11 +326,13 @@ class _Stage:
         in_truth[:3, 3] = -(turn @ mesh.centre + standing.centre)
         around = None
         if setting.occlusion != "none":
-            around = hiding_boxes(
-                standing,
-                VISIBLE_SHARES[setting.occlusion],
-                (*seed, 2),
-            )
+            if "boxes.vertices" not in kept:
+                share = VISIBLE_SHARES[setting.occlusion]
+                found = hiding_boxes(standing, share, (*seed, 2))
+                kept["boxes.vertices"] = found.vertices
+                kept["boxes.faces"] = found.faces
+            corners = kept["boxes.vertices"]
+            around = Mesh(corners, kept["boxes.faces"], np.zeros(3), 1.0, "boxes")
 
         return cls(standing, around, sensor, (*seed, 7), in_truth)
 

@@ -20,6 +20,8 @@ class ThingRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         views: that it took.
         right: whether the thing is named right after each.
         confidence: belief in the answer after each.
+        p_value: share of known things that are explained as badly after each; None where that was
+            not fitted.
         decision: seconds of CPU of each choice.
         verification: seconds of CPU of each verification.
         pose_error: mean distance of the surface (ADD-S), millimetres, after each; None where the
@@ -29,6 +31,7 @@ class ThingRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     views: list[int]
     right: list[bool]
     confidence: list[float]
+    p_value: list[float | None]
     decision: list[float]
     verification: list[float]
     pose_error: list[float | None]
@@ -67,14 +70,14 @@ def run(
     """
     views = [episode.start]
     made: dict[str, list[Any]] = {
-        name: []
-        for name in ("right", "confidence", "decision", "verification", "pose_error")
+        name: [] for name in ThingRun.__struct_fields__ if name != "views"
     }
 
     while True:
         found, seconds = episode.verified(views)
         made["right"].append(int(found.belief.argmax()) == episode.thing)
         made["confidence"].append(float(found.belief.max()))
+        made["p_value"].append(episode.p_value(views))
         made["verification"].append(seconds)
         made["pose_error"].append(episode.pose_error(views))
         if len(views) == count:

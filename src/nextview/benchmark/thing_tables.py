@@ -11,6 +11,8 @@ from nextview.benchmark.thing_episodes import EPISODE_SPHERE
 from nextview.benchmark.thing_policies import CEILINGS
 from nextview.benchmark.thing_replay import EpisodeRuns, ThingRun
 from nextview.checks import extras
+from nextview.session.result import SUSPICIOUS
+from nextview.session.system import UNKNOWN_ALPHA
 from nextview.types import Float, Index, Mask
 
 with extras():
@@ -71,7 +73,8 @@ class _Runs:
         things: whose they are, (R,) int64.
         weight: of each: together 1 for each thing, (R,).
         right: after each view, (R, K) float64.
-        sure: whether it was ever sure, (R,) float64.
+        sure: whether it was ever sure, as a session is: it believes, and the thing is explained no
+            worse than known things usually are, (R,) float64.
         wrong: whether it was sure and wrong, (R,) float64.
         until: views until it was sure; all if it never was, (R,).
         travel: radians on the sphere up to each view, (R, K).
@@ -101,7 +104,12 @@ class _Runs:
         """
         things = np.array([thing for thing, _ in runs])
         right = np.array([each.right for _, each in runs], np.float64)
-        sure = np.array([each.confidence for _, each in runs], np.float64) >= threshold
+        believed = np.array([each.confidence for _, each in runs], np.float64)
+        explained = np.array([each.p_value for _, each in runs], np.float64)
+        suspicious = (
+            explained < SUSPICIOUS * UNKNOWN_ALPHA
+        )  # False where it is not known
+        sure = (believed >= threshold) & ~suspicious
         ever = sure.any(1)
         last = np.where(ever, sure.argmax(1), sure.shape[1] - 1)
         rows = np.arange(len(runs))

@@ -86,7 +86,8 @@ class DiscriminateGeometry:
         information = np.zeros(len(some))
         found = np.ones(len(some))
         if outlook is not None:
-            expected = outlook.expect(outlook.cameras(self.viewpoints.directions[some]))
+            cameras = outlook.cameras(self.viewpoints.directions[some])
+            expected = outlook.expect(cameras, self.goal)
             information = expected.worth(self.goal)
             found = expected.found
         best = information.max()

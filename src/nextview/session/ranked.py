@@ -107,7 +107,7 @@ def rank_views(
 
     cameras = inside.copy()
     cameras[:, :3, 3] *= radius
-    expected = outlook.expect(cameras)
+    expected = outlook.expect(cameras, goal)
     worth = expected.worth(goal)
     information = expected.information(goal)
     most = expected.entropy(goal)

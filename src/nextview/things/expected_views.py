@@ -8,6 +8,7 @@ how far apart the verifier will find them.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -28,7 +29,11 @@ from nextview.things.expected_likelihood import (
 )
 from nextview.things.expected_pose import sharper_poses
 from nextview.things.leading import Hypotheses
-from nextview.things.registration import RegistrationPrior, pose_covariances
+from nextview.things.registration import (
+    Alignment,
+    RegistrationPrior,
+    pose_covariances,
+)
 from nextview.things.surface import SurfaceCaster
 from nextview.things.verification import PixelModel
 from nextview.things.verifier import Verified, Verifier
@@ -57,8 +62,8 @@ class ExpectedViews:
             more than the noise, (V, H, H) float64.
         found: share of the information that each view is trusted to give, (V,) float64, 0 to 1. The
             fewer pixels show the thing, the sooner it is missed.
-        sharper: see ``expected_pose.sharper_poses``, (V,) float64; zeros where it is not known how
-            well the pose is known.
+        sharper: see ``expected_pose.sharper_poses``, (V,) float64; zeros where it was not asked
+            for.
     """
 
     hypotheses: Hypotheses
@@ -193,7 +198,8 @@ def expected_views(
         pixels: how a pixel is judged.
         prior: by how much a hypothesis and a camera may still be moved when the view is there.
         side: rows and columns of the rendered images.
-        covariance: of turn and place of the first hypothesis, (6, 6); None if it is not known.
+        covariance: of turn and place of the first hypothesis, (6, 6), where it is asked how much
+            better its pose will be known.
 
     Returns:
         What each view would tell of each pair of hypotheses.
@@ -258,8 +264,8 @@ class Outlook:
         weights: how much geometry counts.
         pixels: how a pixel is judged.
         prior: by how much a hypothesis and a camera may still be moved.
-        covariance: of turn and place of the first hypothesis by the views so far, (6, 6); None if
-            it is not known.
+        likeliest: the first hypothesis, as it was aligned.
+        views: those so far, as it was aligned with them.
     """
 
     caster: SurfaceCaster
@@ -271,7 +277,8 @@ class Outlook:
     weights: EvidenceWeights
     pixels: PixelModel
     prior: RegistrationPrior
-    covariance: Float | None = None
+    likeliest: Alignment
+    views: tuple[DepthView, ...]
 
     @classmethod
     def of(
@@ -298,6 +305,7 @@ class Outlook:
         sensor = ExpectedSensor.of([view for _, view in seen])
         hypotheses = Hypotheses.leading(verified)
         used = [each for each, _ in seen]
+        row = np.flatnonzero(verified.things == hypotheses.things[0])[:1]
 
         return cls(
             caster=verifier.caster,
@@ -309,13 +317,15 @@ class Outlook:
             weights=verifier.weights,
             pixels=verifier.pixels,
             prior=verifier.prior,
-            covariance=_covariance(
-                verifier,
-                verified,
-                [view for _, view in seen],
-                hypotheses,
-            ),
+            likeliest=verified.alignment(row, verifier),
+            views=tuple(view for _, view in seen),
         )
+
+    @cached_property
+    def covariance(self) -> Float:
+        """Of turn and place of the first hypothesis by the views so far, (6, 6) float64."""
+        found = pose_covariances(self.caster, self.likeliest, self.views, self.prior)
+        return found[0]
 
     @property
     def distance(self) -> float:
@@ -376,11 +386,12 @@ class Outlook:
             different.reshape(side, side),
         )
 
-    def expect(self, cameras: Float) -> ExpectedViews:
+    def expect(self, cameras: Float, goal: Goal = "thing") -> ExpectedViews:
         """Expect what views from some cameras would tell.
 
         Args:
             cameras: camera-to-world poses, (V, 4, 4), object frame, metres.
+            goal: for the pose it is also asked how much better it will be known.
         """
         return expected_views(
             self.caster,
@@ -392,17 +403,5 @@ class Outlook:
             self.weights,
             self.pixels,
             self.prior,
-            covariance=self.covariance,
+            covariance=self.covariance if goal == "pose" else None,
         )
-
-
-def _covariance(
-    verifier: Verifier,
-    verified: Verified,
-    views: Sequence[DepthView],
-    hypotheses: Hypotheses,
-) -> Float:
-    """Covariance of turn and place of the first of the leading hypotheses, (6, 6)."""
-    row = np.flatnonzero(verified.things == hypotheses.things[0])[:1]
-    alignment = verified.alignment(row, verifier)
-    return pose_covariances(verifier.caster, alignment, views, verifier.prior)[0]

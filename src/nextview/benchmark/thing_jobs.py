@@ -1,0 +1,133 @@
+"""One episode of the benchmark of things, and the policies that are replayed in it.
+
+Workers import this module, and so neither pandas nor matplotlib.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from zlib import crc32
+
+import numpy as np
+
+from nextview.benchmark.thing_episodes import Setting, ThingEpisode
+from nextview.benchmark.thing_policies import policies_of
+from nextview.benchmark.thing_replay import EpisodeRuns, ThingRun, run
+from nextview.errors import ResultsError, UsageError
+from nextview.files import read_record, write_record
+from nextview.geometry.mesh import Mesh, load_mesh
+from nextview.policies.base import Policy
+from nextview.recognition.model_card import find_models
+from nextview.things.memory import TaughtRecogniser
+from nextview.things.taught import TaughtThings
+
+
+@dataclass(frozen=True)
+class ThingJob:
+    """One episode, and the policies that are replayed in it.
+
+    Attributes:
+        models: name or folder of the memory.
+        scan: file of the thing.
+        unit: of its length.
+        thing: number of the thing.
+        draw: number of the draw.
+        setting: how it is shown.
+        views: how many each policy takes.
+        repeats: runs of the policy random.
+        policies: names.
+        out: folder of the results.
+    """
+
+    models: str
+    scan: Path
+    unit: str
+    thing: int
+    draw: int
+    setting: Setting
+    views: int
+    repeats: int
+    policies: tuple[str, ...]
+    out: Path
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return f"{self.thing:04d}_{self.draw:02d}"
+
+    @property
+    def scan_name(self) -> str:
+        """Of the thing."""
+        return self.scan.stem
+
+    @property
+    def runs_file(self) -> Path:
+        """Where its runs are written."""
+        return self.out / "runs" / f"{self.name}.json"
+
+
+@lru_cache(maxsize=1)
+def opened(models: str) -> TaughtThings:
+    """The things of a memory whose geometry is known.
+
+    Raises:
+        UsageError: it knows the geometry of none.
+    """
+    recogniser = TaughtRecogniser(find_models(models).recogniser, threads=1)
+    things = TaughtThings.of(recogniser)
+    if things is None:
+        raise UsageError(
+            f"{models}: knows the geometry of no thing; teach it with --unit"
+        )
+    return things
+
+
+def work(job: ThingJob) -> None:
+    """Replay the policies of a job, and write down what they made of it."""
+    things = opened(job.models)
+    chosen = policies_of(job.policies, things)
+    folder = job.out / "episodes" / job.name
+    episode = ThingEpisode(
+        things,
+        partial(_mesh, job.scan, job.unit),
+        job.thing,
+        job.draw,
+        job.setting,
+        folder,
+    )
+    runs: dict[str, list[ThingRun]] = {}
+    if job.runs_file.exists():
+        runs |= read_record(job.runs_file, EpisodeRuns, "runs", ResultsError).runs
+    # Foresight verifies what others need, too.
+    for name in sorted(job.policies, key=lambda name: name != "foresight"):
+        runs[name] = replayed(episode, name, chosen[name], job)
+    episode.save()
+    job.runs_file.parent.mkdir(parents=True, exist_ok=True)
+    done = EpisodeRuns(things.names[job.thing], job.draw, runs)
+    write_record(job.runs_file, done, overwrite=True)
+
+
+def _mesh(scan: Path, unit: str) -> Mesh:
+    return load_mesh(scan, unit=unit)
+
+
+def replayed(
+    episode: ThingEpisode,
+    name: str,
+    make: Callable[[ThingEpisode], Policy],
+    job: ThingJob,
+) -> list[ThingRun]:
+    """The runs of one policy in one episode.
+
+    Args:
+        episode: what is sensed and verified.
+        name: of the policy.
+        make: the policy for an episode.
+        job: starts, views and rules of all episodes.
+    """
+    rng = np.random.default_rng(
+        (job.setting.seed, job.thing, job.draw, crc32(name.encode()))
+    )
+    times = job.repeats if name == "random" else 1
+    return [run(episode, make(episode), job.views, rng) for _ in range(times)]
