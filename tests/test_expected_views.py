@@ -29,7 +29,11 @@ from nextview.things.expected_views import ExpectedViews, Outlook, expected_view
 from nextview.things.leading import Hypotheses
 from nextview.things.registration import RegistrationPrior, render, start
 from nextview.things.surface import Surface, SurfaceCaster
-from nextview.things.unseen_space import MeasuredDepth, chance_of_sight
+from nextview.things.unseen_space import (
+    UNSEEN_FILLED,
+    MeasuredDepth,
+    chance_of_sight,
+)
 from nextview.things.verification import PixelModel, likelihood
 from nextview.things.verifier import Verifier
 from nextview.things.weighing import EvidenceWeights
@@ -432,27 +436,41 @@ def half_a_wall() -> MeasuredDepth:
     return MeasuredDepth(depth, pose, np.array([[60.0, 0, 32], [0, 60, 32], [0, 0, 1]]))
 
 
-def lines_from(*sides: float) -> tuple[np.ndarray, np.ndarray]:
-    """Lines of sight that end at the origin, from cameras on the side of +y or -y."""
+def lines_from(*sides: float, height: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Level lines of sight that end on the z axis, from cameras on the side of +y or -y."""
     rays = np.array([[[0.0, -side, 0.0]] for side in sides], np.float32)
-    return np.zeros_like(rays), rays
+    return np.full_like(rays, (0, 0, height)), rays
 
 
 def test_a_line_of_sight_through_space_that_no_view_looked_into_may_be_blocked():
     ends, rays = lines_from(1.0, -1.0, -1.0)
     blocked = np.array([[False], [False], [True]])
-    sight = chance_of_sight([half_a_wall()], ends, rays, blocked, 0.15, 1.0)
+    sight = chance_of_sight([half_a_wall()], ends, rays, blocked, 0.15, -1.0, 1.0)
     assert sight[1, 0] == 1  # the camera looked through all of it
-    # One line is blocked and 15 cm are known to be free: so often it happens in the other 15 cm.
-    assert sight[0, 0] == pytest.approx(np.exp(-1), rel=0.15)
+    # One line is blocked and 15 cm are known to be free; the other 15 cm are filled oftener.
+    assert -np.log(sight[0, 0]) == pytest.approx(UNSEEN_FILLED, rel=0.15)
+
+
+def test_a_low_line_of_sight_is_blocked_more_often_than_a_high_one():
+    known = lines_from(-1.0, -1.0)
+    blocked = np.array([[False], [False], [True]])
+    lost = []
+    for height in (0.0, 0.05):  # half as high as what stands around, and three quarters
+        ends, rays = lines_from(1.0, height=height)
+        lines = np.concatenate([ends, known[0]]), np.concatenate([rays, known[1]])
+        sight = chance_of_sight([half_a_wall()], *lines, blocked, 0.15, -0.1, 0.1)
+        lost.append(-np.log(sight[0, 0]))
+    assert lost[1] == pytest.approx(lost[0] / 2, rel=0.15)
 
 
 def test_nothing_is_expected_where_nothing_stands_or_above_what_stands():
     ends, rays = lines_from(1.0, -1.0, -1.0)
     alone = np.zeros((3, 1), bool)
-    assert (chance_of_sight([half_a_wall()], ends, rays, alone, 0.15, 1.0) == 1).all()
+    assert (
+        chance_of_sight([half_a_wall()], ends, rays, alone, 0.15, -1.0, 1.0) == 1
+    ).all()
     blocked = np.array([[False], [False], [True]])
-    above = chance_of_sight([half_a_wall()], ends, rays, blocked, 0.15, -0.05)
+    above = chance_of_sight([half_a_wall()], ends, rays, blocked, 0.15, -1.0, -0.05)
     assert above[0, 0] == 1
 
 

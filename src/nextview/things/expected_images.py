@@ -26,7 +26,7 @@ OWN_MARGIN = 0.005  # metres around the thing, within which a point may be its o
 OBSTACLE_REACH = 4.0  # radii of the thing, within which an obstacle may hide it
 OBSTACLE_ROWS = 120  # rows of a depth image that are looked through for obstacles
 UNSEEN_REACH = (
-    2.0  # radii of the thing, within which something that no view shows may hide it
+    4.0  # radii of the thing, within which something that no view shows may hide it
 )
 UNSEEN_EVERY = 2  # every so many rows and columns of pixels, unseen space is looked up
 
@@ -346,6 +346,7 @@ def _clear(
         rays[:, some] / lengths,
         hidden,
         UNSEEN_REACH * radius,
+        scene.floor,
         top,
     )
     coarse = chance.reshape(views, -(-side // UNSEEN_EVERY), -1)

@@ -1,8 +1,10 @@
 """How likely a line of sight to a thing is clear where no view has looked yet.
 
 What stands around a thing hides it from many sides, and a camera sees only the near side of it.
-Space that no view has looked into may hold more of the same: it blocks a line of sight as often, a
-metre, as the space that is known.
+Space that no view has looked into may hold more of the same, standing on the same support: a place
+near the support is filled more often than one higher up. A metre of it blocks a line of sight more
+often than one of the space that is known, because views that show the thing are views from where
+little stands in the way.
 """
 
 from collections.abc import Sequence
@@ -13,7 +15,8 @@ import numpy as np
 from nextview.geometry.observation import Observation
 from nextview.types import Float, Float32, Mask
 
-SIGHT_STEPS = 10  # places on each line of sight that are looked up
+SIGHT_STEPS = 20  # places on each line of sight that are looked up
+UNSEEN_FILLED = 4.0  # how much oftener unknown space is filled than known space
 BEFORE = (
     0.01  # metres before a measured surface, from which on space is known to be free
 )
@@ -80,6 +83,7 @@ def chance_of_sight(
     rays: Float32,
     hidden: Mask,
     reach: float,
+    floor: float,
     top: float,
 ) -> Float32:
     """How likely lines of sight are clear where it is not known what stands on them.
@@ -91,7 +95,9 @@ def chance_of_sight(
         rays: unit vectors from the cameras along the lines, (V, P, 3).
         hidden: lines that something is known to block, (V, P).
         reach: metres before the thing, within which something may stand.
-        top: height of what is known to stand around, metres; what is not known is no higher.
+        floor: height of the support, metres.
+        top: height of what is known to stand around, metres; what is not known is no higher, and
+            may be of any height up to it.
 
     Returns:
         Chances, (V, P) float32: 1 where all is known to be free.
@@ -99,16 +105,17 @@ def chance_of_sight(
     steps = (np.arange(SIGHT_STEPS, dtype=np.float32) + 0.5) / SIGHT_STEPS
     back = (reach * steps)[:, None] * rays[:, :, None]
     places = (ends[:, :, None] - back).astype(np.float32)
-    low = places[..., 2] < top
-    free = np.zeros(low.shape, bool)
+    height = np.nan_to_num(places[..., 2], nan=top)
+    filled = np.clip((top - height) / max(top - floor, 1e-6), 0, 1)
+    free = np.zeros(filled.shape, bool)
     for image in seen:
         free |= image.shows_free(places)
 
     step = reach / SIGHT_STEPS
-    unknown = step * (low & ~free).sum(2)
-    known = step * float((low & free)[~hidden].sum())
+    unknown = step * (filled * ~free).sum(2)
+    known = step * float((filled * free)[~hidden].sum())
     blocked = np.count_nonzero(hidden)
     if not blocked:
         return np.ones(hidden.shape, np.float32)
-    rate = blocked / max(known, step)
+    rate = UNSEEN_FILLED * blocked / max(known, step)
     return np.exp(-rate * unknown).astype(np.float32)
