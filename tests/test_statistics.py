@@ -83,6 +83,11 @@ def test_bootstrap_p_agrees_with_the_paired_t_test():
     assert st.bootstrap_p(np.zeros(1), np.zeros((10, 1))) == [1]
 
 
+def test_differences_by_rounding_are_no_differences():
+    rounding = np.random.default_rng(0).normal(0, 1e-16, (1000, 1))
+    assert st.bootstrap_p(np.array([4e-16]), rounding) == [1]
+
+
 def test_calibration_error_is_the_gap_between_confidence_and_accuracy():
     assert metrics.calibration_error(
         np.full(8, 0.75),

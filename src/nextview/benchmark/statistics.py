@@ -9,6 +9,8 @@ from scipy.stats import chi2, norm
 from nextview.data import metrics
 from nextview.types import Float, Index, Mask
 
+NO_SPREAD = 1e-9  # standard deviation of samples that differ by rounding alone
+
 
 def resample(n: int, samples: int, rng: np.random.Generator) -> Float:
     """Draw bootstrap weights.
@@ -70,7 +72,7 @@ def bootstrap_p(difference: Float, samples: Float) -> Float:
         p-values, (M,).
     """
     error = samples.std(0)
-    return 2 * norm.sf(np.abs(difference) / np.where(error > 0, error, np.inf))
+    return 2 * norm.sf(np.abs(difference) / np.where(error > NO_SPREAD, error, np.inf))
 
 
 def mcnemar(right: Mask, reference: Mask) -> float:
