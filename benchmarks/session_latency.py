@@ -29,7 +29,7 @@ import nextview
 from nextview.cli.exit_status import orderly_end
 from nextview.data.samples import sample_mesh
 from nextview.geometry.viewsphere import look_at_origin
-from nextview.sensing import Frame, ObservedObject, observed_object
+from nextview.sensing import Frame, ObservedObject, plausibility, resampling, sighting
 
 INTRINSICS = np.array([[520.0, 0, 319.5], [0, 520.0, 239.5], [0, 0, 1]])
 SHAPE = 480, 640
@@ -133,23 +133,15 @@ def main(
     taken = []
     memory = []
     # What is timed is wrapped here, so that the product itself knows nothing of it.
-    for name in ("fit_facets", "enclose", "look_again"):
-        within = "finding"
-        setattr(
-            observed_object,
-            name,
-            clock.timed("geometry", getattr(observed_object, name), within),
-        )
-    observed_object.check_observation = clock.timed(
-        "rest",
-        observed_object.check_observation,
-        "finding",
-    )
-    observed_object.check_views = clock.timed(
-        "rest",
-        observed_object.check_views,
-        "finding",
-    )
+    for module, name, part in (
+        (sighting, "fit_facets", "geometry"),
+        (sighting, "enclose", "geometry"),
+        (resampling, "look_again", "geometry"),
+        (plausibility, "check_observation", "rest"),
+        (plausibility, "check_last_view", "rest"),
+    ):
+        timed = clock.timed(part, getattr(module, name), within="finding")
+        setattr(module, name, timed)
     policy_type = type(system.policy)
     models_type = type(system.models)
     policy_type.scores = clock.timed("policy", policy_type.scores)  # type: ignore[attr-defined]

@@ -16,7 +16,7 @@ import nextview
 from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.displacement import displacement
 from nextview.sensing.lean import FRAME_LEAN, lean_of
-from nextview.sensing.segmentation import Plane
+from nextview.sensing.planes import Plane
 from nextview.session.pose_frame import PoseFrame
 
 CARTON = box((0.12, 0.07, 0.09), (0.02, 0, 0.045))

@@ -14,7 +14,7 @@ from nextview.sensing import Frame, ObservedObject, clusters
 from nextview.sensing.facets import Noise, fit_facets
 from nextview.sensing.object_frame import enclose
 from nextview.sensing.outliers import without_outliers
-from nextview.sensing.segmentation import Plane, sample
+from nextview.sensing.planes import Plane, sample
 from nextview.sensing.walls import before_walls, find_walls
 
 UP = np.array([0, 0, 1.0])

@@ -26,8 +26,9 @@ from nextview.sensing import (
     check_observation,
     check_views,
 )
-from nextview.sensing.facets import fit_facets, look_again, virtual_pose
+from nextview.sensing.facets import fit_facets
 from nextview.sensing.plausibility import check_frame, refuse_far
+from nextview.sensing.resampling import look_again, virtual_pose
 
 WEDGE = trimesh.util.concatenate(
     [box((0.2, 0.16, 0.1), (0, 0, 0.05)), box((0.06, 0.16, 0.08), (-0.07, 0, 0.14))]

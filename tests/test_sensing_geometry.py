@@ -14,7 +14,7 @@ from nextview.sensing import ObjectFrame
 from nextview.sensing.facets import Noise, estimate_noise, fit_facets
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import enclose, smallest_circle, upright_axes
-from nextview.sensing.segmentation import Samples, find_plane
+from nextview.sensing.planes import Samples, find_plane
 
 UP = np.array([0, 0, 1.0])
 EXACT = Noise(np.ones(1), np.zeros(1))

@@ -41,7 +41,7 @@ from nextview.geometry.mesh import (
 )
 from nextview.geometry.observation import Camera
 from nextview.geometry.viewsphere import CAMERA_DISTANCE, ViewSphere, rotation_z
-from nextview.sensing.observed_object import SIZE
+from nextview.sensing.facets import SIZE
 from nextview.simulation.robot_camera import sensed_camera
 from nextview.simulation.scene import build_scene
 from nextview.simulation.scene_layout import SUFFIX, SceneLayout

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import Delaunay, QhullError
 
 from nextview.scene.tracks import Track
-from nextview.sensing.segmentation import Plane
+from nextview.sensing.planes import Plane
 from nextview.types import Float, Mask
 
 FLOATING_HEIGHT = (

@@ -19,11 +19,8 @@ from scipy import ndimage
 from nextview.errors import ObservationError
 from nextview.recognition.poses import PoseCandidate
 from nextview.scene.tracks import RenderedObject, Track, render_track
-from nextview.sensing.observed_object import (
-    FEWEST_OBJECT_PIXELS,
-    ObservedObject,
-    Sighting,
-)
+from nextview.sensing.observed_object import ObservedObject
+from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS, Sighting, sighting_of
 from nextview.sensing.tabletop import NEAR_TABLE, TableTop
 from nextview.types import Float, Index, Mask
 
@@ -381,7 +378,7 @@ def _union(tracks: Sequence[Track], bench: Bench) -> Track:
         one = seen[number][0]
         if len(seen[number]) > 1:
             every = np.any([other.mask for other in seen[number]], axis=0)
-            one = first.thing.sighting_of(one.frame, every, one.plane, one.noise)
+            one = sighting_of(one.frame, every, one.plane, one.noise)
         sightings.append(one)
 
     again = dict(pair for track in tracks for pair in track.again) | dict(first.again)

@@ -15,7 +15,7 @@ from nextview.geometry.pinhole import PinholeCamera
 from nextview.recognition.poses import PoseCandidate
 from nextview.sensing.frame import Part, spans
 from nextview.sensing.observed_object import ObservedObject
-from nextview.sensing.sighting import Sighting
+from nextview.sensing.sighting import Sighting, sighting_of
 from nextview.sensing.tabletop import TableTop
 from nextview.session.result import Recognition
 from nextview.things.surface import Surface, SurfaceCaster
@@ -142,7 +142,7 @@ class Track:
         Raises:
             ObservationError: too little is seen of the object.
         """
-        sighting = self.thing.sighting_of(top.frame, mask, top.plane, top.noise)
+        sighting = sighting_of(top.frame, mask, top.plane, top.noise)
         kept = [
             (frame, one)
             for frame, one in zip(self.frames, self.thing.sightings, strict=True)

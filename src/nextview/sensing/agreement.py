@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.geometry.pinhole import PinholeCamera
-from nextview.sensing.facets import ROWS_MEASURED, Noise, estimate_noise
+from nextview.sensing.facets import Noise, noise_of
 from nextview.sensing.frame import Frame
-from nextview.sensing.segmentation import find_plane, sample
+from nextview.sensing.planes import find_plane, sample
 from nextview.types import Float, Float32, Index, Mask
 
 POINT_GRID = 160  # columns of the grid from which surface points are drawn
@@ -175,8 +175,7 @@ def surface_view(frame: Frame, rng: np.random.Generator) -> SurfaceView:
         frame: its pose is not used.
         rng: draws the points.
     """
-    few_rows = slice(None, None, max(1, frame.shape[0] // ROWS_MEASURED))
-    noise = estimate_noise(frame.depth[few_rows], frame.depth[few_rows] > 0)
+    noise = noise_of(frame)
     points = _surface_points(frame)
     if frame.mask is None:
         points, standing = _half_off_the_plane(points, frame, noise, rng)

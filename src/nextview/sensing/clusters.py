@@ -78,6 +78,7 @@ class Footprint:
         pieces: all pieces of the frame.
         area: surface area of each pair, square metres, (K,).
         pixels: number of pixels that show it, (K,).
+        cell: side of a cell, metres.
     """
 
     cells: Index
@@ -85,6 +86,7 @@ class Footprint:
     pieces: Pieces
     area: Float
     pixels: Index
+    cell: float
 
     @cached_property
     def outlines(self) -> dict[int, Float]:
@@ -162,7 +164,7 @@ def footprint(
     cells = np.stack(np.divmod(used[at], side), 1) + low
     pixels = count[pairs]
 
-    return Footprint(cells, piece, pieces, area, pixels)
+    return Footprint(cells, piece, pieces, area, pixels, cell)
 
 
 def clusters(

@@ -1,4 +1,4 @@
-"""Fit a small plane to every pixel of the object, and render these for the networks.
+"""Fit a small plane to every pixel of the object.
 
 The sloped facet model of Haralick and Watson (A facet model for image data, Computer Graphics and
 Image Processing 15, 1981), on inverse depth, where planes of the world are planes of the image: 1/z
@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from nextview.geometry.observation import pinhole
 from nextview.geometry.pinhole import PinholeCamera
-from nextview.geometry.viewsphere import CAMERA_DISTANCE
+from nextview.sensing.frame import Frame
 from nextview.types import Float, Float32, Floats, Index, Mask
 
+SIZE = 224  # side of the observations' images: what the bundled networks take
 CLOSE_ENOUGH = (
     1.5  # standard deviations of noise that a window may deviate from its plane
 )
@@ -32,13 +32,6 @@ BINS = 4  # ranges of depth in which the noise is measured, with equally many pi
 ROWS_MEASURED = 20  # about so many rows of a picture are enough to measure it
 # distances of the pixels that are compared: in many sensors neighbours err together
 LAGS = (1, 2, 4, 6)
-# depth of what can be shown, object radii; all of the object is between 2 and 4
-NEAREST_FACET = 0.5
-FARTHEST_FACET = 100.0
-# half of what one sensor pixel covers here at most, as a part of the image: it bounds the time
-WIDEST_FACET = 1 / 16
-# object radii of depth within which facets are of one surface; the nearest to a pixel is shown
-SURFACE_LAYER = 0.03
 
 
 @dataclass(frozen=True)
@@ -58,6 +51,12 @@ class Noise:
     def at(self, depth: Floats | float) -> Float:
         """Standard deviation of inverse depth at some depths, same shape, 1/metres."""
         return np.asarray(np.interp(depth, self.depths, self.sigmas))
+
+
+def noise_of(frame: Frame) -> Noise:
+    """The noise of all that a frame shows."""
+    few = slice(None, None, max(1, frame.shape[0] // ROWS_MEASURED))
+    return estimate_noise(frame.depth[few], frame.depth[few] > 0)
 
 
 def estimate_noise(depth: Float32, usable: Mask) -> Noise:
@@ -452,98 +451,3 @@ def _deviation(planes: Float, here: Float, own: Float) -> Float:
     return (
         planes[..., 0] * here[:, 0] + planes[..., 1] * here[:, 1] + planes[..., 2] - own
     )
-
-
-def virtual_pose(pose: Float) -> Float:
-    """Return the level pose, (4, 4), at the networks' distance in a camera's direction."""
-    position = pose[:3, 3]
-    outward = position / np.linalg.norm(position) if position.any() else -pose[:3, 2]
-    right = np.array([-outward[1], outward[0], 0.0])
-    if (
-        np.hypot(right[0], right[1]) < 1e-6
-    ):  # straight above: keep the camera's own right
-        right = pose[:3, 0] - (pose[:3, 0] @ outward) * outward
-    right /= np.linalg.norm(right)
-    virtual = np.eye(4)
-    virtual[:3, :3] = np.stack([right, np.cross(-outward, right), -outward], 1)
-    virtual[:3, 3] = CAMERA_DISTANCE * outward
-    return virtual
-
-
-def look_again(
-    facets: Facets,
-    pose: Float,
-    radius: float,
-    size: int,
-) -> tuple[Float32, Index]:
-    """Render facets from the virtual pose.
-
-    Each facet is drawn where the virtual camera sees it. A pixel shows the nearest surface, at the
-    depth where its own ray meets the plane of the facet, so that planes stay planes.
-
-    Args:
-        facets: the facets.
-        pose: of the camera that saw them, (4, 4), object frame, object radii.
-        radius: of the object, metres.
-        size: side of the image, pixels.
-
-    Returns:
-        Depth, (size, size) float32, object radii, and the facet of each pixel, int64, -1 for none.
-    """
-    target = virtual_pose(pose)
-    focal = pinhole(size, CAMERA_DISTANCE)[0, 0]
-    turn = target[:3, :3].T @ pose[:3, :3]
-    shift = target[:3, :3].T @ (pose[:3, 3] - target[:3, 3])
-    seen_from = facets.points[:, 2] / radius  # depth in the sensor's own image
-    points = facets.points @ (turn.T / radius) + shift
-    # n . P = 1 in the sensor's frame; P = turn^T (P' - shift), so n' . P' = 1 + n' . shift.
-    normals = facets.planes @ (radius * turn.T)
-    offset = 1 + normals @ shift
-    z = points[:, 2]
-    front = np.flatnonzero((z > NEAREST_FACET) & (z < FARTHEST_FACET))
-    x, y = focal * points[front, :2].T / z[front] + size / 2
-    # A facet is as wide as a sensor's pixel: so many pixels here, half to each side; somewhat more
-    # where it is turned. A sensor that stands within the object has wider ones; they fill gaps no
-    # farther than WIDEST_FACET.
-    half = (
-        np.clip(
-            0.6 * focal * facets.pitch.mean() * seen_from[front] / z[front],
-            0.5,
-            WIDEST_FACET * size,
-        )
-        + 0.05
-    )
-    # The first column and row whose centres it covers:
-    left, top = (
-        np.clip(np.ceil(at - half - 0.5), -size, size).astype(np.int64) for at in (x, y)
-    )
-    layer = (z[front] / SURFACE_LAYER).astype(np.int64) << 48 | front
-    best = np.full(size * size, np.iinfo(np.int64).max)
-    covered = range(int(2 * half.max()) + 1) if len(front) else range(0)
-    for down in covered:
-        row = top + down
-        dy = np.abs(row + 0.5 - y)
-        some = np.flatnonzero((dy <= half) & (row >= 0) & (row < size))
-        for right in covered:
-            column = left[some] + right
-            dx = np.abs(column + 0.5 - x[some])
-            hit = np.flatnonzero((dx <= half[some]) & (column >= 0) & (column < size))
-            it = some[hit]
-            key = layer[it] | ((dx[hit] + dy[it]) * 64).astype(np.int64) << 32
-            np.minimum.at(best, row[it] * size + column[hit], key)
-    shown = np.flatnonzero(best < np.iinfo(np.int64).max)
-    facet = np.full(size * size, -1)
-    facet[shown] = chosen = best[shown] & 0xFFFFFFFF
-    slopes = (np.arange(size) + 0.5 - size / 2) / focal
-    normal_x, normal_y, normal_z = normals.T.copy()
-    towards = (
-        normal_x[chosen] * slopes[shown % size]
-        + normal_y[chosen] * slopes[shown // size]
-        + normal_z[chosen]
-    )
-    with np.errstate(divide="ignore"):
-        meets = offset[chosen] / towards
-    depth = np.zeros(size * size, np.float32)
-    # A plane seen edge-on runs away within a pixel: stay near the facet.
-    depth[shown] = np.where(np.abs(meets - z[chosen]) < SURFACE_LAYER, meets, z[chosen])
-    return depth.reshape(size, size), facet.reshape(size, size)

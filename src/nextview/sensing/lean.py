@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nextview.sensing.segmentation import Plane
+from nextview.sensing.planes import Plane
 from nextview.types import Float
 
 DEPTH_LEAN = np.radians(2.0)

@@ -1,5 +1,6 @@
 """Refuse what cannot be right in a frame, and name the likely mistake behind an observation."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,7 @@ INNERMOST = 0.4  # how far from the origin the outermost of what is seen has to 
 CONTRADICTION = (
     0.2  # views contradict if one misses this share of the surface that the other saw
 )
+COMPARED_VIEWS = 3  # views before the last one with which it is compared
 # how far a principal point is from the middle of an uncropped picture, at most, half sides of it
 OFF_CENTRE = 0.25
 # metres: few depth cameras measure farther, and nothing fills a picture from there
@@ -541,6 +543,23 @@ def check_views(first: Observation, second: Observation) -> list[ViewWarning]:
     return [
         ViewWarning("contradiction", message + "wrong pose, or the object has moved")
     ]
+
+
+def check_last_view(observations: Sequence[Observation]) -> list[ViewWarning]:
+    """Warn if the last of some views of an object contradicts one of those just before it.
+
+    Args:
+        observations: of the object, in order, at least one.
+
+    Returns:
+        The first such warning, if any.
+    """
+    *earlier, last = observations
+    for view in earlier[-COMPARED_VIEWS:]:
+        warnings = check_views(view, last)
+        if warnings:
+            return warnings
+    return []
 
 
 def _seen_through(first: Observation, second: Observation) -> float:

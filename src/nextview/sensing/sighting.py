@@ -1,16 +1,28 @@
-"""What one frame shows of an object."""
+"""What one frame shows of an object, and the object frame that all frames show together."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
+from nextview.errors import ObservationError
 from nextview.sensing.clusters import Footprint
-from nextview.sensing.facets import Facets, Noise
-from nextview.sensing.frame import Frame
-from nextview.sensing.segmentation import Plane
+from nextview.sensing.facets import SIZE, Facets, Noise, fit_facets
+from nextview.sensing.frame import Frame, within
+from nextview.sensing.object_frame import ObjectFrame, enclose
+from nextview.sensing.outliers import without_outliers
+from nextview.sensing.planes import Plane
 from nextview.types import Float, Mask
+
+FEWEST_OBJECT_PIXELS = 60  # pixels that an object has to have in a frame
+# of the most pixels that a frame shows of an object: others say too little of its size
+LEAST_VIEW_PART = 0.1
+MOST_HULL_POINTS = 3000  # of which the convex hull is taken, about
+TOO_LITTLE = "too little is seen of the object"
 
 
 @dataclass(frozen=True)
@@ -40,7 +52,7 @@ class Sighting:
     shift: Float = field(default_factory=lambda: np.zeros(3))
 
     @property
-    def told(self) -> Frame:
+    def frame_as_given(self) -> Frame:
         """The frame with the pose that it was handed in with."""
         return self.frame.shifted(-self.shift) if self.shift.any() else self.frame
 
@@ -55,3 +67,76 @@ class Sighting:
             and replace(plane, offset=plane.offset - float(plane.normal @ shift)),
             shift=self.shift + shift,
         )
+
+
+def sighting_of(
+    frame: Frame,
+    mask: Mask,
+    plane: Plane | None,
+    noise: Noise,
+    denoise: bool = True,
+) -> Sighting:
+    """Fit the surface of the object to its pixels.
+
+    Args:
+        frame: the frame.
+        mask: the object's pixels, (H, W) bool.
+        plane: that the object stands on; None if it is not seen.
+        noise: of the frame's depth.
+        denoise: smooth depth, fill holes and drop flying pixels.
+
+    Raises:
+        ObservationError: too little is seen of the object.
+    """
+    if np.count_nonzero(mask) < FEWEST_OBJECT_PIXELS:
+        raise ObservationError(TOO_LITTLE)
+
+    part = within(mask, 2)
+    corner = (part[0].start, part[1].start)
+    coarse = max(1, max(mask[part].shape) // SIZE)
+    facets = fit_facets(
+        frame.depth[part],
+        mask[part],
+        frame.intrinsics,
+        corner,
+        denoise,
+        coarse,
+        noise,
+    )
+    if denoise and len(facets.planes):
+        facets = without_outliers(facets, noise, coarse)
+    if len(facets.planes) * coarse**2 < FEWEST_OBJECT_PIXELS:
+        raise ObservationError(TOO_LITTLE)
+
+    pose = frame.camera_to_world
+    few = slice(None, None, max(1, len(facets.planes) // MOST_HULL_POINTS))
+    points = facets.some(few).points @ pose[:3, :3].T + pose[:3, 3]
+    with suppress(QhullError):  # all in one plane: they do as they are
+        points = points[ConvexHull(points).vertices]
+    return Sighting(frame, noise, facets, mask, points, plane)
+
+
+def object_frame_of(sightings: Sequence[Sighting], axes: Float) -> ObjectFrame:
+    """Estimate centre and radius from all frames that show enough of the object.
+
+    Args:
+        sightings: of the object, at least one.
+        axes: rows x, y and z (up) of the object frame, (3, 3).
+
+    Raises:
+        ObservationError: what is seen of the object has no size.
+    """
+    shown = np.array([np.count_nonzero(sighting.mask) for sighting in sightings])
+    enough = shown >= LEAST_VIEW_PART * shown.max()
+    pairs = zip(sightings, enough, strict=True)
+    points = np.concatenate([sighting.hull for sighting, counts in pairs if counts])
+
+    # The height of the planes along up, where the object is: they may lean a little.
+    here = points.mean(0)
+    heights = [
+        axes[2] @ here - plane.height(here) / (plane.normal @ axes[2])
+        for plane in (sighting.plane for sighting in sightings)
+        if plane is not None
+    ]
+    floor = float(np.median(heights)) if heights else None
+    return enclose(points, axes, floor)

@@ -7,7 +7,7 @@ part of the object.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,7 +15,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
-from nextview.sensing.segmentation import Plane, Samples, refine_plane, steep
+from nextview.sensing.frame import Frame
+from nextview.sensing.planes import Plane, Samples, refine_plane, steep
 from nextview.types import Float, Index, Mask
 
 LEAST_LEVEL_SHARE = 0.03  # share of all samples on a further level plane, at least
@@ -58,6 +59,8 @@ BOTTOM_MARGIN = 0.02
 BOTTOM_ASIDE = 0.08
 # height of a level plane over the ground below it, as a part of the distance: less is noise
 GROUND_BELOW = 0.05
+# share of what is seen that may lie lower than the lowest that counts: noise
+LOWEST_SEEN = 0.01
 
 
 def level_planes(samples: Samples, first: Plane) -> list[Plane]:
@@ -130,6 +133,18 @@ def ground_of(samples: Samples, first: Plane, widest: float) -> Plane:
     return first
 
 
+def through_lowest(samples: Samples, up: Float, most: float = np.inf) -> Plane:
+    """The level plane through the lowest points of a frame that does not show the support.
+
+    Args:
+        samples: of the frame.
+        up: direction against gravity, (3,).
+        most: height of the plane along this direction, at most, metres.
+    """
+    lowest = float(np.quantile(samples.points @ up, LOWEST_SEEN))
+    return Plane(up, -min(lowest, most))
+
+
 def under_points(samples: Samples, planes: list[Plane], points: Float) -> Plane | None:
     """Return the highest plane that is seen beside the bottom of an object.
 
@@ -160,45 +175,34 @@ def under_points(samples: Samples, planes: list[Plane], points: Float) -> Plane 
     return None
 
 
-@dataclass(frozen=True)
-class Target:
-    """Where the object is looked for, in the grid of samples and in space.
+def _distance_off(
+    frame: Frame,
+    samples: Samples,
+    plane: Plane,
+    place: Float | None,
+) -> Float:
+    """How far each sample lies from where the object is looked for, (N,): 1 is still there.
 
-    Attributes:
-        axis: row and column of the optical axis in the grid of samples, (2,).
-        width: of the picture, in columns of that grid.
-        place: where the object is, (3,), world, metres; None for what the camera is aimed at.
+    Seen from above it is at a place, (3,), world, metres; without one it is what the camera is
+    aimed at.
     """
+    if place is not None:
+        aside = _in_plane(samples.points, plane) - _in_plane(place[None], plane)
+        away = np.linalg.norm(place - samples.camera)
+        return np.asarray(np.linalg.norm(aside, axis=1) / (POINT_ASIDE * away))
 
-    axis: Float
-    width: float
-    place: Float | None
-
-    def off(self, samples: Samples, plane: Plane) -> Float:
-        """How far each sample lies from there, (N,): 1 is as far as the object may be off.
-
-        Args:
-            samples: of the frame.
-            plane: that is looked for beneath the object.
-        """
-        if self.place is None:
-            pixels = np.hypot(
-                samples.rows - self.axis[0],
-                samples.columns - self.axis[1],
-            )
-            return np.asarray(pixels / (AIM * self.width))
-        aside = _in_plane(samples.points, plane) - _in_plane(self.place[None], plane)
-        return np.asarray(
-            np.linalg.norm(aside, axis=1)
-            / (POINT_ASIDE * np.linalg.norm(self.place - samples.camera))
-        )
+    side = frame.shape[1] / (samples.columns.max() + 1)
+    row, column = frame.intrinsics[[1, 0], [2, 2]] / side
+    blocks = np.hypot(samples.rows - row, samples.columns - column)
+    return np.asarray(blocks / (AIM * (frame.shape[1] / side)))
 
 
 def aimed_at(
+    frame: Frame,
     samples: Samples,
     planes: list[Plane],
     in_the_way: Mask,
-    target: Target,
+    place: Float | None,
 ) -> Plane:
     """The support plane of what the camera is aimed at, or of what stands at a place.
 
@@ -206,43 +210,48 @@ def aimed_at(
     none does.
 
     Args:
+        frame: the frame.
         samples: of the frame.
         planes: level planes, the highest first.
         in_the_way: which samples are of no object, such as walls, (N,) bool.
-        target: where the object is looked for.
+        place: of the object, (3,), world, metres; None for what the camera is aimed at.
     """
     level = ~in_the_way & ~steep(samples, planes[0].normal)
     for plane, lower in pairwise(planes):
         exact = samples.tolerance < TOLD_APART * np.abs(
             lower.height(samples.points) - plane.height(samples.points)
         )
-        if _carries(samples, plane, level & exact, ~in_the_way, target):
+        if _carries(frame, samples, plane, level & exact, ~in_the_way, place):
             return plane
     return planes[-1]
 
 
-def is_named(samples: Samples, plane: Plane, target: Target) -> bool:
+def is_named(
+    frame: Frame,
+    samples: Samples,
+    plane: Plane,
+    place: Float | None,
+) -> bool:
     """Whether a point on a level surface, or below it, selects the surface itself.
 
     A table top is selected where nothing stands on it. The ground is never selected.
 
     Args:
+        frame: the frame.
         samples: of the frame.
         plane: the level plane.
-        target: the place where the object is.
+        place: of the object, (3,), world, metres; None where no point was given.
     """
-    if target.place is None or plane.height(target.place) > np.median(
-        samples.tolerance
-    ):
+    if place is None or plane.height(place) > np.median(samples.tolerance):
         return False
-    off = target.off(samples, plane)
+    off = _distance_off(frame, samples, plane, place)
     above = plane.height(samples.points) > samples.tolerance
     on = plane.holds(samples) & ~steep(samples, plane.normal)
     if on.sum() < 3 or _thing_there(samples, above, off) is not None:
         return False
 
     its_own = _surface_there(samples, on, off)
-    away = float(np.linalg.norm(target.place - samples.camera))
+    away = float(np.linalg.norm(place - samples.camera))
     wide = (
         np.linalg.norm(np.ptp(_in_plane(samples.points[its_own], plane), 0))
         > GROUND_WIDTH * away
@@ -262,17 +271,18 @@ def _surface_there(samples: Samples, on: Mask, off: Float) -> Mask:
 
 
 def _carries(
+    frame: Frame,
     samples: Samples,
     plane: Plane,
     level: Mask,
     free: Mask,
-    target: Target,
+    place: Float | None,
 ) -> bool:
     """Whether a plane carries the target, and is no part of it."""
     on = plane.holds(samples) & level
     if on.sum() < 3:
         return False
-    off = target.off(samples, plane)
+    off = _distance_off(frame, samples, plane, place)
     its_own = _surface_there(samples, on, off)
     ground = _in_plane(samples.points[its_own], plane)
     try:
@@ -280,14 +290,13 @@ def _carries(
     except (QhullError, ValueError):  # too few points, or all in a line
         return False
 
-    nearest = samples.points[off.argmin()] if target.place is None else target.place
+    nearest = samples.points[off.argmin()] if place is None else place
     away = float(np.linalg.norm(nearest - samples.camera))
     wide = bool(
         np.linalg.norm(np.ptp(ground[outline.vertices], 0)) > GROUND_WIDTH * away
     )
-    if target.place is not None and plane.height(target.place) < (
-        -1 if wide else 1
-    ) * np.median(samples.tolerance):
+    lowest = (-1 if wide else 1) * np.median(samples.tolerance)
+    if place is not None and plane.height(place) < lowest:
         return False
 
     above = (plane.height(samples.points) > samples.tolerance) & free

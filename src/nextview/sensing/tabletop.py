@@ -8,19 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from nextview.sensing import clusters, segmentation, support
+from nextview.errors import ObservationError
+from nextview.sensing import clusters, planes, segmentation, support
 from nextview.sensing.clusters import Joins
 from nextview.sensing.convex_pieces import STANDS, Pieces, cut
-from nextview.sensing.facets import Noise
+from nextview.sensing.facets import Noise, noise_of
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, upright_axes
-from nextview.sensing.observed_object import (
-    FEWEST_OBJECT_PIXELS,
-    ObservedObject,
-    noise_of,
-)
-from nextview.sensing.segmentation import Plane, Samples, sample
+from nextview.sensing.planes import Plane, Samples, sample
+from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
+from nextview.sensing.support_plane import NO_SUPPORT, find_support_plane
 from nextview.sensing.walls import before_walls, find_walls
 from nextview.types import Float, Float32, Index, Mask
 
@@ -98,13 +96,11 @@ class TableTop:
         noise = noise_of(frame)
         samples = sample(frame, frame.depth > 0, noise)
         if earlier is None:
-            plane = ObservedObject(up if frame.pose is not None else None).find_support(
-                frame
-            )
+            plane = _find_support(frame, samples, up)
             if widest is not None:
                 plane = support.ground_of(samples, plane, widest)
         else:
-            plane = segmentation.find_again(earlier, samples, _near(samples, known))
+            plane = planes.find_again(earlier, samples, _near(samples, known))
 
         above = segmentation.above_plane(frame, plane, noise)
         walls = find_walls(samples, plane, np.random.default_rng(0))
@@ -229,6 +225,15 @@ class TableTop:
         apart = np.abs(own - its)[known]
 
         return bool(len(apart)) and float(np.median(apart)) < step
+
+
+def _find_support(frame: Frame, samples: Samples, up: Float | None) -> Plane:
+    """The plane on which things stand, in a first frame."""
+    upright = None if up is None or frame.pose is None else upright_axes(up)[2]
+    plane = find_support_plane(frame, samples, upright, np.random.default_rng(0))
+    if plane is None:
+        raise ObservationError(NO_SUPPORT)
+    return plane
 
 
 def _unevenness(frame: Frame, height: Float32) -> float:

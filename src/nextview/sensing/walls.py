@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
-from nextview.sensing.segmentation import Plane, Samples, steep
+from nextview.sensing.planes import Plane, Samples, steep
 from nextview.types import Float, Index, Mask
 
 LINE_TRIALS = 150  # lines that are tried for each wall

@@ -65,7 +65,7 @@ def after_repeated(
         assert state.frame is not None
         was, now = (
             state.frame.pose_in_object(f.camera_to_world)
-            for f in (sighting.told, frame)
+            for f in (sighting.frame_as_given, frame)
         )
         if _is_one_picture(
             seen,

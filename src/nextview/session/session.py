@@ -31,13 +31,18 @@ from nextview.geometry.viewsphere import (
 from nextview.policies.base import EpisodeState, Policy, SeeksPose, ValuesViews
 from nextview.policies.off_grid import anywhere
 from nextview.recognition.belief import MUCH, Stopping, log_evidence_of
+from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import Models, NetworkRecogniser
 from nextview.recognition.map_names import maps_among
 from nextview.recognition.novelty import Novelty, ViewScore, values_of
 from nextview.recognition.poses import share_of_likeliest
 from nextview.recognition.protocol import JudgesTogether, LooksAhead
 from nextview.sensing.frame import Frame
-from nextview.sensing.plausibility import ViewWarning, check_observation, check_views
+from nextview.sensing.plausibility import (
+    ViewWarning,
+    check_last_view,
+    check_observation,
+)
 from nextview.session.episode import Episodes, Step
 from nextview.session.limits import Limits, in_words
 from nextview.session.pose_frame import PoseFrame
@@ -68,8 +73,6 @@ be a thousand times.
 """
 # times as large as in any single frame: from there an object of several frames is none
 MUCH_LARGER = 1.5
-CONTRADICTABLE = 3
-"""Views before the last with whose geometry it is compared."""
 
 
 @runtime_checkable
@@ -631,11 +634,11 @@ class Session:
             )
         if self.object is not None:
             raise SessionError("this session takes frames: it has an observed object")
-        warnings = check_observation(seen)
-        for view in self.views[-CONTRADICTABLE:]:
-            warnings = warnings or check_views(view.observation, seen)
         earlier = [view.observation for view in self.views]
-        warnings = [REPEATED] if is_repeated(seen, earlier) else warnings
+        if is_repeated(seen, earlier):
+            warnings = [REPEATED]
+        else:
+            warnings = check_observation(seen) or check_last_view([*earlier, seen])
         return self._take([*earlier, seen], warnings, seen.pose, None)
 
     def _add_frame(self, frame: Frame) -> View:
@@ -751,63 +754,45 @@ class Session:
     ) -> View:
         """Take in the last of some observations, and whichever of the others has changed."""
         last = len(observations) - 1
-        earlier = observations[:last]
         changed = [
-            k for k, seen in enumerate(earlier) if seen is not self.views[k].observation
+            k
+            for k, view in enumerate(self.views)
+            if observations[k] is not view.observation
         ]
-        changed.append(last)
-
-        found = self.models.evidence([observations[k] for k in changed])
-        once = np.array(
-            [
-                REPEATED not in (warnings if k == last else self.views[k].warnings)
-                for k in changed
-            ]
-        )
-        found = replace(found, seen=once if found.seen is None else found.seen & once)
-        evidence = {k: found.select([row]) for row, k in enumerate(changed)}
+        evidence = self._evidence(observations, [*changed, last], warnings)
         directions = [self._snapped(direction_of(seen.pose)) for seen in observations]
-
-        episodes = self._episodes
-        if changed != [last]:
-            episodes = self._begin(self.view)
-            for k, step in enumerate(self._episodes.steps):
-                # What all views said together then is not asked again: it takes time.
-                episodes.take(
-                    evidence.get(k, step.evidence),
-                    directions[k][None],
-                    step.joint,
-                )
+        episodes = self._replayed(evidence, directions) if changed else self._episodes
 
         reach = self._reach
-        doubtful = any(warning.holds for warning in warnings) or self._contradicted(
-            last + 1
-        )
+        doubtful = any(warning.holds for warning in warnings)
+        doubtful = doubtful or self._contradicted(last + 1)
         taken = episodes.next_step(
             evidence[last],
             directions[last][None],
-            lambda state: self._constrained(state, reach, object, here),
+            constrain=lambda state: self._constrained(state, reach, object, here),
             hold=lambda step: (
                 doubtful
                 or self._suspicious([*episodes.steps, step], observations)
                 or self._pose_in_doubt(step)
             ),
         )
+
         steps = [*episodes.steps, taken.step]
         travel = self._travelled([int(step.views[0]) for step in steps], directions)
+        seen = {
+            k: self._view(steps[k], observations[k], directions[k], travel[k])
+            for k in (*changed, last)
+        }
         views = list(self.views)
-        for k in changed[:-1]:
-            seen = self._view(steps[k], observations[k], directions[k], travel[k])
-            views[k] = _seen_anew(views[k], seen)
-
-        off = angle_between(self.sphere.directions[self.view], directions[last])
-        asked = bool(self.views) or object is None or object.known is not None
+        for k in changed:
+            views[k] = _seen_anew(views[k], seen[k])
+        asked_for = bool(self.views) or object is None or object.known is not None
         view = replace(
-            self._view(taken.step, observations[last], directions[last], travel[last]),
+            seen[last],
             next_view=_next_of(taken.step),
             values=self._values(taken.step),
             warnings=tuple(warnings),
-            degrees_off=float(np.degrees(off)) if asked else 0.0,
+            degrees_off=self._degrees_off(directions[last]) if asked_for else 0.0,
         )
 
         episodes.keep(taken)
@@ -815,6 +800,43 @@ class Session:
         self.views = [*views, view]
         self.object = object
         return view
+
+    def _evidence(
+        self,
+        observations: Sequence[Observation],
+        which: Sequence[int],
+        warnings: Sequence[ViewWarning],
+    ) -> dict[int, Evidence]:
+        """The evidence of some of the observations; a repeated picture counts as unseen.
+
+        ``warnings`` are those of the last observation.
+        """
+        found = self.models.evidence([observations[k] for k in which])
+        warned = [*(view.warnings for view in self.views), warnings]
+        once = np.array([REPEATED not in warned[k] for k in which])
+        found = replace(found, seen=once if found.seen is None else found.seen & once)
+        return {k: found.select([row]) for row, k in enumerate(which)}
+
+    def _replayed(
+        self,
+        evidence: dict[int, Evidence],
+        directions: Sequence[Float],
+    ) -> Episodes:
+        """The episode so far once more, with new evidence of some of its views."""
+        episodes = self._begin(self.view)
+        for k, step in enumerate(self._episodes.steps):
+            # What all views said together then is not asked again: it takes time.
+            episodes.take(
+                evidence.get(k, step.evidence),
+                directions[k][None],
+                step.joint,
+            )
+        return episodes
+
+    def _degrees_off(self, direction: Float) -> float:
+        """Between the view that was asked for and where the camera stood."""
+        off = angle_between(self.sphere.directions[self.view], direction)
+        return float(np.degrees(off))
 
     def _snapped(self, towards: Float) -> Float:
         """A direction, (3,), or that of the candidate view at which it is."""

@@ -7,7 +7,7 @@ import numpy as np
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import ObjectFrame
-from nextview.sensing.segmentation import Plane, sample
+from nextview.sensing.planes import Plane, sample
 from nextview.sensing.sighting import Sighting
 from nextview.sensing.walls import find_walls
 from nextview.types import Float, Index, Mask

@@ -1,0 +1,402 @@
+"""Planes in a frame, found by RANSAC and refined by least squares; likely mistakes in its pose."""
+
+from copy import deepcopy
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.random import Generator
+from scipy import ndimage
+
+from nextview.sensing.facets import Noise
+from nextview.sensing.frame import CAMERA_AXES, Frame
+from nextview.types import Float, Floats, Index, Mask
+
+# planes that are tried: with one point in ten on the plane, 0.8 of all draws hit it at least once
+TRIALS = 200
+# cosine of the lean of a support plane, at most: errors of a calibration
+TILT = np.cos(np.radians(12.0))
+# the same, at which a plane counts nothing when planes are compared
+STEEPEST_SUPPORT = np.cos(np.radians(15.0))
+# a quarter turn of a camera about its optical axis
+QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+# share of what is seen that lies on a support plane, at least; more if gravity is not known
+LEAST_SUPPORT = 0.04
+LEAST_ALONE = 0.15
+# times as much of a frame lies on a plane as range, if it is range: narrow lenses hardly bend one
+RANGE = 1.05
+BLOCKS_SAMPLED = 1500  # blocks of pixels in which planes are searched
+LARGE_SIDE = 8  # pixels across such a block from which on every second one is looked at
+STEEP_LAG = 2  # samples between two that tell how steep a surface is
+# error of a camera's pose, at most: by it a plane known from earlier frames is moved in this one
+POSE_SHIFT = 0.02  # metres
+POSE_TURN = np.radians(2.0)
+# tolerances from a plane up to which few samples lie beside it, if it is a surface that is seen
+TOLERANCES_ASIDE = 3.0
+STEEP_RISE = 0.7  # rise of a steep surface, as a part of the way
+# times by which the mean over a block is more exact than a pixel, at most: the lens errs, too
+MOST_ALONE = 4.0
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A grid of points of a frame, with their tolerance from a plane.
+
+    Attributes:
+        points: (N, 3), world, metres.
+        tolerance: distance from a plane within which each point may belong to it, metres, (N,).
+        rows: of the blocks in the picture, (N,).
+        columns: of the blocks in the picture, (N,).
+        camera: position of the camera, (3,), world, metres.
+    """
+
+    points: Float
+    tolerance: Float
+    rows: Index
+    columns: Index
+    camera: Float
+
+    def some(self, which: Mask) -> "Samples":
+        """Those of a choice, (N,) bool."""
+        return Samples(
+            self.points[which],
+            self.tolerance[which],
+            self.rows[which],
+            self.columns[which],
+            self.camera,
+        )
+
+
+def sample(frame: Frame, pixels: Mask, noise: Noise) -> Samples:
+    """Return the means over blocks of pixels.
+
+    The mean inverse depth of pixels of a plane is that at the mean of their places in the picture,
+    with less noise than that of one. A block is left out if fewer than half of its pixels are
+    given.
+
+    Args:
+        frame: the frame.
+        pixels: pixels to use, (H, W) bool; all have a depth.
+        noise: of the frame.
+
+    Returns:
+        The samples.
+    """
+    step = 1
+    side = max(1, int(np.sqrt(np.count_nonzero(pixels) / BLOCKS_SAMPLED)))
+    if (
+        side >= LARGE_SIDE
+    ):  # every second pixel is enough: those side by side err together anyway
+        step = 2
+        side //= step
+    few = (slice(None, None, step), slice(None, None, step))
+    given = pixels[few]
+    count = _block_sums(given.astype(np.float32), side)
+    rows, columns = np.nonzero(2 * count >= side**2)
+    count = count[rows, columns]
+
+    inverse = np.zeros(given.shape, np.float32)
+    np.divide(1, frame.depth[few], out=inverse, where=given)
+    ray_x, ray_y = frame.rays
+    z = count / _block_sums(inverse, side)[rows, columns]
+    x = _block_sums(given * ray_x[None, ::step], side)[rows, columns] / count
+    y = _block_sums(given * ray_y[::step, None], side)[rows, columns] / count
+
+    pose = frame.camera_to_world
+    points = (np.stack([x, y, np.ones(len(z))], 1) * z[:, None]) @ pose[
+        :3,
+        :3,
+    ].T + pose[:3, 3]
+    erring_together = max(1.0, (2 * noise.grain + 1) / step)  # pixels across
+    # root of how many err for themselves
+    alone = np.clip(np.sqrt(count) / erring_together, 1, MOST_ALONE)
+    return Samples(
+        points,
+        3 * noise.at(z) * z**2 / alone + 0.003 * z,
+        rows,
+        columns,
+        pose[:3, 3],
+    )
+
+
+def _block_sums(values: Floats, side: int) -> Float:
+    """Return sums over squares of pixels; incomplete squares are left out."""
+    height, width = (n // side for n in values.shape)
+    of_rows = _sums_along(values[: height * side], side)
+    return np.asarray(_sums_along(of_rows[:, : width * side].T, side).T, np.float64)
+
+
+def _sums_along(values: Floats, side: int) -> Floats:
+    """Sums of each ``side`` rows that follow each other: faster than a reduction over an axis."""
+    sums = values[::side].copy()
+    for first in range(1, side):
+        sums += values[first::side]
+    return sums
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane: ``normal @ p + offset`` is the height of a position p, metres.
+
+    Attributes:
+        normal: of unit length, (3,).
+        offset: metres.
+        lean_error: by how much it may lean, as far as the thickness and the extent of what is seen
+            of it tell, radians, one standard deviation; 0 where that is not known.
+    """
+
+    normal: Float
+    offset: float
+    lean_error: float = 0.0
+
+    def height(self, points: Float) -> Float:
+        """Of points (..., 3) above the plane, metres."""
+        return points @ self.normal + self.offset
+
+    def holds(self, samples: Samples) -> Mask:
+        """Which samples are on it, (N,) bool."""
+        return np.abs(self.height(samples.points)) < samples.tolerance
+
+    def extent(self, samples: Samples) -> Float:
+        """Return the samples on the plane, (M, 3), connected with most of them."""
+        on = self.holds(samples)
+        if not on.any():
+            return samples.points[on]
+        grid = np.zeros((samples.rows.max() + 1, samples.columns.max() + 1), bool)
+        grid[samples.rows, samples.columns] = on
+        part = ndimage.label(grid)[0][samples.rows, samples.columns]
+        return samples.points[on & (part == np.bincount(part[on]).argmax())]
+
+
+def steep(samples: Samples, up: Float) -> Mask:
+    """Return the samples on surfaces that rise steeply.
+
+    Args:
+        samples: the samples.
+        up: direction against gravity, (3,).
+
+    Returns:
+        Whether each is on such a surface, by its neighbours above and below in the picture, (N,)
+        bool.
+    """
+    upright = np.zeros(len(samples.points), bool)
+    if not len(upright):
+        return upright
+    grid = np.full((samples.rows.max() + 1 + STEEP_LAG, samples.columns.max() + 1), -1)
+    grid[samples.rows, samples.columns] = np.arange(len(samples.points))
+    lower = grid[samples.rows + STEEP_LAG, samples.columns]
+    pairs = np.stack([np.arange(len(lower)), lower], 1)[lower >= 0]
+    step = samples.points[pairs[:, 0]] - samples.points[pairs[:, 1]]
+    rising = np.abs(step @ up) > STEEP_RISE * np.linalg.norm(step, axis=1)
+
+    upright[pairs[rising].ravel()] = True
+    return upright
+
+
+def find_plane(
+    samples: Samples,
+    rng: Generator,
+    up: Float | None = None,
+    above: Float | None = None,
+) -> Plane | None:
+    """Find the plane with most samples by RANSAC (Fischler and Bolles 1981).
+
+    Args:
+        samples: the samples.
+        rng: source of all random numbers.
+        up: direction to which the plane is perpendicular, (3,); None for any plane.
+        above: point that lies above the plane, as the camera does, (3,); None for none.
+
+    Returns:
+        The plane; None if too few samples lie on any.
+    """
+    points = samples.points
+    if len(points) < 10:
+        return None
+    a, b, c = points[rng.integers(len(points), size=(3, TRIALS))]
+    normals = np.cross(b - a, c - a)
+    if up is not None:
+        # one point is enough where the direction is known; the triples find what leans a little
+        normals[::2] = up
+    length = np.linalg.norm(normals, axis=1)
+    normals = normals[length > 0] / length[length > 0, None]
+    through = a[length > 0]
+    offsets = -(normals * through).sum(1)
+    turn = np.where(
+        (normals @ samples.camera + offsets if up is None else normals @ up) < 0,
+        -1,
+        1,
+    )
+    normals = normals * turn[:, None]
+    offsets = offsets * turn
+    fits = normals @ samples.camera + offsets > 0
+    if up is not None:
+        fits &= normals @ up > TILT
+    if above is not None:
+        fits &= normals @ above + offsets > np.median(samples.tolerance)
+    normals = normals[fits]
+    offsets = offsets[fits]
+    if len(normals) == 0:
+        return None
+    # From the camera on, so that half as many digits are enough.
+    away = (points - samples.camera).astype(np.float32) @ normals.T.astype(np.float32)
+    away += (offsets + normals @ samples.camera).astype(np.float32)
+    count = (np.abs(away) < samples.tolerance[:, None].astype(np.float32)).sum(0)
+    if up is not None:
+        # What leans much is hardly a support, but a plane through things that stand on one.
+        count = count * (1 - (1 - normals @ up) / (1 - STEEPEST_SUPPORT))
+    best = int(count.argmax())
+    plane = refine_plane(Plane(normals[best], float(offsets[best])), samples)
+    level = up is None or plane.normal @ up > TILT
+    least = LEAST_ALONE if up is None else LEAST_SUPPORT
+    return plane if level and plane.holds(samples).mean() > least else None
+
+
+def refine_plane(plane: Plane, samples: Samples, loose: float = 1.0) -> Plane:
+    """Fit a plane to the samples near it by least squares, three times.
+
+    Args:
+        plane: the plane.
+        samples: the samples.
+        loose: tolerances within which samples count.
+
+    Returns:
+        The refined plane; the plane itself if fewer than ten samples are near.
+    """
+    points = samples.points
+    tolerance = loose * samples.tolerance
+    for _ in range(3):
+        on = np.abs(plane.height(points)) < tolerance
+        if on.sum() < 10:
+            return plane
+        weight = 1 / tolerance[on, None] ** 2
+        centre = (weight * points[on]).sum(0) / weight.sum()
+        spread = points[on] - centre
+        squares, directions = np.linalg.eigh((weight * spread).T @ spread)
+        normal = directions[:, 0] * (np.sign(directions[:, 0] @ plane.normal) or 1.0)
+        # Neighbours err together: it may lean by half as much as a sample is off at its edge.
+        error = float(np.sqrt(max(squares[0], 0.0) / max(squares[1], 1e-12))) / 2
+        plane = Plane(normal, float(-normal @ centre), error)
+    return plane
+
+
+def find_again(plane: Plane, samples: Samples, other: Mask) -> Plane:
+    """The plane of an earlier frame as this frame shows it, though the pose of one of them errs.
+
+    Least squares from the plane of the earlier frame is enough where the error is below the
+    noise. By a larger error only a strip of the surface lies in reach, and the fit is a plane that
+    cuts it. Samples then lie beside the fit as well as on it, and the surface is searched for as
+    far around as the pose may err.
+
+    Args:
+        plane: of an earlier frame.
+        samples: of this frame.
+        other: which samples may be of the object, (N,) bool: they are not searched for the plane.
+
+    Returns:
+        The plane in this frame; that of least squares where no other holds more samples.
+    """
+    fit = refine_plane(plane, samples, loose=2)
+    if _is_seen(fit, samples):
+        return fit
+
+    away = np.linalg.norm(samples.points - samples.camera, axis=1)
+    reach = POSE_SHIFT + np.sin(POSE_TURN) * away
+    around = samples.some((np.abs(plane.height(samples.points)) < reach) & ~other)
+    found = find_plane(around, np.random.default_rng(0), plane.normal)
+    if found is None or found.normal @ plane.normal < np.cos(POSE_TURN):
+        return fit
+    return found if found.holds(around).sum() > fit.holds(around).sum() else fit
+
+
+def _is_seen(plane: Plane, samples: Samples) -> bool:
+    """Whether more samples lie on a plane than closely beside it, as those of a surface do."""
+    away = np.abs(plane.height(samples.points)) / samples.tolerance
+    on = np.count_nonzero(away < 1)
+    beside = np.count_nonzero(away < TOLERANCES_ASIDE) - on
+    return bool(on > beside)
+
+
+def lies_better_as_range(
+    frame: Frame,
+    plane: Plane | None,
+    samples: Samples,
+    rng: Generator,
+    up: Float | None,
+    above: Float | None = None,
+) -> bool:
+    """Return whether the frame fits a plane better if its depth is taken along each ray.
+
+    Args:
+        frame: the frame.
+        plane: found with the depth as it is; None if there is none.
+        samples: of the frame.
+        rng: source of all random numbers.
+        up: direction against gravity, (3,); None if it is not known.
+        above: point that lies above the plane, (3,); None for none.
+
+    Returns:
+        True if more of the frame lies on a plane then.
+    """
+    along = samples.points - samples.camera
+    depth = along @ frame.camera_to_world[:3, 2]
+    nearer = replace(
+        samples,
+        points=samples.camera
+        + along * (depth / np.linalg.norm(along, axis=1))[:, None],
+    )
+    other = find_plane(nearer, deepcopy(rng), up, above)
+    usual = 0.0 if plane is None else float(plane.holds(samples).mean())
+    if other is None or other.holds(nearer).mean() <= RANGE * usual:
+        return False
+
+    # Two planes of one room may be found: each is refined for both readings of the depth, so that
+    # like is compared.
+    share = held = 0.0
+    for found, its_samples in ((plane, samples), (other, nearer)):
+        if found is None:
+            continue
+        on = found.holds(its_samples)
+        share = max(share, _share_held(samples, on, found.normal))
+        held = max(held, _share_held(nearer, on, found.normal))
+    return held > RANGE * share
+
+
+def _share_held(samples: Samples, on: Mask, normal: Float) -> float:
+    """Share of the samples on the plane that fits some of them, (N,) bool, best."""
+    middle = np.median(samples.points[on] @ normal)
+    plane = refine_plane(Plane(normal, -float(middle)), samples, loose=2)
+    return float(refine_plane(plane, samples).holds(samples).mean())
+
+
+def mistake_in_pose(plane: Plane, pose: Float, up: Float) -> str | None:
+    """Return the mistake in a pose without which the largest plane would be level.
+
+    Floors and tables are level and walls upright. A plane that leans in between indicates a wrong
+    pose; so does one that is level but lies over the camera. A wall indicates nothing: seen from
+    the side it would pass for a floor.
+
+    Args:
+        plane: the largest plane in view.
+        pose: camera-to-world, (4, 4).
+        up: direction against gravity, (3,).
+
+    Returns:
+        The mistake, in words; None if there is none.
+    """
+    if plane.normal @ up > TILT or abs(plane.normal @ up) < np.sqrt(1 - TILT**2):
+        return None
+
+    rotation = pose[:3, :3]
+    mistakes = {
+        "the camera's axes are OpenGL's?": rotation @ CAMERA_AXES["opengl"],
+        "the camera's axes are those of a ROS body?": rotation @ CAMERA_AXES["ros"],
+        "the pose is inverse, world-to-camera?": rotation.T,
+        "the picture is turned to the left?": rotation @ QUARTER,
+        "the picture is turned to the right?": rotation @ QUARTER.T,
+        "the picture stands on its head?": rotation @ QUARTER @ QUARTER,
+    }
+    seen = rotation.T @ plane.normal
+    rises = {mistake: float(right @ seen @ up) for mistake, right in mistakes.items()}
+    likeliest = max(rises, key=lambda mistake: rises[mistake])
+
+    return likeliest if rises[likeliest] > TILT else None

@@ -1,0 +1,184 @@
+"""What a frame shows of the object as the networks take it: seen from three object radii, level."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nextview.geometry.observation import Observation, SceneView, pinhole
+from nextview.geometry.viewsphere import CAMERA_DISTANCE
+from nextview.sensing.facets import SIZE, Facets
+from nextview.sensing.object_frame import ObjectFrame
+from nextview.sensing.sighting import Sighting
+from nextview.types import Float, Float32, Index
+
+# depth of what can be shown, object radii; all of the object is between 2 and 4
+NEAREST_FACET = 0.5
+FARTHEST_FACET = 100.0
+# half of what one sensor pixel covers here at most, as a part of the image: it bounds the time
+WIDEST_FACET = 1 / 16
+# object radii of depth within which facets are of one surface; the nearest to a pixel is shown
+SURFACE_LAYER = 0.03
+# object radii that a pixel of the scene may show: half a voxel of ``expected_visibility``
+FINEST_PITCH = 1 / 32
+
+
+def observation_of(
+    sighting: Sighting,
+    object_frame: ObjectFrame,
+    life_size: bool = True,
+) -> Observation:
+    """Resample what a frame shows of the object.
+
+    Args:
+        sighting: of the object in the frame.
+        object_frame: of the object, as far as it is known.
+        life_size: whether the radius is evidence of the class.
+
+    Returns:
+        The view from three object radii, in the direction of the camera.
+    """
+    pose = object_frame.pose_in_object(sighting.frame.camera_to_world)
+    depth, facet = look_again(sighting.facets, pose, object_frame.radius, SIZE)
+
+    return Observation(
+        depth,
+        virtual_pose(pose),
+        pinhole(SIZE, CAMERA_DISTANCE),
+        object_frame.radius if life_size else None,
+        _resampled(sighting.frame.image, sighting.facets, facet),
+        _scene(sighting, pose, object_frame.radius),
+        colour=_resampled(sighting.frame.colour, sighting.facets, facet),
+    )
+
+
+def virtual_pose(pose: Float) -> Float:
+    """Return the level pose, (4, 4), at the networks' distance in a camera's direction."""
+    position = pose[:3, 3]
+    outward = position / np.linalg.norm(position) if position.any() else -pose[:3, 2]
+    right = np.array([-outward[1], outward[0], 0.0])
+    if (
+        np.hypot(right[0], right[1]) < 1e-6
+    ):  # straight above: keep the camera's own right
+        right = pose[:3, 0] - (pose[:3, 0] @ outward) * outward
+    right /= np.linalg.norm(right)
+    virtual = np.eye(4)
+    virtual[:3, :3] = np.stack([right, np.cross(-outward, right), -outward], 1)
+    virtual[:3, 3] = CAMERA_DISTANCE * outward
+    return virtual
+
+
+def look_again(
+    facets: Facets,
+    pose: Float,
+    radius: float,
+    size: int,
+) -> tuple[Float32, Index]:
+    """Render facets from the virtual pose.
+
+    Each facet is drawn where the virtual camera sees it. A pixel shows the nearest surface, at the
+    depth where its own ray meets the plane of the facet, so that planes stay planes.
+
+    Args:
+        facets: the facets.
+        pose: of the camera that saw them, (4, 4), object frame, object radii.
+        radius: of the object, metres.
+        size: side of the image, pixels.
+
+    Returns:
+        Depth, (size, size) float32, object radii, and the facet of each pixel, int64, -1 for none.
+    """
+    target = virtual_pose(pose)
+    focal = pinhole(size, CAMERA_DISTANCE)[0, 0]
+    turn = target[:3, :3].T @ pose[:3, :3]
+    shift = target[:3, :3].T @ (pose[:3, 3] - target[:3, 3])
+    seen_from = facets.points[:, 2] / radius  # depth in the sensor's own image
+    points = facets.points @ (turn.T / radius) + shift
+    # n . P = 1 in the sensor's frame; P = turn^T (P' - shift), so n' . P' = 1 + n' . shift.
+    normals = facets.planes @ (radius * turn.T)
+    offset = 1 + normals @ shift
+    z = points[:, 2]
+    front = np.flatnonzero((z > NEAREST_FACET) & (z < FARTHEST_FACET))
+    x, y = focal * points[front, :2].T / z[front] + size / 2
+    # A facet is as wide as a sensor's pixel: so many pixels here, half to each side; somewhat more
+    # where it is turned. A sensor that stands within the object has wider ones; they fill gaps no
+    # farther than WIDEST_FACET.
+    half = (
+        np.clip(
+            0.6 * focal * facets.pitch.mean() * seen_from[front] / z[front],
+            0.5,
+            WIDEST_FACET * size,
+        )
+        + 0.05
+    )
+    # The first column and row whose centres it covers:
+    left, top = (
+        np.clip(np.ceil(at - half - 0.5), -size, size).astype(np.int64) for at in (x, y)
+    )
+    layer = (z[front] / SURFACE_LAYER).astype(np.int64) << 48 | front
+    best = np.full(size * size, np.iinfo(np.int64).max)
+    covered = range(int(2 * half.max()) + 1) if len(front) else range(0)
+    for down in covered:
+        row = top + down
+        dy = np.abs(row + 0.5 - y)
+        some = np.flatnonzero((dy <= half) & (row >= 0) & (row < size))
+        for right in covered:
+            column = left[some] + right
+            dx = np.abs(column + 0.5 - x[some])
+            hit = np.flatnonzero((dx <= half[some]) & (column >= 0) & (column < size))
+            it = some[hit]
+            key = layer[it] | ((dx[hit] + dy[it]) * 64).astype(np.int64) << 32
+            np.minimum.at(best, row[it] * size + column[hit], key)
+    shown = np.flatnonzero(best < np.iinfo(np.int64).max)
+    facet = np.full(size * size, -1)
+    facet[shown] = chosen = best[shown] & 0xFFFFFFFF
+    slopes = (np.arange(size) + 0.5 - size / 2) / focal
+    normal_x, normal_y, normal_z = normals.T.copy()
+    towards = (
+        normal_x[chosen] * slopes[shown % size]
+        + normal_y[chosen] * slopes[shown // size]
+        + normal_z[chosen]
+    )
+    with np.errstate(divide="ignore"):
+        meets = offset[chosen] / towards
+    depth = np.zeros(size * size, np.float32)
+    # A plane seen edge-on runs away within a pixel: stay near the facet.
+    depth[shown] = np.where(np.abs(meets - z[chosen]) < SURFACE_LAYER, meets, z[chosen])
+    return depth.reshape(size, size), facet.reshape(size, size)
+
+
+def _resampled(
+    picture: NDArray[np.uint8] | None,
+    facets: Facets,
+    facet: Index,
+) -> NDArray[np.uint8] | None:
+    """The picture of a frame, (H, W) or (H, W, 3), at the facets that a camera sees, (S, S)."""
+    if picture is None:
+        return None
+    shown = np.zeros((*facet.shape, *picture.shape[2:]), np.uint8)
+    hit = facet >= 0
+    shown[hit] = picture[facets.rows[facet[hit]], facets.columns[facet[hit]]]
+    return shown
+
+
+def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
+    """Return all that a frame shows, in the object frame and object radii."""
+    k = sighting.frame.intrinsics.copy()
+    step = max(
+        1,
+        int(
+            FINEST_PITCH
+            * min(k[0, 0], k[1, 1])
+            / max(float(np.linalg.norm(pose[:3, 3])), 1.0)
+        ),
+    )
+
+    k[:2] /= step
+    k[:2, 2] += 0.5 - (step // 2 + 0.5) / step
+    few = (slice(step // 2, None, step),) * 2
+    return SceneView(
+        sighting.frame.depth[few] / np.float32(radius),
+        sighting.mask[few],
+        pose,
+        k,
+    )
