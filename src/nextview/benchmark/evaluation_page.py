@@ -48,7 +48,7 @@ def write_evaluation(
     figures: Path | None = None,
     overwrite: bool = False,
 ) -> Evaluation:
-    """Evaluate recogniser and maps on every view, beside the published scores.
+    """Evaluate a recogniser and its maps on every view, and compare with published scores.
 
     Args:
         predictions: predictions of nextview predict.

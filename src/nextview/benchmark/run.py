@@ -108,8 +108,8 @@ def run_benchmark(
 ) -> Results:
     """Run all policies at all thresholds from the same first views, and compare them.
 
-    Episodes, tables and tests are written; nextview report makes a page of them. Why a policy
-    failed stands in the settings of the results.
+    It writes episodes, tables and significance tests; nextview report makes a page of them. If a
+    policy fails, the settings of the results name the reason.
 
     Args:
         predictions: predictions of nextview predict.

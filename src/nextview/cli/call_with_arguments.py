@@ -17,7 +17,7 @@ CONFIG = (
     tyro.conf.PositionalMetavarFromFieldName,
     tyro.conf.PositionalRequiredArgs,
 )
-PRESET = "which recipe the options of the recipe begin as"
+PRESET = "recipe that sets the defaults of the recipe options"
 
 
 def find(path: str) -> Any:

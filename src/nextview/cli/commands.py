@@ -39,21 +39,21 @@ COMMANDS = {  # by name, in the order in which they are listed
     ),
     "look": Command(
         f"{CLI}.look:look",
-        "say which known things stand where on a table",
+        "name and locate all known things on a table",
     ),
     "demo": Command(
         f"{CLI}.demo:demo",
-        "recognise a sample object, and draw the episode",
+        "recognise a sample object and draw the episode",
     ),
     "learn": Command(
         f"{TEACHING}.learn:learn_things",
-        "teach it your objects from scans or depth frames",
+        "learn your objects from scans or depth frames",
         "{found}\nnext: nextview recognise MESH --models {out}; what was learned is drawn in"
         " {out}/learned.png",
     ),
     "explore": Command(
         f"{CLI}.explore:explore",
-        "choose views in the browser, and watch the belief",
+        "choose views in the browser and watch the belief",
     ),
     "capture": Command(
         f"{CLI}.capture:capture",
@@ -61,14 +61,14 @@ COMMANDS = {  # by name, in the order in which they are listed
     ),
     "completion": Command(
         f"{CLI}.completion:completion",
-        "print completions for bash, zsh or fish",
+        "print a completion script for bash, zsh or fish",
     ),
     "list": Command(
         f"{CLI}.listing:show",
-        "list the bundled models, or the view measures",
+        "list the bundled models or the view measures",
     ),
     "download": Command(f"{CLI}.listing:download", "download ModelNet10 or ModelNet40"),
-    "scenes": Command(f"{CLI}.scenes:scenes", "draw cluttered scenes, or rooms"),
+    "scenes": Command(f"{CLI}.scenes:scenes", "draw cluttered scenes or rooms"),
     "render": Command(
         f"{CLI}.stores:render",
         "render every view of a dataset into a view store",
@@ -110,7 +110,7 @@ COMMANDS = {  # by name, in the order in which they are listed
     ),
     "predict": Command(
         f"{CLI}.predict:predict",
-        "run the models over every view of a store, once",
+        "run the models once over every view of a store",
     ),
     "fit calibration": Command(
         f"{TRAINING}.card_fits:fit_calibration",
@@ -134,7 +134,7 @@ COMMANDS = {  # by name, in the order in which they are listed
     ),
     "fit valleys": Command(
         f"{TRAINING}.card_fits:fit_valleys",
-        "find classes for which a map's valley is better",
+        "choose the classes that use the valley of a map",
         "{found.objects} objects: the valley is better for these classes: {found.classes}",
     ),
     "evaluate": Command(

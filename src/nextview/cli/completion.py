@@ -12,12 +12,12 @@ def completion(
     shell: Literal["bash", "zsh", "fish"],
     /,
 ) -> None:
-    """Print the script by which a shell completes commands, options and their values.
+    """Print a script that lets a shell complete commands, options and their values.
 
     For bash: nextview completion bash > ~/.local/share/bash-completion/completions/nextview
 
     Args:
-        shell: which shell.
+        shell: name of the shell.
     """
     from nextview.cli.commands import COMMANDS
 

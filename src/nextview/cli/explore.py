@@ -24,17 +24,17 @@ def explore(
     port: int = 8080,
     browser: bool = True,
 ) -> None:
-    """Explore objects in the browser: click the views to take, or let a policy walk.
+    """Explore objects in the browser: click the views to take, or let a policy choose them.
 
-    Candidate views are coloured by the value that the policy gives them. Images, local maps and
-    belief are updated at once. Two policies can run side by side, with clean renders or through a
+    Candidate views are coloured by the value that the policy assigns to them. Images, local maps
+    and belief are updated at once. Two policies can run side by side, on clean renders or with a
     simulated sensor.
 
     Args:
         path: mesh file, folder of meshes or of class folders, or view store; by default the sample
             objects.
-        looking: models and policies; you can continue after the end of an episode.
-        compare: second policy, which walks beside the first.
+        looking: Models and policies. More views can be taken after the end of an episode.
+        compare: second policy, which runs beside the first.
         sensor: simulated depth camera: kinect, stereo, setup, wrist or none, or NAME:STRENGTH.
         start: index of the first view; by default random.
         up: up axis of the mesh files; by default z, and y for GLB.
@@ -42,7 +42,7 @@ def explore(
         seed: seed of the first view, the policies and the sensor errors.
         host: address to serve the page at; 0.0.0.0 opens it to every machine that reaches this one.
         port: port of the page; the next free one if it is taken.
-        browser: whether the page is opened in a browser.
+        browser: by default the page is opened in a browser.
     """
     with extras():
         import viser  # noqa: F401  # a missing extra is named before models are opened

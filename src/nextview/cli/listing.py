@@ -17,14 +17,14 @@ def show(
     name: str | None = None,
     /,
 ) -> None:
-    """List the bundled models, or the view measures: what makes a view good.
+    """List the bundled models or the view measures.
 
-    A measure that needs the depth is computed from a view store alone. Of those that need the mesh,
-    and of measures of your own, docs/add_a_measure.md tells.
+    A measure scores how good a view is. Measures that need only the depth are computed from a view
+    store; docs/add_a_measure.md describes the others, and how to add your own.
 
     Args:
         what: models or measures.
-        name: of a model: print its whole card.
+        name: name of a model whose card is printed.
     """
     if what == "measures":
         from nextview.data.measures import all_measures
@@ -73,8 +73,8 @@ def download(
     """Download ModelNet10 (473 MB) or ModelNet40 (2 GB), verify and unpack it.
 
     Args:
-        name: which one.
-        out: folder to put it into, as OUT/ModelNet10.
+        name: dataset to download.
+        out: folder to unpack it into, as OUT/ModelNet10.
     """
     from rich.progress import (
         BarColumn,

@@ -85,10 +85,10 @@ def look(
     looking: LookOptions = LookOptions(),
     output: LookOutput = LookOutput(),
 ) -> None:
-    """Say which of the known things are where: all that stands on a table, in captured frames.
+    """Name and locate all known things on a table, in captured depth frames.
 
-    Frames that do not fit the others are left out. Objects that are none of the known things are
-    listed as unknown, with their size and place.
+    Objects that match no known thing are listed as unknown, with size and position. Frames that
+    contradict the others are left out.
 
     Args:
         path: folder of captured depth images with poses (BOP, TUM RGB-D, 7-Scenes, or depth images

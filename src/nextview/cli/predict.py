@@ -27,7 +27,7 @@ def predict(
 ) -> None:
     """Run the recogniser and the map networks over every view of a store, once.
 
-    Resumes where it was.
+    An interrupted run resumes.
 
     Args:
         store: view store made by nextview render.

@@ -27,13 +27,13 @@ def scenes(
     """Draw cluttered scenes around targets on a table, or rooms.
 
     Each scene is a small JSON file that names meshes and says where they stand; the same seed draws
-    the same files. Resumes where it was. Objects of one split stand only among objects of that
-    split. Render them with nextview render OUT STORE --meshes MESHES, and go on as with any other
-    store.
+    the same files. An interrupted run resumes. Objects of one split stand only among objects of
+    that split. Render them with nextview render OUT STORE --meshes MESHES, and go on as with any
+    other store.
 
-    With --room a scene is a room as a mobile robot sees it, in metres: floor, walls, furniture
-    behind, objects at the size that they have in life, on the floor or on a table, and a level
-    camera. Its frames are taken by a RoomCamera (docs/scenes.md).
+    With --room a scene is a room as a mobile robot sees it: floor, walls, furniture in the
+    background, objects of life size on the floor or on a table, and a level camera. A RoomCamera
+    renders its frames (docs/scenes.md).
 
     Args:
         meshes: dataset folder, CLASS/train|test/MESH or CLASS/MESH.

@@ -31,13 +31,13 @@ def render(
 
     The folder is CLASS/SPLIT/MESH, SPLIT/CLASS/MESH or CLASS/MESH.
 
-    A folder of scenes (nextview scenes) makes a store too: of what shows of each target, and of the
-    scene around it.
+    A folder of scenes (nextview scenes) can be rendered too. The store then holds the visible part
+    of each target, and the scene around it.
 
     Args:
         dataset: folder of meshes or scenes.
         store: view store to create or to complete.
-        viewpoints: viewpoints of the views.
+        viewpoints: number of viewpoints.
         azimuths: views on each ring; by default 8 for the 40 views and 12 for the 12.
         size: side of the images, pixels.
         overwrite: replace a store of other objects or settings.
@@ -99,9 +99,9 @@ def check(
     /,
     workers: Workers = Workers(),
 ) -> None:
-    """Read every object of a view store, against its checksums.
+    """Check every object of a view store against its checksum.
 
-    Ends with status 2 if one is damaged.
+    The exit status is 2 if one is damaged.
 
     Args:
         store: view store made by nextview render.
@@ -142,7 +142,7 @@ def measure(
 ) -> None:
     """Compute view measures of every rendered object and keep them in the store.
 
-    Resumes where it was.
+    An interrupted run resumes.
 
     Args:
         store: view store made by nextview render.
@@ -150,8 +150,8 @@ def measure(
             default all that need only the depth.
         split: measure only this split.
         held_out: measure only objects that this model (name or card) held out of its training.
-        objects: measure only this number of objects, spread evenly; twice the number later includes
-            the same ones.
+        objects: measure only this number of objects, spread evenly; a later run with twice the
+            number includes the same ones.
         overwrite: compute existing values again.
     """
     select = some_objects(ViewStore.open(store), split, held_out, objects)

@@ -151,7 +151,7 @@ class RenderOptions:
     Attributes:
         seed: seed of the deformations and of the sensor errors; those of an object depend on it and
             on the name alone.
-        deform: how to make a new object of each mesh.
+        deform: Random deformations of each mesh.
         noise_seed: seed of the sensor errors alone: the same objects with other errors.
         sensor: simulated depth camera, NAME or NAME:STRENGTH (docs/your_camera.md); clean renders
             by default.

@@ -63,18 +63,18 @@ def fit_calibration(
     delta: float = 0.1,
     seed: int = 0,
 ) -> FittedCalibration:
-    """Calibrate a recogniser: correlation of several views, and error rates.
+    """Calibrate a recogniser: temperature, correlation of views, and error rates.
 
-    Both go into its card; nextview predict takes them into predictions made before, without
-    predicting again. The size of the objects is not used.
+    The result is written into the card. Run nextview predict again to update existing predictions;
+    it does not run the networks again. The size of the objects is not used.
 
     Args:
         predictions: predictions of the training split (nextview predict --held-out, or --split
             train).
-        card: card of the recogniser, in which "calibration" is written. The fit uses the objects
-            that it lists as held out.
-        sensed: predictions of the same objects through sensors (nextview render --sensor mix), to
-            fit to as well.
+        card: card of the recogniser, into which "calibration" is written. The fit uses the objects
+            that the card lists as held out.
+        sensed: predictions of the same objects through sensors (nextview render --sensor mix),
+            which are used for the fit as well.
         delta: probability with which a guaranteed error rate may be wrong.
         seed: seed of the random walks of the fit.
     """
@@ -394,17 +394,17 @@ def fit_size(
     predictions: Path,
     card: Path,
 ) -> FittedSize:
-    """Learn how large the objects of each class are, for stores and cameras that know the scale.
+    """Fit the sizes of the objects of each class, for stores and cameras that know the scale.
 
-    It goes into the card; nextview predict takes it into predictions made before, without
-    predicting again.
+    The result is written into the card. Run nextview predict again to update existing predictions;
+    it does not run the networks again.
 
     Args:
-        store: view store that knows the unit of its meshes (nextview render --unit). Its training
-            objects teach, except those in the predictions.
-        predictions: of training objects that the recogniser has not seen (nextview predict
-            --held-out); they decide the weight of the size beside the shape.
-        card: of the recogniser; "size" is written into it.
+        store: view store that knows the unit of its meshes (nextview render --unit). The fit
+            uses its training objects, except those in the predictions.
+        predictions: predictions of training objects that the recogniser has not seen (nextview
+            predict --held-out). They determine the weight of the size beside the shape.
+        card: card of the recogniser, into which "size" is written.
     """
     views = ViewStore.open(store)
     predicted = Predictions.load(predictions)
@@ -539,16 +539,16 @@ def fit_valleys(
     predictions: Path,
     card: Path,
 ) -> FittedValleys:
-    """Choose the classes for which the valley of a predicted map is the better view than its peak.
+    """Choose the classes for which the valley of a predicted map is a better view than its peak.
 
-    They go into the network's card; nextview predict takes them into predictions made before,
-    without predicting again.
+    The result is written into the card. Run nextview predict again to update existing predictions;
+    it does not run the networks again.
 
     Args:
-        predictions: of the training split, by a recogniser that was not trained on the objects
-            (nextview predict --held-out). Fitted to the objects that the map network was not
-            trained on either.
-        card: of the map network; "valley_classes" is written into it.
+        predictions: predictions of the training split by a recogniser that was not trained on the
+            objects (nextview predict --held-out). The fit uses those objects that the map network
+            was not trained on either.
+        card: card of the map network, into which "valley_classes" is written.
     """
     table = Predictions.load(predictions)
 

@@ -230,10 +230,10 @@ def train_map(
             measure).
         out: folder for checkpoints, logs and network.pt, the network of the epoch with the lowest
             squared error.
-        predictions: for --measure confidence, of the store's training split, by the recogniser
-            whose confidence is to be predicted.
-        weights: folder of a finished run of the same depth and input from which a ResNet starts: a
-            recogniser's, or a map network's to go on with.
+        predictions: for --measure confidence: predictions of the store's training split by the
+            recogniser whose confidence is to be predicted.
+        weights: folder of a finished run from which a ResNet of the same depth and input starts:
+            that of a recogniser, or that of a map network to continue.
 
     Raises:
         DatasetError: the store lacks what it takes, or another process trains in the same folder.

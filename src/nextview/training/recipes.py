@@ -71,14 +71,16 @@ class RecogniserRecipe:
         seed: seed of all random draws.
         ensemble_seed: seed of the initial weights and draws of one network of an ensemble; --seed
             decides the validation objects of all.
-        input: what the network sees: a depth camera's, or the shaded image.
-        augment: by default views are varied: mirrored, shifted, scaled, partly hidden.
-        balanced: by default rare classes are drawn more often; else every view comes once in turn.
-        lr_schedule: of the rate: up and down, or halved every fifth epoch.
+        input: input of the network: the geometry that a depth camera measures, or a shaded image.
+        augment: by default views are augmented: mirrored, shifted, scaled, partly hidden.
+        balanced: by default rare classes are drawn more often; otherwise every view is drawn once
+            in turn.
+        lr_schedule: schedule of the learning rate: one cycle up and down, or halved every fifth
+            epoch.
         patience: stop after so many epochs without a better class mean on validation; 0 never stops
             early.
-        interpolation: how far the parameters go in the end, from the first to the trained ones.
-            Less than 1 keeps more of what the network learned before (Wortsman et al., "Robust
+        interpolation: position of the final weights between the initial (0) and the trained ones
+            (1). Less than 1 keeps more of what the network learned before (Wortsman et al., "Robust
             fine-tuning of zero-shot models", CVPR 2022).
     """
 
@@ -136,28 +138,31 @@ class MapRecipe:
     """How a map network is trained.
 
     Attributes:
-        measure: of views, whose map it predicts: one that the store holds (nextview measure), or
-            "confidence", the recogniser's where it is right, which takes predictions.
-        input: what the network sees: the geometry of the view, through a ResNet; or the partial
-            cloud, through a PointNet, as published.
-        layers: of the ResNet.
+        measure: measure of views that is predicted: one that the store holds (nextview measure), or
+            "confidence", the belief of the recogniser in the true class, which needs
+            --predictions.
+        input: input of the network: the geometry of the view for a ResNet, or the partial cloud for
+            a PointNet, as published.
+        layers: number of layers of the ResNet.
         size: side of the ResNet's input image, pixels.
-        points: drawn from each cloud in training; validation and use take all 1,024.
-        extent: what it predicts: the local window alone, or all views.
+        points: number of points drawn from each cloud in training; validation and use take all
+            1,024.
+        extent: predicted views: the local window, or all views.
         epochs: passes over the training objects.
-        views_per_object: of each object in one epoch, drawn at random.
-        batch: views a step.
+        views_per_object: random views of each object in one epoch.
+        batch: views per step.
         lr: peak learning rate of AdamW.
-        weight_decay: of AdamW.
-        orthogonality_weight: of the orthogonality terms of the PointNet's transforms.
-        peak_weight: of the cross-entropy of the window's highest cell, beside the squared error of
-            all.
-        peak_sharpness: of --peak-weight: values are divided by it to give log-odds.
-        peak_reach: of --peak-weight: 0 for the highest cell itself, 1 for its four neighbours too.
-        mirror: by default left and right are exchanged in half of the views, in the map too.
-        lr_schedule: of the rate: up and down, or a tenth every fifth epoch.
-        validation_share: part of the training split held out for validation.
-        seed: decides everything random.
+        weight_decay: weight decay of AdamW.
+        orthogonality_weight: weight of the orthogonality terms of the PointNet's transforms.
+        peak_weight: weight of the cross-entropy of the window's highest cell, beside the squared
+            error of all cells.
+        peak_sharpness: for --peak-weight: values are divided by it to give log-odds.
+        peak_reach: for --peak-weight: 0 for the highest cell alone, 1 for its four neighbours too.
+        mirror: by default half of the views are mirrored left to right, with their maps.
+        lr_schedule: schedule of the learning rate: one cycle up and down, or divided by ten every
+            fifth epoch.
+        validation_share: share of the training split that is held out for validation.
+        seed: seed of all random draws.
         patience: stop after so many epochs without a lower error on validation; 0 never stops
             early.
     """
@@ -214,23 +219,23 @@ class GainRecipe:
     """How the gain policy is trained.
 
     Attributes:
-        inputs: of the networks: belief, view, place, azimuth_bin and any maps of the predictions;
-            in scenes visibility too, the share of the object that is expected to show from each
-            view.
-        frame: from where azimuths are counted: from the camera's, or from the object's azimuth bin
-            0, which takes a recogniser with azimuth bins.
+        inputs: inputs of the networks: belief, view, place, azimuth_bin and any maps of the
+            predictions; in scenes also visibility, the expected visible share of the object from
+            each view.
+        frame: origin of the azimuths: that of the camera, or azimuth bin 0 of the object, which
+            needs a recogniser with azimuth bins.
         objective: value of a view: the belief in the true class after it, its logarithm, or whether
             the answer is right.
-        max_views: the values of views 2 to this one are learned.
+        max_views: number of views in an episode; the values of the second to this one are learned.
         hidden: width of the two hidden layers.
-        networks_per_fold: averaged, of each fold; each weighs the objects by a bootstrap draw of
-            its own.
-        epochs: each over new episodes of all objects.
-        episodes: of each object in an epoch.
-        batch: states in a step.
-        lr: AdamW's learning rate at its peak (one-cycle).
-        weight_decay: AdamW's.
-        seed: of everything random.
+        networks_per_fold: networks that are averaged in each fold; each weights the objects by a
+            bootstrap draw of its own.
+        epochs: number of epochs, each with new episodes of all objects.
+        episodes: episodes of each object in one epoch.
+        batch: states per step.
+        lr: peak learning rate of AdamW (one-cycle).
+        weight_decay: weight decay of AdamW.
+        seed: seed of all random draws.
     """
 
     inputs: tuple[str, ...] = POLICY_INPUTS

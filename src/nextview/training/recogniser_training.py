@@ -413,10 +413,10 @@ def train_recogniser(
         out: folder for checkpoints, logs and network.pt, the network of the epoch with the best
             class mean.
         deformed: stores of the same objects or some of them, stretched and rotated (nextview render
-            --stretch .25 --rotated --seed 1 and so on) or through sensors (--sensor mix); their
-            views may be others.
-        weights: start from a published checkpoint, torchvision's of the same depth or
-            EfficientNet-Lite0's, or go on from the run in this folder, on other data or for longer.
+            --stretch .25 --rotated --seed 1 and so on) or through sensors (--sensor mix);
+            they may have other viewpoints.
+        weights: published checkpoint to start from (torchvision's of the same depth, or
+            EfficientNet-Lite0's), or folder of a run to continue, on other data or for longer.
 
     Raises:
         DatasetError: a store cannot be used, or another process trains in the same folder.

@@ -68,12 +68,13 @@ def fit_unknown(
     workers: int | None = None,
     track: TrackProgress = silently,
 ) -> FittedUnknown:
-    """Teach a recogniser to notice objects of unknown classes at a chosen false-alarm rate.
+    """Fit the detection of objects of unknown classes, at a chosen false-alarm rate.
 
-    It remembers views of its training objects. How novel other views of known classes are is
-    measured on the objects that its card calls held out. All objects are turned about the vertical
-    at random; half of them are stretched. The novelty score goes into NAME.novelty.safetensors
-    beside the card, and its SHA-256 into the card. A run that was stopped begins anew.
+    The novelty score of a view is its distance to the nearest stored views of the training objects.
+    The scores of known classes are measured on the objects that the card lists as held out. All
+    objects are rotated about the vertical at random; half of them are stretched. The stored views
+    are written to NAME.novelty.safetensors beside the card, and their SHA-256 into the card. An
+    interrupted run starts over.
 
     Args:
         meshes: folder of the meshes that the recogniser was trained on; its test split is not used.
