@@ -139,8 +139,8 @@ class MapRecipe:
 
     Attributes:
         measure: measure of views that is predicted: one that the store holds (nextview measure), or
-            "confidence", the belief of the recogniser in the true class, which needs
-            --predictions.
+            "confidence", the belief of the recogniser in its answer, and 0 where the answer is
+            wrong, which needs --predictions.
         input: input of the network: the geometry of the view for a ResNet, or the partial cloud for
             a PointNet, as published.
         layers: number of layers of the ResNet.
