@@ -131,7 +131,7 @@ def test_a_page_is_one_file_that_says_all(made, tmp_path, capsys):
     page = path.read_text()
     assert "__VISER_EMBED_DATA__" in page
     assert "&lt;b&gt;my table" in page
-    assert "3 frames: 2 sure, 0 not sure, 0 unknown" in page
+    assert "3 frames: 2 confident, 0 not confident, 0 unknown" in page
     for thing in scene.objects:
         assert f"{thing.number} {thing.name.replace('_', ' ')} <small>confident" in page
     with pytest.raises(ResultsError):

@@ -57,7 +57,7 @@ def doubts_of(scene: Scene) -> list[str]:
             continue
         beliefs = sorted(thing.result.beliefs.items(), key=lambda pair: -pair[1])
         rest = [f"{one} {belief:.2f}" for one, belief in beliefs[:MOST_CANDIDATES]]
-        said.append(f"{thing.number} is not sure: {', '.join(rest)}")
+        said.append(f"{thing.number} is not confident: {', '.join(rest)}")
     return said
 
 

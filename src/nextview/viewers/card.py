@@ -52,7 +52,7 @@ def walk_card(walk: Walk) -> str:
     goes_on = (
         "It would stop here."
         if walk.stopped
-        else "Not sure enough yet: it would look again."
+        else "Not confident yet: another view is needed."
     )
 
     parts = [

@@ -156,7 +156,7 @@ class Page:
             initial_value=exploration.mesh is None,
         )
         step = gui.add_button("Take the next view")
-        walk = gui.add_button("Go on until it is sure")
+        walk = gui.add_button("Continue until confident")
         restart = gui.add_button("Start over")
         self._preview = gui.add_html("", visible=False)
 

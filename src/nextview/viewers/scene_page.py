@@ -120,7 +120,8 @@ def scene_card(scene: Scene, title: str) -> str:
     frames = f"{count} frame{'s' * (count > 1)}"
     sure = sum(thing.confident for thing in objects)
     unknown = sum(thing.name == UNKNOWN_NAME for thing in objects)
-    said = f"{frames}: {sure} sure, {len(objects) - sure - unknown} not sure, {unknown} unknown"
+    doubtful = len(objects) - sure - unknown
+    said = f"{frames}: {sure} confident, {doubtful} not confident, {unknown} unknown"
     if not objects:
         said = f"{frames}: nothing stands on the plane"
     parts = "".join(_object_card(thing) for thing in objects)

@@ -74,6 +74,6 @@ def colour_of(thing: SceneObject) -> str:
 
 
 def named(thing: SceneObject) -> str:
-    """The name of an object, with a question mark where it is not sure."""
+    """The name of an object, with a question mark where it is not confident."""
     doubt = "" if thing.confident or thing.name == UNKNOWN_NAME else "?"
     return thing.name.replace("_", " ") + doubt
