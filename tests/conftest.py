@@ -16,7 +16,9 @@ import pytest
 import trimesh
 from filelock import FileLock
 from hypothesis import settings
+from small_tables import meshes_of
 
+import nextview
 from nextview.data.samples import sample_mesh
 from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import MapNetwork, Models, NetworkRecogniser
@@ -107,6 +109,18 @@ def knobs_memory(shared, knobs) -> Path:
         learn(knobs, folder / "mine", unit="m", upright=True, workers=0)
 
     return shared("knobs_memory", make) / "mine"
+
+
+@pytest.fixture(scope="session")
+def ycb():
+    """The system that knows the bundled household things."""
+    return nextview.load("ycb", threads=1)
+
+
+@pytest.fixture(scope="session")
+def ycb_meshes():
+    """Some of these things, by name."""
+    return meshes_of(("cracker_box", "mug", "banana", "tomato_soup_can"))
 
 
 @pytest.fixture(scope="session")

@@ -379,16 +379,26 @@ def test_a_stage_that_resumes_says_what_it_did(views, tmp_path, capsys, monkeypa
         assert said in " ".join(capsys.readouterr().err.split())
 
 
-def test_where_there_is_no_terminal_a_line_tells_how_far_it_is(monkeypatch):
+def test_where_there_is_no_terminal_lines_tell_how_far_it_is_the_first_at_once(
+    monkeypatch,
+):
     file = io.StringIO()
+    seconds = 0
     monkeypatch.setattr(progress, "console", Console(file=file, width=80))
-    monkeypatch.setattr(progress, "EVERY", 0.0)
-    progress.track(range(1, 7), 6, "rendering v.zarr")
-    lines = file.getvalue().splitlines()
-    assert lines
-    assert all(
-        re.fullmatch(r"rendering v.zarr: \d of 6 after \d+ s", line) for line in lines
-    )
+    monkeypatch.setattr(progress.time, "monotonic", lambda: seconds)
+
+    def steps():
+        nonlocal seconds
+        assert file.getvalue() == "rendering v.zarr: begun, 100 in all\n"
+        while seconds < 100:
+            seconds += 1
+            yield seconds
+
+    progress.track(steps(), 100, "rendering v.zarr")
+    lines = file.getvalue().splitlines()[1:]
+    assert lines == [
+        f"rendering v.zarr: {n} of 100 after {n} s" for n in (6, 17, 38, 69, 100)
+    ]
 
 
 def test_render_says_at_once_what_sizes_the_networks_take(furniture, tmp_path, capsys):

@@ -52,27 +52,30 @@ def built(folder: Path, meshes: Path) -> list[Room]:
     ]
 
 
-def a_room(folder: Path, **changed) -> Room:
-    """A cube of one metre in the middle of a room of 6 x 4 x 2.5 m, looked at along +x."""
-    path = pipeline.write_off(folder / "cube.off", trimesh.creation.box((1, 1, 1)))
-    pose = np.eye(4)
-    pose[:3, :3] = np.transpose([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
-    pose[:3, 3] = -2.5, 0, 0.5
-    cube = Standing(path.name, mesh_hash(path), np.sqrt(0.75))
+def room_with(folder: Path, mesh: trimesh.Trimesh, pose: np.ndarray, **changed) -> Room:
+    """A thing in the middle of a room of 6 x 4 x 2.5 m, and a camera with a pose."""
+    path = pipeline.write_off(folder / "thing.off", mesh)
+    radius = np.linalg.norm(mesh.vertices - mesh.bounds.mean(0), axis=1).max()
     given = {
-        "name": "cube@room-0",
+        "name": "thing@room-0",
         "kind": "floor",
         "seed": 0,
-        "label": "cube",
-        "target": cube,
-    }
-    given |= {
+        "label": "thing",
+        "target": Standing(path.name, mesh_hash(path), round(float(radius), 5)),
         "width": 6.0,
         "depth": 4.0,
         "height": 2.5,
         "pose": tuple(pose.ravel().tolist()),
     }
     return build_room(RoomLayout(**given | changed), folder)
+
+
+def a_room(folder: Path, **changed) -> Room:
+    """A cube of one metre, looked at along +x."""
+    pose = np.eye(4)
+    pose[:3, :3] = np.transpose([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    pose[:3, 3] = -2.5, 0, 0.5
+    return room_with(folder, trimesh.creation.box((1, 1, 1)), pose, **changed)
 
 
 # Geometry
@@ -294,22 +297,12 @@ def looked_at(
     distance: float,
     height: float,
 ) -> Room:
-    """A thing that stands in the middle of a room, and a camera aimed at its centre."""
-    path = pipeline.write_off(folder / "thing.off", mesh)
-    size = float(np.linalg.norm(mesh.vertices - mesh.bounds.mean(0), axis=1).max())
-    thing = Standing(path.name, mesh_hash(path), round(size, 5))
+    """A thing in the middle of a room, and a camera aimed at its centre."""
     centre = np.array([0, 0, np.ptp(mesh.vertices[:, 2]) / 2])
     aside = np.array([-distance, 0.3, height - centre[2]])
     pose = level_pose(aside / np.linalg.norm(aside), float(np.linalg.norm(aside)))
     pose[:3, 3] += centre
-    given = {"name": "thing@room-0", "kind": "floor", "seed": 0, "label": "thing"}
-    given |= {
-        "width": 8.0,
-        "depth": 4.0,
-        "height": 2.4,
-        "pose": tuple(pose.ravel().tolist()),
-    }
-    return build_room(RoomLayout(target=thing, **given), folder)
+    return room_with(folder, mesh, pose, width=8.0, height=2.4)
 
 
 def found_in(room: Room, **asked) -> tuple[float, float, float]:

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from PIL import Image
 from scipy.spatial import cKDTree
-from small_tables import camera_over, meshes_of, view, without
+from small_tables import camera_over, view, without
 
 import nextview
 from nextview.cli.main import main
@@ -18,32 +18,20 @@ from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box
 from nextview.simulation.tables import SimulatedTable, TableCamera
 
-NAMES = ("cracker_box", "mug", "banana", "tomato_soup_can")
-
-
-@pytest.fixture(scope="module")
-def system():
-    return nextview.load("ycb", threads=1)
-
-
-@pytest.fixture(scope="module")
-def meshes():
-    return meshes_of(NAMES)
-
 
 def by_name(scene) -> dict:
     return {thing.name: thing for thing in scene.objects}
 
 
-def test_all_things_are_found_named_and_placed_in_one_frame(system, meshes):
-    camera = camera_over(list(meshes.values()))
-    scene = nextview.Scene(system)
+def test_all_things_are_found_named_and_placed_in_one_frame(ycb, ycb_meshes):
+    camera = camera_over(list(ycb_meshes.values()))
+    scene = nextview.Scene(ycb)
     look = scene.update(camera.frame(view(20)))
     assert look.taken
-    assert len(look.appeared) == len(NAMES)
+    assert len(look.appeared) == len(ycb_meshes)
 
     found = by_name(scene)
-    assert set(found) == set(NAMES)
+    assert set(found) == set(ycb_meshes)
     for number, thing in enumerate(camera.table.things):
         true = camera.owner == number
         mask = found[thing.name].pixels[0]
@@ -56,9 +44,9 @@ def test_all_things_are_found_named_and_placed_in_one_frame(system, meshes):
         assert add_s < 0.1 * diameter
 
 
-def test_objects_keep_their_numbers_from_frame_to_frame(system, meshes):
-    camera = camera_over(list(meshes.values()), sensor="wrist")
-    scene = nextview.Scene(system)
+def test_objects_keep_their_numbers_from_frame_to_frame(ycb, ycb_meshes):
+    camera = camera_over(list(ycb_meshes.values()), sensor="wrist")
+    scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20)))
     before = {name: thing.number for name, thing in by_name(scene).items()}
     look = scene.update(camera.frame(view(110)))
@@ -69,9 +57,9 @@ def test_objects_keep_their_numbers_from_frame_to_frame(system, meshes):
             assert set(by_name(scene)[thing.name].pixels) == {0, 1}
 
 
-def test_a_sure_object_keeps_its_pixels_in_every_frame(system, meshes):
-    camera = camera_over([meshes["cracker_box"], meshes["banana"]])
-    scene = nextview.Scene(system)
+def test_a_sure_object_keeps_its_pixels_in_every_frame(ycb, ycb_meshes):
+    camera = camera_over([ycb_meshes["cracker_box"], ycb_meshes["banana"]])
+    scene = nextview.Scene(ycb)
     for degrees in (20, 60, 100, 140):
         scene.update(camera.frame(view(degrees)))
     for thing in scene.objects:
@@ -82,26 +70,26 @@ def test_a_sure_object_keeps_its_pixels_in_every_frame(system, meshes):
     assert (mask & true).sum() > 0.75 * (mask | true).sum()
 
 
-def test_an_empty_table_is_said_to_be_empty(system):
+def test_an_empty_table_is_said_to_be_empty(ycb):
     camera = camera_over([])
-    scene = nextview.Scene(system)
+    scene = nextview.Scene(ycb)
     look = scene.update(camera.frame(view(20)))
     assert scene.objects == ()
     assert [warning.name for warning in look.warnings] == ["empty"]
 
 
-def test_a_frame_without_a_plane_is_refused(system):
+def test_a_frame_without_a_plane_is_refused(ycb):
     rng = np.random.default_rng(0)
     depth = rng.uniform(0.4, 3.0, (240, 320)).astype(np.float32)
-    scene = nextview.Scene(system)
+    scene = nextview.Scene(ycb)
     with pytest.raises(ObservationError, match="no support plane"):
         scene.update(Frame(depth, [[300, 0, 160], [0, 300, 120], [0, 0, 1]], view(20)))
     assert scene.frames == ()
 
 
-def test_a_second_frame_needs_a_pose(system, meshes):
-    camera = camera_over([meshes["mug"]])
-    scene = nextview.Scene(system)
+def test_a_second_frame_needs_a_pose(ycb, ycb_meshes):
+    camera = camera_over([ycb_meshes["mug"]])
+    scene = nextview.Scene(ycb)
     frame = camera.frame(view(20))
     scene.update(replace(frame, pose=None, pixel_centre=0.5))
     assert by_name(scene)["mug"].result.pose_frame == "camera"
@@ -109,11 +97,11 @@ def test_a_second_frame_needs_a_pose(system, meshes):
         scene.update(frame)
 
 
-def test_strangers_are_unknown_and_their_size_is_told(system):
+def test_strangers_are_unknown_and_their_size_is_told(ycb):
     ring = trimesh.creation.torus(0.06, 0.022)
     stranger = make_mesh(ring.vertices, ring.faces, "ring", "m")
     camera = camera_over([stranger])
-    scene = nextview.Scene(system)
+    scene = nextview.Scene(ycb)
     for degrees in (20, 110):
         scene.update(camera.frame(view(degrees)))
     (thing,) = scene.objects
@@ -127,20 +115,20 @@ def test_strangers_are_unknown_and_their_size_is_told(system):
     )
 
 
-def test_a_thing_that_was_taken_away_is_gone(system, meshes):
-    camera = camera_over(list(meshes.values()))
-    scene = nextview.Scene(system)
+def test_a_thing_that_was_taken_away_is_gone(ycb, ycb_meshes):
+    camera = camera_over(list(ycb_meshes.values()))
+    scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20)))
     mug = by_name(scene)["mug"].number
     camera.change(without(camera.table, "mug"))
     look = scene.update(camera.frame(view(80)))
     assert look.gone == (mug,)
-    assert set(by_name(scene)) == set(NAMES) - {"mug"}
+    assert set(by_name(scene)) == set(ycb_meshes) - {"mug"}
 
 
-def test_a_thing_that_was_moved_stays_itself(system, meshes):
-    camera = camera_over([meshes["cracker_box"], meshes["mug"]])
-    scene = nextview.Scene(system)
+def test_a_thing_that_was_moved_stays_itself(ycb, ycb_meshes):
+    camera = camera_over([ycb_meshes["cracker_box"], ycb_meshes["mug"]])
+    scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20)))
     before = by_name(scene)["mug"]
     shift = np.eye(4)
@@ -159,9 +147,9 @@ def test_a_thing_that_was_moved_stays_itself(system, meshes):
 
 
 @pytest.mark.parametrize("wrong", ["shifted", "turned"])
-def test_a_frame_with_a_wrong_pose_is_left_out(system, meshes, wrong):
-    camera = camera_over(list(meshes.values()))
-    scene = nextview.Scene(system)
+def test_a_frame_with_a_wrong_pose_is_left_out(ycb, ycb_meshes, wrong):
+    camera = camera_over(list(ycb_meshes.values()))
+    scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20)))
     before = {thing.number: thing.place for thing in scene.objects}
     frame = camera.frame(view(80))
@@ -178,43 +166,43 @@ def test_a_frame_with_a_wrong_pose_is_left_out(system, meshes, wrong):
     }.keys() == before.keys()
 
     assert scene.update(frame).taken
-    assert set(by_name(scene)) == set(NAMES)
+    assert set(by_name(scene)) == set(ycb_meshes)
 
 
-def test_where_to_look_next_shows_what_was_hidden(system, meshes):
-    camera = camera_over(list(meshes.values()), seed=3)
-    scene = nextview.Scene(system)
+def test_where_to_look_next_shows_what_was_hidden(ycb, ycb_meshes):
+    camera = camera_over(list(ycb_meshes.values()), seed=3)
+    scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20)))
-    hidden = set(NAMES) - set(by_name(scene))
+    hidden = set(ycb_meshes) - set(by_name(scene))
     assert hidden == {"mug"}
     assert not scene.done
 
     scene.update(camera.frame(scene.target))
-    assert set(by_name(scene)) == set(NAMES)
+    assert set(by_name(scene)) == set(ycb_meshes)
 
 
-def test_no_view_is_asked_for_that_the_camera_cannot_be_brought_to(system, meshes):
-    camera = camera_over([meshes["mug"], meshes["banana"]])
-    scene = nextview.Scene(system, reachable=lambda pose: pose[0, 3] > 0.1)
+def test_no_view_is_asked_for_that_the_camera_cannot_be_brought_to(ycb, ycb_meshes):
+    camera = camera_over([ycb_meshes["mug"], ycb_meshes["banana"]])
+    scene = nextview.Scene(ycb, reachable=lambda pose: pose[0, 3] > 0.1)
     assert scene.target is None
     scene.update(camera.frame(view(20)))
     assert scene.target[0, 3] > 0.1
     assert scene.target[2, 3] > 0.1
-    nowhere = nextview.Scene(system, reachable=lambda pose: False)
+    nowhere = nextview.Scene(ycb, reachable=lambda pose: False)
     nowhere.update(camera.frame(view(20)))
     assert nowhere.target is None
 
 
-def test_only_the_region_is_looked_at(system, meshes):
-    camera = camera_over([meshes["cracker_box"], meshes["mug"]])
+def test_only_the_region_is_looked_at(ycb, ycb_meshes):
+    camera = camera_over([ycb_meshes["cracker_box"], ycb_meshes["mug"]])
     middle = camera.table.things[1].placed.mean(0)
     region = Box(middle - 0.1, middle + 0.1)
-    scene = nextview.Scene(system, region=region)
+    scene = nextview.Scene(ycb, region=region)
     scene.update(camera.frame(view(20)))
     assert set(by_name(scene)) == {"mug"}
 
 
-def test_a_table_full_of_unknown_things(system):
+def test_a_table_full_of_unknown_things(ycb):
     rings = []
     for number, (radius, tube) in enumerate(
         [(0.06, 0.022), (0.05, 0.015), (0.045, 0.02)]
@@ -222,16 +210,16 @@ def test_a_table_full_of_unknown_things(system):
         ring = trimesh.creation.torus(radius, tube)
         rings.append(make_mesh(ring.vertices, ring.faces, f"ring {number}", "m"))
     camera = camera_over(rings, gap=0.1)
-    scene = nextview.Scene(system)
+    scene = nextview.Scene(ycb)
     for degrees in (20, 110):
         scene.update(camera.frame(view(degrees)))
     assert [thing.name for thing in scene.objects] == ["unknown"] * 3
     assert scene.target is not None
 
 
-def test_a_hand_over_the_table_changes_no_name(system, meshes):
-    camera = camera_over([meshes["cracker_box"], meshes["banana"]])
-    scene = nextview.Scene(system)
+def test_a_hand_over_the_table_changes_no_name(ycb, ycb_meshes):
+    camera = camera_over([ycb_meshes["cracker_box"], ycb_meshes["banana"]])
+    scene = nextview.Scene(ycb)
     frame = camera.frame(view(20))
     rows, columns = np.nonzero(camera.owner == 1)  # the banana
     depth = frame.depth.copy()
@@ -267,8 +255,8 @@ _CENTRE = np.array(
 )  # OpenCV counts from the first pixel's
 
 
-def test_the_command_says_what_is_on_the_table(meshes, tmp_path, capsys):
-    camera = camera_over([meshes["cracker_box"], meshes["mug"]])
+def test_the_command_says_what_is_on_the_table(ycb_meshes, tmp_path, capsys):
+    camera = camera_over([ycb_meshes["cracker_box"], ycb_meshes["mug"]])
     captured(camera, (20, 60), tmp_path / "table")
     figure = tmp_path / "table.png"
     main(

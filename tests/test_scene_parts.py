@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from small_tables import camera_over, meshes_of, view
+from small_tables import camera_over, view
 
 import nextview
 from nextview.scene.floating import floating
@@ -15,22 +15,11 @@ from nextview.scene.parting import Bench, merged, new_track, taken_over
 from nextview.scene.tracks import Track
 from nextview.sensing.tabletop import TableTop
 
-NAMES = ("cracker_box", "mug", "tomato_soup_can")
 UP = np.array([0, 0, 1.0])
 
 
-@pytest.fixture(scope="module")
-def system():
-    return nextview.load("ycb", threads=1)
-
-
-@pytest.fixture(scope="module")
-def meshes():
-    return meshes_of(NAMES)
-
-
-def judged_by(system):
-    judge = Judge(system, 1)
+def judged_by(ycb):
+    judge = Judge(ycb, 1)
 
     def judged(tracks):
         results = judge([track.thing for track in tracks])
@@ -43,12 +32,12 @@ def judged_by(system):
 
 
 def two_sides(
-    system,
+    ycb,
     camera,
     degrees=(20, 140),
 ) -> tuple[list[list[Track]], list[Bench]]:
     """The objects of each of two frames as objects of their own, judged, with their frames."""
-    judged = judged_by(system)
+    judged = judged_by(ycb)
     found, benches = [], []
     for number, angle in enumerate(degrees):
         top = TableTop.of(camera.frame(view(angle)), UP)
@@ -63,10 +52,10 @@ def two_sides(
     return found, benches
 
 
-def test_two_sides_of_one_thing_are_one_object_and_two_things_stay_two(system, meshes):
+def test_two_sides_of_one_thing_are_one_object_and_two_things_stay_two(ycb, ycb_meshes):
     found, benches = two_sides(
-        system,
-        camera_over([meshes["tomato_soup_can"], meshes["cracker_box"]]),
+        ycb,
+        camera_over([ycb_meshes["tomato_soup_can"], ycb_meshes["cracker_box"]]),
     )
     assert [len(tracks) for tracks in found] == [2, 2]
     every = [track for tracks in found for track in tracks]
@@ -80,8 +69,8 @@ def test_two_sides_of_one_thing_are_one_object_and_two_things_stay_two(system, m
     assert merged(found[0], benches[:1]) == found[0]
 
 
-def test_an_object_that_ended_takes_no_pixels(system, meshes):
-    found, benches = two_sides(system, camera_over([meshes["tomato_soup_can"]]), (20,))
+def test_an_object_that_ended_takes_no_pixels(ycb, ycb_meshes):
+    found, benches = two_sides(ycb, camera_over([ycb_meshes["tomato_soup_can"]]), (20,))
     ((can,),) = found
     ended = replace(can, frames=())
     unjudged = replace(can, number=5, result=None)
@@ -89,9 +78,9 @@ def test_an_object_that_ended_takes_no_pixels(system, meshes):
     assert taken_over([can, unjudged], benches)[0].absorbed == (5,)
 
 
-def test_a_look_tells_which_numbers_end_in_another_object(system, meshes):
-    camera = camera_over([meshes["mug"], meshes["cracker_box"]])
-    scene = nextview.Scene(system)
+def test_a_look_tells_which_numbers_end_in_another_object(ycb, ycb_meshes):
+    camera = camera_over([ycb_meshes["mug"], ycb_meshes["cracker_box"]])
+    scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20)))
     mug = next(track for track in scene._tracks if track.result.answer == "mug")
     scene._tracks.append(
@@ -103,9 +92,9 @@ def test_a_look_tells_which_numbers_end_in_another_object(system, meshes):
     assert len(scene.objects) == 2
 
 
-def test_a_lone_thing_that_is_elsewhere_may_be_a_wrong_pose(system, meshes):
-    camera = camera_over([meshes["mug"]])
-    scene = nextview.Scene(system)
+def test_a_lone_thing_that_is_elsewhere_may_be_a_wrong_pose(ycb, ycb_meshes):
+    camera = camera_over([ycb_meshes["mug"]])
+    scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20)))
     frame = camera.frame(view(60))
     pose = frame.pose.copy()
@@ -115,8 +104,8 @@ def test_a_lone_thing_that_is_elsewhere_may_be_a_wrong_pose(system, meshes):
     assert [warning.name for warning in look.warnings] == ["pose"]
 
 
-def test_the_ground_is_below_what_may_be_a_thing(meshes):
-    camera = camera_over([meshes["mug"]])
+def test_the_ground_is_below_what_may_be_a_thing(ycb_meshes):
+    camera = camera_over([ycb_meshes["mug"]])
     frame = camera.frame(view(20, elevation=35.0, distance=2.2))
     table = np.array([0, 0, 0.0])
     small = TableTop.of(frame, UP, widest=0.4).plane
@@ -126,9 +115,9 @@ def test_the_ground_is_below_what_may_be_a_thing(meshes):
     assert TableTop.of(frame, UP).plane.height(table) == pytest.approx(0, abs=0.02)
 
 
-def test_what_stands_behind_another_thing_is_not_seen(system, meshes):
-    camera = camera_over([meshes["cracker_box"], meshes["tomato_soup_can"]])
-    scene = nextview.Scene(system)
+def test_what_stands_behind_another_thing_is_not_seen(ycb, ycb_meshes):
+    camera = camera_over([ycb_meshes["cracker_box"], ycb_meshes["tomato_soup_can"]])
+    scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20, elevation=65.0)))
     tracks = {track.result.most_like: track for track in scene._tracks}
     box, can = (
@@ -144,13 +133,13 @@ def test_what_stands_behind_another_thing_is_not_seen(system, meshes):
 
 
 def test_a_thing_floats_unless_it_stands_on_the_plane_or_on_another_object(
-    system,
-    meshes,
+    ycb,
+    ycb_meshes,
 ):
-    camera = camera_over([meshes["mug"]])
+    camera = camera_over([ycb_meshes["mug"]])
     top = TableTop.of(camera.frame(view(20)), UP)
     whole = max(top.segments(), key=np.count_nonzero)
-    judged = judged_by(system)
+    judged = judged_by(ycb)
     mug = judged([new_track(whole, Bench(top, 0, judged))])[0]
     assert mug.result.answer == "mug"
     assert floating([mug], top.plane) == [False]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from small_tables import camera_over, meshes_of, view, without
+from small_tables import camera_over, view, without
 
 pytest.importorskip("rerun", reason="the extra 'record' is not installed")
 pytest.importorskip("viser", reason="the extra 'explore' is not installed")
@@ -20,16 +20,16 @@ NAMES = ("cracker_box", "mug", "banana")
 
 
 @pytest.fixture(scope="module")
-def camera():
+def camera(ycb_meshes):
     """Over three known things."""
-    return camera_over(list(meshes_of(NAMES).values()))
+    return camera_over([ycb_meshes[name] for name in NAMES])
 
 
 @pytest.fixture(scope="module")
-def made(camera, tmp_path_factory):
+def made(ycb, camera, tmp_path_factory):
     """A scene of three frames, the banana gone from the last; and its recording, made meanwhile."""
     path = tmp_path_factory.mktemp("recorded") / "scene.rrd"
-    scene = nextview.Scene(nextview.load("ycb", threads=1))
+    scene = nextview.Scene(ycb)
     recorder = SceneRecorder(path)
     for degrees in (20, 60):
         scene.update(camera.frame(view(degrees)))

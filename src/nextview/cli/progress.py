@@ -1,4 +1,4 @@
-"""Progress on standard error: a bar in a terminal, else a line now and then."""
+"""Progress on standard error: a bar in a terminal, else lines, the first one at once."""
 
 import time
 from collections.abc import Iterable, Iterator
@@ -11,7 +11,9 @@ from rich.text import Text
 
 from nextview.cli.exit_status import printable
 
-EVERY = 30.0  # seconds between two lines where the output is no terminal
+# seconds to the second line where the output is no terminal, and between two lines in the end
+FIRST_WAIT = 5.0
+LONGEST_WAIT = 30.0
 
 
 class Terminal(Console):
@@ -122,12 +124,16 @@ def _show_bar(done: Iterable[int], total: int, what: str) -> None:
 
 
 def _print_lines(done: Iterable[int], total: int, what: str) -> None:
+    """Print a line when the work begins, and then less and less often."""
+    console.print(f"{what}: begun, {total} in all", soft_wrap=True)
     begun = last = time.monotonic()
+    wait = FIRST_WAIT
     for n in done:
         now = time.monotonic()
-        if now - last > EVERY:
+        if now - last > wait:
             console.print(
                 f"{what}: {n} of {total} after {now - begun:.0f} s",
                 soft_wrap=True,
             )
             last = now
+            wait = min(2 * wait, LONGEST_WAIT)

@@ -155,6 +155,34 @@ class RoomMeshes:
     small: dict[str, tuple[str, ...]]
 
 
+@dataclass(frozen=True)
+class LifeSizeMesh:
+    """A mesh as large as in life.
+
+    Attributes:
+        file: below the folder of the meshes.
+        sha256: of the file.
+        mesh: what it holds.
+        radius: object radius, metres.
+    """
+
+    file: str
+    sha256: str
+    mesh: Mesh
+    radius: float
+
+    @classmethod
+    def of(
+        cls,
+        folder: Path,
+        file: str,
+        mesh: Mesh,
+        radius: float,
+    ) -> "LifeSizeMesh":
+        """A mesh of a file below a folder, and its object radius, metres."""
+        return cls(file, mesh_hash(folder / file), mesh, _short(radius))
+
+
 def draw_rooms(
     dataset: Path,
     out: Path,
@@ -299,14 +327,18 @@ def draw_room(source: RoomMeshes, task: RoomTask, seed: int) -> RoomLayout:
     rng = np.random.default_rng([seed, *task.name.encode()])
     mesh = load_mesh(source.folder / task.target, unit=source.unit)
     radius = life_radius(mesh, task.label, rng)
+    thing = LifeSizeMesh.of(source.folder, task.target, mesh, radius)
+
     for _ in range(ROOM_LAYOUTS_TRIED):
-        layout = _layout(source, task, mesh, radius, rng)
+        layout = _layout(source, task, thing, seed, rng)
         if layout is None:
             continue
+
         room = build_room(layout, source.folder, MAX_FACES)
         pose = _first_view(room, rng)
         if pose is not None:
-            return _with_pose(layout, seed, pose)
+            return replace(layout, pose=tuple(np.round(pose, 5).ravel().tolist()))
+
     raise DatasetError(
         f"{source.folder / task.target}: shows in none of {ROOM_LAYOUTS_TRIED} rooms"
     )
@@ -338,18 +370,19 @@ def life_radius(mesh: Mesh, label: str, rng: np.random.Generator) -> float:
 def _layout(
     source: RoomMeshes,
     task: RoomTask,
-    mesh: Mesh,
-    radius: float,
+    thing: LifeSizeMesh,
+    seed: int,
     rng: np.random.Generator,
 ) -> RoomLayout | None:
     """A room without a first view, its target on the floor or a table; None where nothing fits."""
     width, depth, height = rng.uniform(
         *np.transpose([ROOM_SIDE, ROOM_SIDE, ROOM_HEIGHT])
     )
-    small = task.label in ON_TABLES or (mesh.metres is not None and radius < HAND_SIZED)
+    measured = thing.mesh.metres is not None
+    small = task.label in ON_TABLES or (measured and thing.radius < HAND_SIZED)
     furnish = _on_table if small else _on_floor
 
-    placed = furnish(source, task, mesh, radius, (width, depth), rng)
+    placed = furnish(source, task, thing, (width, depth), rng)
     if placed is None:
         return None
 
@@ -357,7 +390,7 @@ def _layout(
     return RoomLayout(
         name=task.name,
         kind="table" if small else "floor",
-        seed=0,
+        seed=seed,
         label=task.label,
         target=target,
         width=_short(width),
@@ -372,19 +405,18 @@ def _layout(
 def _on_floor(
     source: RoomMeshes,
     task: RoomTask,
-    mesh: Mesh,
-    radius: float,
+    thing: LifeSizeMesh,
     room: tuple[float, float],
     rng: np.random.Generator,
 ) -> Furnished | None:
     """A target on the floor, half of them with the back to a wall; None where nothing fits."""
     back = np.radians(LIFE_SIZES[task.label].back) if task.label in LIFE_SIZES else 0.0
     against = bool(rng.integers(2))
-    target = _standing(source, task.target, mesh, radius, room, back, against, rng)
+    target = _standing(thing, room, back, against, rng)
     if target is None:
         return None
 
-    taken = [footprint(at_rest(mesh.vertices, target))]
+    taken = [footprint(at_rest(thing.mesh.vertices, target))]
     objects, slabs = _furniture(source, task.split, room, taken, rng)
     return target, objects, slabs
 
@@ -392,8 +424,7 @@ def _on_floor(
 def _on_table(
     source: RoomMeshes,
     task: RoomTask,
-    mesh: Mesh,
-    radius: float,
+    thing: LifeSizeMesh,
     room: tuple[float, float],
     rng: np.random.Generator,
 ) -> Furnished | None:
@@ -401,13 +432,13 @@ def _on_table(
     slabs = _table(room, rng)
     top = slabs[0]
     upright = task.label in ON_TABLES
-    poses = np.eye(3)[None] if upright else resting_poses(mesh)
+    poses = np.eye(3)[None] if upright else resting_poses(thing.mesh)
     rest = poses[rng.integers(len(poses))]
     azimuth = rng.uniform(0, 2 * np.pi)
     if upright:  # its back to the wall, as the table's
         azimuth = top.azimuth + np.pi / 2 - np.radians(LIFE_SIZES[task.label].back)
     taken: list[Float] = []
-    target = _lying(source, task.target, mesh, (radius, azimuth, rest), top, taken, rng)
+    target = _lying(thing, azimuth, rest, top, taken, rng)
     if target is None:
         return None
 
@@ -423,34 +454,21 @@ def _on_table(
     return target, [*objects, *more], [*slabs, *boxes]
 
 
-def _with_pose(layout: RoomLayout, seed: int, pose: Float) -> RoomLayout:
-    """A layout with the seed that drew it and the pose of its first view, (4, 4)."""
-    return replace(layout, seed=seed, pose=tuple(np.round(pose, 5).ravel().tolist()))
-
-
 def _standing(
-    source: RoomMeshes,
-    file: str,
-    mesh: Mesh,
-    radius: float,
+    thing: LifeSizeMesh,
     room: tuple[float, float],
     back: float,
     against: bool,
     rng: np.random.Generator,
 ) -> Standing | None:
-    """Place a mesh on the floor of a room; None where it is too large.
+    """Place a mesh on the floor of a room, ``against`` a wall or anywhere.
 
-    It stands anywhere, or with its back against a wall.
+    ``back`` is the direction from its middle to its back, radians. None where it is too large.
     """
     wall = int(rng.integers(4))
     azimuth = np.pi / 2 * wall - back if against else rng.uniform(0, 2 * np.pi)
-    thing = Standing(
-        file,
-        mesh_hash(source.folder / file),
-        _short(radius),
-        azimuth=_short(azimuth),
-    )
-    half = np.ptp(at_rest(mesh.vertices, thing)[:, :2], axis=0) / 2
+    placed = Standing(thing.file, thing.sha256, thing.radius, azimuth=_short(azimuth))
+    half = np.ptp(at_rest(thing.mesh.vertices, placed)[:, :2], axis=0) / 2
     free = np.array(room) / 2 - half - AT_WALL[1]
     if (free <= 0).any():
         return None
@@ -460,7 +478,7 @@ def _standing(
         axis = wall % 2
         side = 1 if wall < 2 else -1
         place[axis] = side * (room[axis] / 2 - half[axis] - rng.uniform(*AT_WALL))
-    return replace(thing, x=_short(place[0]), y=_short(place[1]))
+    return replace(placed, x=_short(place[0]), y=_short(place[1]))
 
 
 def _furniture(
@@ -473,32 +491,53 @@ def _furniture(
     """Furniture against the walls, away from footprints that are taken; these are added."""
     objects: list[Standing] = []
     slabs: list[Slab] = []
-    others = source.furniture.get(split, ())
 
     for _ in range(int(rng.integers(FURNITURE[0], FURNITURE[1] + 1))):
         for _ in range(PLACES_TRIED):
-            thing: Standing | Slab | None = _cabinet(room, rng)
-            corners = (
-                _slab_corners(thing) if isinstance(thing, Slab) else np.zeros((0, 3))
-            )
-            if others and rng.integers(3):
-                file, label = others[int(rng.integers(len(others)))]
-                mesh = _other(source.folder / file)
-                if mesh is None:
-                    continue
-                back = np.radians(LIFE_SIZES[label].back)
-                radius = life_radius(mesh, label, rng)
-                thing = _standing(source, file, mesh, radius, room, back, True, rng)
-                if thing is None:
-                    continue
-                corners = at_rest(mesh.vertices, thing)
+            piece, corners = _piece(source, split, room, rng)
+            if piece is None:
+                continue
+
             outline = footprint(corners)
-            if min(separation(outline, other) for other in taken) >= FURNITURE_GAP:
-                taken.append(outline)
-                (objects if isinstance(thing, Standing) else slabs).append(thing)  # type: ignore[arg-type]
-                break
+            if min(separation(outline, there) for there in taken) < FURNITURE_GAP:
+                continue
+
+            taken.append(outline)
+            if isinstance(piece, Slab):
+                slabs.append(piece)
+            else:
+                objects.append(piece)
+            break
 
     return objects, slabs
+
+
+def _piece(
+    source: RoomMeshes,
+    split: str,
+    room: tuple[float, float],
+    rng: np.random.Generator,
+) -> tuple[Standing | Slab | None, Float]:
+    """A cabinet or another piece of furniture against a wall, and its corners, (K, 3).
+
+    None for a mesh that cannot be used or is too large.
+    """
+    cabinet = _cabinet(room, rng)
+    others = source.furniture.get(split, ())
+    if not others or not rng.integers(3):
+        return cabinet, _slab_corners(cabinet)
+
+    file, label = others[int(rng.integers(len(others)))]
+    mesh = _other(source.folder / file)
+    if mesh is None:
+        return None, np.zeros((0, 3))
+
+    radius = life_radius(mesh, label, rng)
+    thing = LifeSizeMesh.of(source.folder, file, mesh, radius)
+    placed = _standing(thing, room, np.radians(LIFE_SIZES[label].back), True, rng)
+    if placed is None:
+        return None, np.zeros((0, 3))
+    return placed, at_rest(mesh.vertices, placed)
 
 
 @lru_cache(maxsize=64)
@@ -550,40 +589,37 @@ def _table(room: tuple[float, float], rng: np.random.Generator) -> list[Slab]:
 
 
 def _lying(
-    source: RoomMeshes,
-    file: str,
-    mesh: Mesh,
-    how: tuple[float, float, Float],
+    thing: LifeSizeMesh,
+    azimuth: float,
+    rest: Float,
     top: Slab,
     taken: list[Float],
     rng: np.random.Generator,
 ) -> Standing | None:
-    """Place a mesh on a table in a resting pose; None where it does not fit.
+    """Place a mesh on a table in a resting pose, a rotation (3, 3); None where it does not fit.
 
     Its footprint is added to those of the other things.
     """
-    radius, azimuth, rest = how
     rotation = (
         IDENTITY if np.array_equal(rest, np.eye(3)) else tuple(rest.ravel().tolist())
     )
-    sha256 = mesh_hash(source.folder / file)
 
     for _ in range(PLACES_TRIED):
         aside = _on_top(top, rng)
-        thing = Standing(
-            mesh=file,
-            sha256=sha256,
-            radius=_short(radius),
+        placed = Standing(
+            mesh=thing.file,
+            sha256=thing.sha256,
+            radius=thing.radius,
             x=_short(aside[0]),
             y=_short(aside[1]),
             z=_short(top.z + top.height),
             azimuth=_short(azimuth),
             rotation=rotation,
         )
-        outline = footprint(at_rest(mesh.vertices, thing))
+        outline = footprint(at_rest(thing.mesh.vertices, placed))
         if _fits(outline, top, taken):
             taken.append(outline)
-            return thing
+            return placed
 
     return None
 
@@ -602,8 +638,8 @@ def _beside(
         mesh = _other(source.folder / file, source.unit)
         if mesh is None or mesh.metres is None or mesh.metres > HAND_SIZED:
             return None
-        how = mesh.metres, rng.uniform(0, 2 * np.pi), np.eye(3)
-        return _lying(source, file, mesh, how, top, taken, rng)
+        thing = LifeSizeMesh.of(source.folder, file, mesh, mesh.metres)
+        return _lying(thing, rng.uniform(0, 2 * np.pi), np.eye(3), top, taken, rng)
 
     x, y = _on_top(top, rng)
     size = rng.uniform(*np.transpose(BOOK))

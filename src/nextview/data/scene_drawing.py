@@ -291,46 +291,31 @@ def draw_scene(
     hiding = _Hiding(mesh)
 
     for _ in range(SCENE_LAYOUTS_TRIED):
-        placed = _layout(
-            mesh,
-            others,
-            meshes.folder,
-            hiding,
-            level,
-            CLUTTER_LEVELS[level] + rng.uniform(-SPREAD, SPREAD),
-            rng,
+        goal = CLUTTER_LEVELS[level] + rng.uniform(-SPREAD, SPREAD)
+        placed = _layout(mesh, others, meshes.folder, hiding, level, goal, rng)
+        if placed is None:
+            continue
+
+        scene = TargetScene(mesh, tuple(item for _, item in placed))
+        shares = visible_shares(
+            scene,
+            SCENE_VIEWS.poses,
+            SHARE_PIXELS,
+            SCENE_VIEWS.distance,
+        )
+        reachable = scene.reachable(SCENE_VIEWS.poses[:, :3, 3])
+        things = [thing for thing, _ in placed]
+        return SceneLayout(
+            name=name,
+            level=level,
+            seed=seed,
+            target=Placement(target, mesh_hash(meshes.folder / target)),
+            objects=tuple(thing for thing in things if isinstance(thing, Placement)),
+            blocks=tuple(thing for thing in things if isinstance(thing, Block)),
+            visible=tuple(_rounded(*shares)),
+            unreachable=tuple(np.flatnonzero(~reachable).tolist()),
         )
 
-        if placed is not None:
-            scene = TargetScene(mesh, tuple(item for _, item in placed))
-            objects = tuple(
-                thing for thing, _ in placed if isinstance(thing, Placement)
-            )
-            blocks = tuple(thing for thing, _ in placed if isinstance(thing, Block))
-            shares = tuple(
-                _rounded(
-                    *visible_shares(
-                        scene,
-                        SCENE_VIEWS.poses,
-                        SHARE_PIXELS,
-                        SCENE_VIEWS.distance,
-                    )
-                )
-            )
-            unreachable = tuple(
-                np.flatnonzero(~scene.reachable(SCENE_VIEWS.poses[:, :3, 3])).tolist()
-            )
-            middle = Placement(target, mesh_hash(meshes.folder / target))
-            return SceneLayout(
-                name,
-                level,
-                seed,
-                middle,
-                objects,
-                blocks,
-                shares,
-                unreachable,
-            )
     raise DatasetError(
         f"{meshes.folder / target}: no layout of {SCENE_LAYOUTS_TRIED} lets"
         f" {CLUTTER_LEVELS[level]:.0%} of it show"

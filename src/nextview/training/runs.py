@@ -3,7 +3,6 @@
 import csv
 import io
 import logging
-import pickle
 import re
 import time
 import warnings
@@ -160,7 +159,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             return torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise ModelError(f"{path}: there is no such checkpoint") from None
-    except (*DAMAGED, pickle.UnpicklingError) as error:
+    except DAMAGED as error:
         what = f"a damaged checkpoint or one that torch cannot read safely ({type(error).__name__})"
         raise ModelError(
             f"{path}: {what}; give another, or delete it to begin this training anew"
