@@ -24,7 +24,18 @@ from nextview.recognition.belief import Calibration
 from nextview.recognition.inference import MapNetwork, Models, NetworkRecogniser
 from nextview.teaching.learn import learn
 
-LONG = ("test_workflow.py", "test_training.py")
+LONG = (
+    "test_training.py",
+    "test_site.py",
+    "test_captured.py",
+    "test_poses.py",
+    "test_outputs.py",
+    "test_pages.py",
+    "test_scene.py",
+    "test_verification.py",
+    "test_verification_fit.py",
+    "test_wheel.py",
+)
 """Files that take longest: begun first, no process is left alone with one at the end."""
 
 settings.register_profile("nextview", deadline=None)
@@ -37,11 +48,9 @@ def pytest_collection_modifyitems(items):
             item.add_marker(
                 pytest.mark.skip(reason="takes minutes: NEXTVIEW_TESTS=all runs it")
             )
-    items.sort(
-        key=lambda item: (
-            LONG.index(item.path.name) if item.path.name in LONG else len(LONG)
-        )
-    )
+    last = len(LONG)
+    place = {name: k for k, name in enumerate(LONG)}
+    items.sort(key=lambda item: place.get(item.path.name, last))
 
 
 @pytest.fixture(scope="session")
@@ -85,6 +94,16 @@ def taught(shared, scans) -> Path:
         )
         / "mine"
     )
+
+
+@pytest.fixture(scope="session")
+def shown(shared, scans, taught) -> Path:
+    """They, seen through a sensor: views.zarr, and what the models say of it, predictions.npz."""
+
+    def make(folder: Path) -> None:
+        pipeline.show_taught(scans, taught, folder)
+
+    return shared("shown", make)
 
 
 @pytest.fixture(scope="session")

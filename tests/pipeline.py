@@ -329,6 +329,15 @@ def store_of(
     return store
 
 
+def show_taught(scans: Path, models: Path, folder: Path, *options: str) -> None:
+    """Taught things through a sensor: views.zarr, and what is said of them, predictions.npz."""
+    store = str(folder / "views.zarr")
+    render = ["render", str(scans), store, "--sensor", "wrist", "--rotated", *options]
+    predict = ["predict", store, str(folder / "predictions.npz")]
+    main([*render, "--workers", "0"])
+    main([*predict, "--models", str(models), "--workers", "0"])
+
+
 # Scenes: meshes in metres, and a pinhole camera that casts rays at them
 
 INTRINSICS = np.array([[520.0, 0, 310.5], [0, 530.0, 246.5], [0, 0, 1]])

@@ -578,12 +578,11 @@ def test_learn_names_the_frames_that_it_leaves_out_and_refuses_wrong_poses(
     tmp_path,
 ):
     depths, poses = nine
-    for name in ("chair", "stool"):
-        write_frames(tmp_path / "things" / name, "7scenes", depths, poses)
+    write_frames(tmp_path / "things/stool", "7scenes", depths, poses)
     cut_image(tmp_path / "things/stool")
     write_frames(tmp_path / "things/wrong", "7scenes", depths, np.linalg.inv(poses))
     learned = learn(tmp_path / "things", tmp_path / "mine", workers=0)
-    assert learned.things == 2
+    assert learned.things == 1
     wrong, frame = sorted(learned.left_out, key=lambda phrase: "stool" in phrase)
     assert "the poses are inverse" in wrong
     assert "1 of 9 frames" in frame

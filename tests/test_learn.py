@@ -13,7 +13,6 @@ from scipy.special import logsumexp
 
 import nextview
 from nextview.benchmark.replay import make_specs, replay, truncate
-from nextview.cli.main import main
 from nextview.data.predictions import Predictions
 from nextview.data.samples import sample_mesh
 from nextview.errors import DatasetError, NextviewError, UsageError
@@ -96,27 +95,8 @@ def test_the_explorer_shows_the_leading_things_as_they_were_taught(taught, scans
     np.testing.assert_array_equal(remembered_picture(bundled, 100, 1, 3), drawn.picture)
 
 
-def test_predictions_of_taught_things_replay_with_their_policy(
-    tmp_path,
-    taught,
-    scans,
-    capsys,
-):
-    store, table = tmp_path / "shown.zarr", tmp_path / "shown.npz"
-    main(
-        [
-            "render",
-            str(scans),
-            str(store),
-            "--sensor",
-            "wrist",
-            "--rotated",
-            "--workers",
-            "0",
-        ]
-    )
-    main(["predict", str(store), str(table), "--models", str(taught), "--workers", "0"])
-    specs = make_specs(Predictions.load(table), 4, 0)
+def test_predictions_of_taught_things_replay_with_their_policy(taught, shown):
+    specs = make_specs(Predictions.load(shown / "predictions.npz"), 4, 0)
     for policy in ("random-all", str(taught / "memory.json")):
         ends = truncate(replay(policy, specs, 3, 0), Stopping(0.999, 3))
         assert (ends.answer == specs.labels).mean() > 0.9

@@ -38,20 +38,10 @@ FLOATS = (
 ARRAYS = (*FLOATS, "thing", "pictures", "places", "faces", "counts")
 
 
-@pytest.fixture(scope="session")
-def sized(shared, scans):
-    """A memory of three things whose sizes are known."""
-
-    def make(folder):
-        nextview.learn(scans, folder / "mine", unit="cm", upright=True, workers=0)
-
-    return shared("sized", make) / "mine"
-
-
 @pytest.fixture
-def models(sized, tmp_path):
-    """A copy of it."""
-    return shutil.copytree(sized, tmp_path / "mine")
+def models(knobs_memory, tmp_path):
+    """A copy of a memory of three things whose sizes are known."""
+    return shutil.copytree(knobs_memory, tmp_path / "mine")
 
 
 @pytest.fixture(scope="module")
@@ -265,7 +255,7 @@ def test_arrays_that_fit_together_have_to_fit_card_and_features(
     ):
         open_recogniser(models / "memory.json")
     with pytest.raises(ModelError, match=r"memory\.safetensors"):
-        nextview.learn(models, models, remove=("table",))
+        nextview.learn(models, models, remove=("can",))
 
 
 def changed_card(models, change):
@@ -421,6 +411,7 @@ VALUES = {
     "text": lambda value: "\x00",
     "number": lambda value: -1,
     "large": lambda value: 10**30,
+    "not a number": lambda value: np.nan,
     "list": lambda value: [],
     "object": lambda value: {},
     "shorter": lambda value: (
@@ -470,23 +461,19 @@ def test_any_other_field_is_refused_by_name_or_the_memory_works(
     assert refused > 20
 
 
-def meshes_by_name(scans):
-    return {path.stem: load_mesh(path, unit="cm") for path in sorted(scans.iterdir())}
-
-
 def test_a_memory_holds_the_surface_of_each_thing_in_the_frame_of_its_file(
-    sized,
-    scans,
+    knobs_memory,
+    knobs,
 ):
-    things = TaughtThings.of(open_recogniser(sized / "memory.json"))
-    meshes = meshes_by_name(scans)
+    things = TaughtThings.of(open_recogniser(knobs_memory / "memory.json"))
+    meshes = {path.stem: load_mesh(path, unit="m") for path in sorted(knobs.iterdir())}
     assert things.names == tuple(meshes)
     for surface, mesh in zip(
         things.verifier.caster.surfaces,
         meshes.values(),
         strict=True,
     ):
-        in_file = (mesh.vertices * mesh.radius + mesh.centre) / 100
+        in_file = mesh.vertices * mesh.radius + mesh.centre
         step = np.ptp(in_file, axis=0).max() / 65535
         np.testing.assert_allclose(surface.vertices, in_file, atol=step)
         np.testing.assert_array_equal(surface.faces, mesh.faces)

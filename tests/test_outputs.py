@@ -48,7 +48,7 @@ WRITES = {
         "p.npz",
         "--models {models} --maps lem --split test --workers 0",
     ),
-    "learn": (f"learn {Path(SAMPLE).parent}", "folder", "--upright --workers 0"),
+    "learn": ("learn {scan}", "folder", "--upright --workers 0"),
     "evaluate": ("evaluate {predictions}", "folder", "--split test --samples 10"),
     "benchmark": (
         "benchmark {predictions}",
@@ -90,8 +90,11 @@ def made(
     list(
         write_capture(can, folder / "capture", ViewSphere((40.0,), 3), 0.07, table=True)
     )
+    (folder / "scan").mkdir()
+    shutil.copy(SAMPLE, folder / "scan")
     return {
         "capture": folder / "capture",
+        "scan": folder / "scan",
         "furniture": furniture,
         "views": own,
         "models": models,
@@ -195,23 +198,23 @@ def test_what_exists_is_refused_and_overwritten_on_demand_only(
 # The home folder
 
 HOMELY = {
-    "recognise": (
-        "from nextview.cli.main import main; main(['recognise', SAMPLE, '--max-views', '1'])"
+    "a recognition": (
+        "import nextview; from nextview.cli.main import main;"
+        " nextview.recognise(SAMPLE); main(['recognise', SAMPLE, '--max-views', '1'])"
     ),
-    "from Python": "import nextview; nextview.recognise(SAMPLE)",
-    "learn": (
-        "from nextview.cli.main import main; main(['learn', FOLDER, 'mine', '--upright',"
-        " '--workers', '0'])"
+    "pictures": (
+        "import nextview; from nextview.cli.main import main;"
+        " nextview.recognise(SAMPLE).plot('e.png');"
+        " main(['learn', SCAN, 'mine', '--upright', '--workers', '0'])"
     ),
-    "a figure": "import nextview; nextview.recognise(SAMPLE).plot('e.png')",
 }
 
 
 @pytest.mark.parametrize("job", HOMELY)
-def test_a_run_writes_nothing_in_the_home_folder(job, tmp_path):
+def test_a_run_writes_nothing_in_the_home_folder(job, made, tmp_path):
     home = tmp_path / "home"
     home.mkdir()
-    code = f"SAMPLE, FOLDER = {SAMPLE!r}, {str(Path(SAMPLE).parent)!r}\n{HOMELY[job]}"
+    code = f"SAMPLE, SCAN = {SAMPLE!r}, {str(made['scan'])!r}\n{HOMELY[job]}"
     hidden = (
         "ORT_DISABLE_TELEMETRY",
         "MPLCONFIGDIR",
@@ -227,9 +230,7 @@ def test_a_run_writes_nothing_in_the_home_folder(job, tmp_path):
         path.relative_to(home).parts[:2] for path in home.rglob("*") if path.is_file()
     }
     # its list of fonts
-    assert written <= (
-        {(".cache", "matplotlib")} if job in ("a figure", "learn") else set()
-    )
+    assert written <= ({(".cache", "matplotlib")} if job == "pictures" else set())
 
 
 def test_who_wants_telemetry_keeps_it():

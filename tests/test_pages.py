@@ -222,11 +222,11 @@ def test_its_options_are_there(line, capsys):
 
 
 SMALL = {
-    "render": "--workers 1",
+    "render": "--workers 0",
     "train recogniser": (
         "--size 32 --epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4"
     ),
-    "predict": "--workers 1",
+    "predict": "--workers 0",
     "fit calibration": "--delta 0.2",
     "train gain": "--folds 2 --epochs 1 --episodes 1 --networks-per-fold 1",
     "benchmark": "--runs 2 --samples 100",

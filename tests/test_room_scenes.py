@@ -61,7 +61,7 @@ def room_with(folder: Path, mesh: trimesh.Trimesh, pose: np.ndarray, **changed) 
         "kind": "floor",
         "seed": 0,
         "label": "thing",
-        "target": Standing(path.name, mesh_hash(path), round(float(radius), 5)),
+        "target": Standing(path.name, mesh_hash(path), float(radius)),
         "width": 6.0,
         "depth": 4.0,
         "height": 2.5,

@@ -45,6 +45,12 @@ def system(several):
     )
 
 
+@pytest.fixture(scope="module")
+def alone():
+    """The network without memories."""
+    return nextview.load(threads=1, policy="spread")
+
+
 def test_memories_come_first_and_names_that_two_know_are_told_apart(several, known):  # noqa: F811
     assert several.classes[:4] == ("block", "bottle", "carton", "mug")
     assert several.classes[4:] == NetworkRecogniser(threads=1).classes
@@ -64,17 +70,22 @@ def test_a_thing_is_named_with_its_pose(system, meshes, name):  # noqa: F811
 
 @pytest.mark.parametrize("name", ["chair", "table", "monitor"])
 @pytest.mark.parametrize("unit", ["cm", None])
-def test_a_class_is_named_where_no_thing_explains_what_is_seen(system, name, unit):
+def test_a_class_is_named_where_no_thing_explains_what_is_seen(
+    system,
+    alone,
+    name,
+    unit,
+):
     shown = replace(sample_mesh(name), unit=unit)
     result = system.recognise(shown, start=12, seed=2)
     assert result.answer == name
     assert result.pose is None
     assert result.why_no_pose
-    alone = nextview.load(threads=1, policy="spread").recognise(shown, start=12, seed=2)
+    by_network = alone.recognise(shown, start=12, seed=2)
     ours = result.views[0].belief[4:]
     np.testing.assert_allclose(
         ours / ours.sum(),
-        alone.views[0].belief,
+        by_network.views[0].belief,
         atol=0.02 if unit else 1e-6,
     )
 

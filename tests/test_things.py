@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from pipeline import some_predictions
+from pipeline import show_taught, some_predictions
 from scipy.special import log_softmax
 
 from nextview.benchmark.replay import make_specs, replay, replay_policy
-from nextview.cli.main import main
 from nextview.data.predictions import Predictions
 from nextview.data.rendering import rotations
 from nextview.data.store import ViewStore
@@ -79,37 +78,12 @@ def test_things_are_compared_from_meshes_on_under_the_same_azimuth_and_other_noi
     tmp_path,
     scans,
     taught,
-    capsys,
+    shown,
 ):
-    tables = [tmp_path / f"{k}.npz" for k in range(2)]
-    for k, more in enumerate(([], ["--noise-seed", "1"])):
-        store = str(tmp_path / f"{k}.zarr")
-        main(
-            [
-                "render",
-                str(scans),
-                store,
-                "--sensor",
-                "wrist",
-                "--rotated",
-                "--workers",
-                "0",
-                *more,
-            ]
-        )
-        main(
-            [
-                "predict",
-                store,
-                str(tables[k]),
-                "--models",
-                str(taught),
-                "--maps",
-                "--workers",
-                "0",
-            ]
-        )
-    first, again = (ViewStore.open(tmp_path / f"{k}.zarr") for k in range(2))
+    show_taught(scans, taught, tmp_path, "--noise-seed", "1")
+    both = (shown, tmp_path)
+    first, again = (ViewStore.open(folder / "views.zarr") for folder in both)
+    tables = [folder / "predictions.npz" for folder in both]
     np.testing.assert_array_equal(rotations(first), rotations(again))
     assert not np.array_equal(first.depth(0), again.depth(0))
     THINGS["main"](

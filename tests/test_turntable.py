@@ -111,8 +111,7 @@ def test_a_thing_from_a_turntable_is_recognised_by_its_mesh(frames, scans, tmp_p
         match=r"chair: its frames have no poses; --turntable ccw or cw says",
     ):
         learn(tmp_path / "things", tmp_path / "mine", workers=0)
-    for name in ("monitor", "table"):
-        shutil.copy(scans / f"{name}.off", tmp_path / "things")
+    shutil.copy(scans / "table.off", tmp_path / "things")
     found = learn(
         tmp_path / "things",
         tmp_path / "mine",
@@ -120,9 +119,9 @@ def test_a_thing_from_a_turntable_is_recognised_by_its_mesh(frames, scans, tmp_p
         turntable="ccw",
         workers=0,
     )
-    assert (found.things, found.left_out) == (3, ())
+    assert (found.things, found.left_out) == (2, ())
     system = nextview.load(models=tmp_path / "mine", unknown=0)
-    for name in ("chair", "monitor", "table"):
+    for name in ("chair", "table"):
         assert (
             system.recognise(
                 scans / f"{name}.off",
