@@ -25,6 +25,7 @@ from nextview.recognition.inference import MapNetwork, Models, NetworkRecogniser
 from nextview.teaching.learn import learn
 
 LONG = (
+    "test_workflow.py",
     "test_training.py",
     "test_site.py",
     "test_captured.py",

@@ -2,6 +2,8 @@
 
 import inspect
 import io
+import json
+import os
 import re
 import shutil
 import signal
@@ -9,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import redirect_stdout, suppress
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
@@ -259,40 +262,68 @@ PathFinder.find_spec = staticmethod(find)
 """Code that hides packages from the search of installed ones."""
 
 
-@pytest.mark.parametrize(
-    ("code", "extra"),
-    [
-        ("from nextview.viewers.recording import Recorder", "record"),
-        ("import nextview.benchmark.environments", "envs"),
-        ("from nextview.benchmark.run import run_benchmark", "benchmark"),
-        ("from nextview.benchmark.report import report", "benchmark"),
-        (
-            "from nextview.benchmark.evaluation_page import write_evaluation",
-            "benchmark",
-        ),
-        ("from nextview.viewers.page import Page", "explore"),
-        ("from nextview.training.recogniser_training import train_recogniser", "train"),
-        ("from nextview.training.export import export_map", "train"),
-        ("from nextview.training.gain_training import train_gain", "train"),
-        (
-            (
-                "from nextview.data.pool import each; list(each(print, [1], None,"
-                " 'tcp://localhost:1'))"
-            ),
-            "cluster",
-        ),
-    ],
-)
-def test_python_without_an_extra_names_it_too(code, extra):
-    caught = "    print(error)\nelse:\n    raise SystemExit('nothing was raised')"
-    body = (
-        f"import nextview\ntry:\n    {code}\nexcept "
-        f"nextview.MissingExtraError as error:\n{caught}"
-    )
-    done = run_python(HIDDEN + body)
+NEED_EXTRAS = {
+    "from nextview.viewers.recording import Recorder": "record",
+    "import nextview.benchmark.environments": "envs",
+    "from nextview.benchmark.run import run_benchmark": "benchmark",
+    "from nextview.benchmark.report import report": "benchmark",
+    "from nextview.benchmark.evaluation_page import write_evaluation": "benchmark",
+    "from nextview.viewers.page import Page": "explore",
+    "from nextview.training.recogniser_training import train_recogniser": "train",
+    "from nextview.training.export import export_map": "train",
+    "from nextview.training.gain_training import train_gain": "train",
+    (
+        "from nextview.data.pool import each;"
+        " list(each(print, [1], None, 'tcp://localhost:1'))"
+    ): "cluster",
+}
+HELPS = [
+    "train recogniser",
+    "train gain",
+    "export map",
+    "evaluate",
+    "benchmark",
+    "report",
+]
+WITHOUT_EXTRAS = f"""
+import io, json
+from contextlib import redirect_stderr, redirect_stdout
+import nextview
+from nextview.cli.main import main
+
+errors = {{}}
+for code in {list(NEED_EXTRAS)!r}:
+    try:
+        exec(code, {{}})
+    except nextview.MissingExtraError as error:
+        errors[code] = str(error)
+
+helps = {{}}
+for name in {HELPS!r}:
+    out, error = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(error):
+        try:
+            main([*name.split(), "--help"])
+        except SystemExit as end:
+            helps[name] = [end.code, out, error]
+    helps[name][1:] = out.getvalue(), error.getvalue()
+print(json.dumps([errors, helps]))
+"""
+
+
+@pytest.fixture(scope="module")
+def without_extras():
+    """What is said where no extra is installed: errors by code, and helps by command."""
+    done = run_python(HIDDEN + WITHOUT_EXTRAS, env=os.environ | {"COLUMNS": "80"})
     assert done.returncode == 0, done.stderr
-    assert f"pip install 'nextview[{extra}]'" in done.stdout
-    assert done.stdout.count("\n") == 1
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("code", NEED_EXTRAS)
+def test_python_without_an_extra_names_it_too(code, without_extras):
+    said = without_extras[0][code]
+    assert f"pip install 'nextview[{NEED_EXTRAS[code]}]'" in said
+    assert "\n" not in said
 
 
 def test_a_module_that_is_no_extra_is_no_missing_extra():
@@ -301,25 +332,17 @@ def test_a_module_that_is_no_extra_is_no_missing_extra():
     assert not isinstance(raised.value, MissingExtraError)
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["train recogniser", "train gain", "export map", "evaluate", "benchmark", "report"],
-)
-def test_help_needs_no_extra(name):
-    """The packages are hidden from the search of installed ones."""
-    done = run_python(
-        HIDDEN
-        + f"from nextview.cli.main import main; main({[*name.split(), '--help']!r})"
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith(f"usage: nextview {name} ")
-    assert "pip install 'nextview[" in done.stderr
-    assert (
-        done.stdout
-        == run_python(
-            f"from nextview.cli.main import main; main({[*name.split(), '--help']!r})"
-        ).stdout
-    )
+@pytest.mark.parametrize("name", HELPS)
+def test_help_needs_no_extra(name, without_extras, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    status, shown, said = without_extras[1][name]
+    assert status == 0
+    assert shown.startswith(f"usage: nextview {name} ")
+    assert "pip install 'nextview[" in said
+
+    with pytest.raises(SystemExit):
+        main([*name.split(), "--help"])
+    assert capsys.readouterr().out == shown
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
@@ -337,8 +360,9 @@ def test_a_shell_completes_the_whole_command(shell, capsys):
 def completions_for_bash(tmp_path_factory):
     pytest.importorskip("torch")
     path = tmp_path_factory.mktemp("bash") / "nextview.sh"
-    code = "from nextview.cli.main import main; main(['completion', 'bash'])"
-    path.write_text(run_python(code).stdout)
+    with redirect_stdout(io.StringIO()) as script, suppress(SystemExit):
+        main(["completion", "bash"])
+    path.write_text(script.getvalue())
     return path
 
 

@@ -313,56 +313,62 @@ def test_pointnet_ignores_the_order_of_points_and_begins_with_identities():
     )
 
 
-def test_export_keeps_the_answers(tmp_path):
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """A network whose rows of weights differ in magnitude, as in trained ones, and the folder of
+    its files, 16.onnx and 8.onnx, by the bits of a weight.
+    """
+    folder = tmp_path_factory.mktemp("exported")
     torch.manual_seed(0)
-    network = ResNet(18, 5, 4).eval()
-    x = torch.rand(2, 4, 64, 64)
-    export_onnx(network, x.numpy(), "input", ["logits"], tmp_path / "net.onnx")
-    assert [p.name for p in tmp_path.iterdir()] == ["net.onnx"]
-    session = ort.InferenceSession(tmp_path / "net.onnx")
-    more = torch.rand(3, 4, 64, 64)  # another batch size than the example's
+    network = ResNet(18, 10, 4).eval()
+    magnitudes = torch.logspace(-2, 1, 512)[:, None, None, None]
     with torch.no_grad():
-        expected = network(more)
-    for ours, theirs in zip(
-        session.run(None, {"input": more.numpy()}),
-        expected,
-        strict=True,
-    ):
-        assert np.abs(ours - theirs.numpy()).max() < 0.01 * theirs.abs().max()
-    assert (
-        sys.modules[ResNet.__module__].__file__.encode()
-        not in (tmp_path / "net.onnx").read_bytes()
+        network.layer4[1].conv1.weight *= magnitudes
+    example = torch.rand(2, 4, 64, 64).numpy()
+    for bits in (16, 8):
+        export_onnx(
+            network,
+            example,
+            "input",
+            ["logits"],
+            folder / f"{bits}.onnx",
+            bits,
+        )
+    return network, folder
+
+
+def answers(network, folder, bits):
+    """What a file and its network say of another number of inputs than the example's."""
+    x = torch.rand(3, 4, 64, 64, generator=torch.Generator().manual_seed(1))
+    session = ort.InferenceSession(
+        folder / f"{bits}.onnx",
+        providers=["CPUExecutionProvider"],
     )
+    with torch.no_grad():
+        expected = network(x)[0].numpy()
+    return session.run(["logits"], {"input": x.numpy()})[0], expected
+
+
+def test_export_keeps_the_answers(exported):
+    network, folder = exported
+    found, expected = answers(network, folder, 16)
+    assert np.abs(found - expected).max() < 0.01 * np.abs(expected).max()
+    assert sorted(path.name for path in folder.iterdir()) == ["16.onnx", "8.onnx"]
+    file = folder / "16.onnx"
+    assert sys.modules[ResNet.__module__].__file__.encode() not in file.read_bytes()
     full = sum(p.numel() for p in network.parameters()) * 4
-    assert (tmp_path / "net.onnx").stat().st_size < 0.6 * full
+    assert file.stat().st_size < 0.6 * full
 
 
 def test_eight_bits_a_weight_are_enough_for_the_answers_and_nearly_halve_the_file_again(
-    tmp_path,
+    exported,
 ):
-    torch.manual_seed(0)
-    network = ResNet(18, 10, 4).eval()
-    with torch.no_grad():  # every row of another magnitude, as in trained networks
-        network.layer4[1].conv1.weight *= torch.logspace(-2, 1, 512)[
-            :,
-            None,
-            None,
-            None,
-        ]
-    x = np.random.default_rng(0).random((2, 4, 64, 64)).astype(np.float32)
-    output = {}
+    network, folder = exported
+    error = {}
     for bits in (16, 8):
-        export_onnx(network, x, "input", ["logits"], tmp_path / f"{bits}.onnx", bits)
-        session = ort.InferenceSession(
-            tmp_path / f"{bits}.onnx",
-            providers=["CPUExecutionProvider"],
-        )
-        output[bits] = session.run(["logits"], {"input": x})[0]
-    true = network(torch.from_numpy(x))[0].detach().numpy()
-    assert np.abs(output[8] - true).max() < 0.02 * np.abs(true).max()
-    assert (
-        np.abs(output[8] - true).max() > np.abs(output[16] - true).max()
-    )  # so they do have fewer
-    assert (tmp_path / "8.onnx").stat().st_size < 0.55 * (
-        tmp_path / "16.onnx"
-    ).stat().st_size
+        found, expected = answers(network, folder, bits)
+        error[bits] = np.abs(found - expected).max()
+    assert error[8] < 0.02 * np.abs(expected).max()
+    assert error[8] > error[16]  # so they do have fewer
+    sizes = [(folder / f"{bits}.onnx").stat().st_size for bits in (8, 16)]
+    assert sizes[0] < 0.55 * sizes[1]
