@@ -40,7 +40,7 @@ def shop(tmp_path_factory):
             )
             path.parent.mkdir(parents=True, exist_ok=True)
             trimesh.creation.icosphere(2, radius * rng.uniform(0.8, 1.25)).export(path)
-    list(render(folder / "meshes", folder / "views.zarr", SPHERE, 32, workers=1))
+    list(render(folder / "meshes", folder / "views.zarr", SPHERE, 32, workers=0))
     change_card(
         make_recogniser(folder, CLASSES),
         held_out=["big_0", "big_1", "small_0", "small_1"],
@@ -110,7 +110,8 @@ def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
     assert np.isnan(ViewStore.open(views).radii).all()
     main(["predict", views, honest, "--held-out", card, "--recogniser", card, "--maps"])
     assert "--unit" in refused(capsys, "fit", "size", views, honest, card)
-    main(["render", str(shop / "meshes"), views, "--size", "32", "--unit", "cm"])
+    render_line = ["render", str(shop / "meshes"), views, "--size", "32"]
+    main([*render_line, "--unit", "cm", "--workers", "0"])
     radii = dict(
         zip(ViewStore.open(views).names, ViewStore.open(views).radii, strict=True)
     )
@@ -125,13 +126,13 @@ def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
                 Path(views),
                 SPHERE,
                 32,
-                workers=1,
+                workers=0,
                 options=RenderOptions(unit="m"),
             )
         )
 
     test = shop / "test.npz"
-    list(predict(Path(views), test, read_card(Path(card)), {}, "test", workers=1))
+    list(predict(Path(views), test, read_card(Path(card)), {}, "test", workers=0))
     by_shape = Predictions.load(test)
     assert by_shape.of_size is None
     main(["fit", "size", views, honest, card])
@@ -147,7 +148,7 @@ def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
             read_card(Path(card)),
             {},
             "test",
-            workers=1,
+            workers=0,
             overwrite=True,
         )
     )
@@ -162,7 +163,7 @@ def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
             {},
             "test",
             size=False,
-            workers=1,
+            workers=0,
             overwrite=True,
         )
     )
@@ -178,7 +179,7 @@ def test_from_the_meshes_to_the_belief(shop, tmp_path, capsys):
             read_card(Path(card)),
             {},
             "test",
-            workers=1,
+            workers=0,
         )
     )
     np.testing.assert_allclose(
