@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import redirect_stdout, suppress
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
@@ -362,9 +361,8 @@ def test_a_shell_completes_the_whole_command(shell, capsys):
 def completions_for_bash(tmp_path_factory):
     pytest.importorskip("torch")
     path = tmp_path_factory.mktemp("bash") / "nextview.sh"
-    with redirect_stdout(io.StringIO()) as script, suppress(SystemExit):
-        main(["completion", "bash"])
-    path.write_text(script.getvalue())
+    code = "from nextview.cli.main import main; main(['completion', 'bash'])"
+    path.write_text(run_python(code).stdout)
     return path
 
 
