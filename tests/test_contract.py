@@ -352,7 +352,8 @@ def test_episodes(name, golden):
         abs=1e-9,
     )
     np.testing.assert_allclose(found["belief"], wanted["belief"], rtol=0, atol=1e-5)
-    assert found["novelty"] == pytest.approx(wanted["novelty"], abs=1e-4)
+    # ONNX Runtime takes other kernels on other processors: 4e-4 between two of them.
+    assert found["novelty"] == pytest.approx(wanted["novelty"], abs=1e-3)
 
 
 def test_the_benchmarks_table(tmp_path, golden):
