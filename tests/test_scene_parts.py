@@ -11,7 +11,16 @@ import nextview
 from nextview.scene.floating import floating
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import TableGround
-from nextview.scene.parting import Bench, merged, new_track, taken_over
+from nextview.scene.parting import (
+    MOST_JOINED,
+    MOST_PARTS,
+    MOST_TRIMMED,
+    Bench,
+    merged,
+    new_track,
+    part,
+    taken_over,
+)
 from nextview.scene.tracks import Track
 from nextview.sensing.tabletop import TableTop
 
@@ -67,6 +76,30 @@ def test_two_sides_of_one_thing_are_one_object_and_two_things_stay_two(ycb, ycb_
     assert all(track.frames == (0, 1) for track in one_each)
     assert sorted(number for track in one_each for number in track.absorbed) == [10, 11]
     assert merged(found[0], benches[:1]) == found[0]
+
+
+def test_a_frame_full_of_scraps_is_parted_otherwise_a_few_times_only(ycb_meshes):
+    top = TableTop.of(camera_over([ycb_meshes["cracker_box"]]).frame(view(20)), UP)
+    (box,) = top.segments()
+    rows = np.flatnonzero(box.any(1))
+    strips = []
+    for some in np.array_split(rows[2:-2], 20):
+        strip = np.zeros_like(box)
+        strip[some] = box[some]
+        strips.append(strip)
+    unknown = SimpleNamespace(answer=None, pose=None, pose_candidates=())
+    judged = []
+
+    def judge(tracks):
+        judged.extend(tracks)
+        return [replace(track, result=unknown) for track in tracks]
+
+    bench = Bench(top, 0, judge)
+    tracks = judge([new_track(strip, bench) for strip in strips])
+    judged.clear()
+    assert len(part(tracks, bench, {})) == len(tracks)
+    # each strip and its neighbour would be 19 tries
+    assert MOST_JOINED <= len(judged) <= MOST_JOINED + MOST_TRIMMED + 2 * MOST_PARTS
 
 
 def test_an_object_that_ended_takes_no_pixels(ycb, ycb_meshes):

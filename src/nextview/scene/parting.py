@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
@@ -22,6 +22,7 @@ from nextview.scene.tracks import RenderedObject, Track, render_track
 from nextview.sensing.observed_object import ObservedObject
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS, Sighting, sighting_of
 from nextview.sensing.tabletop import NEAR_TABLE, TableTop
+from nextview.session.result import Recognition
 from nextview.types import Float, Index, Mask
 
 GOOD_FIT = 0.85  # share of an object's pixels that its scan explains, from which none is in doubt
@@ -40,6 +41,10 @@ NEAR_GAP = (
 NEAR_STEP = 0.03  # metres between their depths there, at most
 MOST_GROUP = 5  # segments that touch and are tried as one object
 MOST_TRIES = 2  # frames in which an object's pixels are parted otherwise in vain
+# objects that are judged anew in a frame at most, those with the most pixels first
+MOST_TRIMMED = 2  # that were not known before the frame
+MOST_PARTS = 4  # of those that are cut, and again of those whose rests are taken out
+MOST_JOINED = 10  # groups that are tried as one object in a frame, at most
 LEAST_TAKEN = 0.15  # share of an object's pixels that another one's scan takes over
 IN_EACH_OTHER = 0.5  # radii of the smaller of two scans between their centres, at most
 
@@ -52,19 +57,37 @@ class Bench:
         top: what the frame shows.
         number: of the frame.
         judge: says what objects are.
+        rendered: objects as they were rendered so far, by ``id`` of their results, in which frames
+            they were seen, and whether as what they are most like; each with its result, which
+            keeps its ``id`` to itself.
     """
 
     top: TableTop
     number: int
     judge: Callable[[Sequence[Track]], list[Track]]
+    rendered: dict[
+        tuple[int, tuple[int, ...], bool],
+        tuple[Recognition, RenderedObject | None],
+    ] = field(default_factory=dict, repr=False)
 
     def render(self, track: Track) -> RenderedObject | None:
         """What the frame would see of an object that was named."""
-        return render_track(track, self.top, self.number, track.posed)
+        return self._rendered(track, likeliest=False)
 
     def render_likeliest(self, track: Track) -> RenderedObject | None:
         """What the frame would see of an object if it were what it is most like."""
-        return render_track(track, self.top, self.number, track.likeliest)
+        return self._rendered(track, likeliest=True)
+
+    def _rendered(self, track: Track, likeliest: bool) -> RenderedObject | None:
+        """What the frame would see of an object, rendered once."""
+        if track.result is None:
+            return None
+        key = (id(track.result), track.frames, likeliest)
+        if key not in self.rendered:
+            posed = track.likeliest if likeliest else track.posed
+            rendered = render_track(track, self.top, self.number, posed)
+            self.rendered[key] = (track.result, rendered)
+        return self.rendered[key][1]
 
     def fit(self, track: Track) -> tuple[int, int]:
         """How many of an object's pixels its scan explains, and how many there are."""
@@ -264,7 +287,8 @@ def _trimmed(
     """Take away pixels beside the outline of what objects are most like: low ones, which the plane
     explains; and, of an object that was named before this frame, all, which may be another one's.
     """
-    changed = {}
+    smaller = {}
+    known = []
     for row, track in enumerate(tracks):
         mask = track.mask_in(bench.number)
         if mask is None or bench.is_good(track):
@@ -285,9 +309,15 @@ def _trimmed(
             kept |= mask & (bench.top.height > NEAR_TABLE)
         lost = 1 - float(kept.sum() / max(mask.sum(), 1))
         if LEAST_TRIMMED < lost < MOST_PLANE_SHARE:
-            with suppress(ObservationError):
-                changed[row] = track.with_mask(bench.number, kept, bench.top)
+            smaller[row] = kept
+            if named is not None:
+                known.append(row)
 
+    changed = {}
+    new = [row for row in _largest(smaller) if row not in known]
+    for row in [*known, *new[:MOST_TRIMMED]]:
+        with suppress(ObservationError):
+            changed[row] = tracks[row].with_mask(bench.number, smaller[row], bench.top)
     judged = bench.judge(list(changed.values()))
     tracks = list(tracks)
     for row, track in zip(changed, judged, strict=True):
@@ -296,11 +326,19 @@ def _trimmed(
     return tracks
 
 
+def _largest(masks: Mapping[int, Mask]) -> list[int]:
+    """Rows of some masks, (H, W) bool each, those with the most pixels first."""
+    return sorted(masks, key=lambda row: -np.count_nonzero(masks[row]))
+
+
 def _joined(tracks: Sequence[Track], bench: Bench) -> list[Track]:
     """Join objects that touch where one scan explains them all better than several do."""
     groups = _groups(tracks, bench)
+    masks = [track.mask_in(bench.number) for track in tracks]
+    pixels = [0 if mask is None else np.count_nonzero(mask) for mask in masks]
+    groups.sort(key=lambda group: -sum(pixels[row] for row in group))
     unions = []
-    for group in groups:
+    for group in groups[:MOST_JOINED]:
         with suppress(ObservationError):
             unions.append((group, _union([tracks[row] for row in group], bench)))
     judged = bench.judge([union for _, union in unions])
@@ -395,38 +433,40 @@ def _union(tracks: Sequence[Track], bench: Bench) -> Track:
 
 def _cut(tracks: Sequence[Track], bench: Bench) -> list[Track]:
     """Cut objects along their concave edges where several scans explain them better than one."""
-    tries: dict[int, list[Track]] = {}
-    for row, track in enumerate(tracks):
-        mask = track.mask_in(bench.number)
-        if mask is None or track.tries >= MOST_TRIES or bench.is_good(track):
-            continue
-        parts = bench.top.segments(mask, "never")
-        if 1 < len(parts) <= MOST_GROUP:
-            with suppress(ObservationError):
-                tries[row] = _parts(track, parts, bench)
-    return _better(tracks, tries, bench)
+    parts: dict[int, list[Mask]] = {}
+    for row in _doubtful(tracks, bench):
+        mask = tracks[row].mask_in(bench.number)
+        found = bench.top.segments(mask, "never")
+        if 1 < len(found) <= MOST_GROUP:
+            parts[row] = found
+    return _better(tracks, parts, bench)
+
+
+def _doubtful(tracks: Sequence[Track], bench: Bench) -> list[int]:
+    """Rows of objects that may be parted otherwise, those with the most pixels first."""
+    masks = {
+        row: mask
+        for row, track in enumerate(tracks)
+        if (mask := track.mask_in(bench.number)) is not None
+        and track.tries < MOST_TRIES
+        and not bench.is_good(track)
+    }
+    return _largest(masks)
 
 
 def _without_rests(tracks: Sequence[Track], bench: Bench) -> list[Track]:
     """Take out what each scan explains; what stays of its pixels is segmented anew."""
-    tries: dict[int, list[Track]] = {}
-    for row, track in enumerate(tracks):
-        mask = track.mask_in(bench.number)
-        rendered = bench.render_likeliest(track)
-        if (
-            mask is None
-            or rendered is None
-            or track.tries >= MOST_TRIES
-            or bench.is_good(track)
-        ):
+    parts: dict[int, list[Mask]] = {}
+    for row in _doubtful(tracks, bench):
+        mask = tracks[row].mask_in(bench.number)
+        rendered = bench.render_likeliest(tracks[row])
+        if mask is None or rendered is None:
             continue
         around = ndimage.binary_dilation(rendered.around(mask.shape), iterations=2)
         rests = bench.top.segments(mask & ~around)
         if rests:
-            own = mask & ~np.any(rests, axis=0)
-            with suppress(ObservationError):
-                tries[row] = _parts(track, [own, *rests], bench)
-    return _better(tracks, tries, bench)
+            parts[row] = [mask & ~np.any(rests, axis=0), *rests]
+    return _better(tracks, parts, bench)
 
 
 def _parts(track: Track, masks: Sequence[Mask], bench: Bench) -> list[Track]:
@@ -452,21 +492,33 @@ def new_track(mask: Mask, bench: Bench) -> Track:
 
 def _better(
     tracks: Sequence[Track],
-    tries: dict[int, list[Track]],
+    parts: Mapping[int, Sequence[Mask]],
     bench: Bench,
 ) -> list[Track]:
-    """The objects, each as it is or as its parts, whichever scans explain better."""
-    judged = iter(bench.judge([one for parts in tries.values() for one in parts]))
+    """The objects, each as it is or as its parts, whichever scans explain better.
+
+    ``parts`` are the pixels of the parts of some of them, by their rows, in the order in which
+    they are tried.
+    """
+    tries: dict[int, list[Track]] = {}
+    left = MOST_PARTS
+    for row, masks in parts.items():
+        if len(masks) <= left:
+            with suppress(ObservationError):
+                tries[row] = _parts(tracks[row], masks, bench)
+                left -= len(masks)
+
+    judged = iter(bench.judge([one for some in tries.values() for one in some]))
+    by_parts = {row: [next(judged) for _ in some] for row, some in tries.items()}
     found = []
     for row, track in enumerate(tracks):
-        if row not in tries:
+        if row not in by_parts:
             found.append(track)
             continue
-        parts = [next(judged) for _ in tries[row]]
         before = bench.share([track])
         wanted = LEAST_GAIN if before >= KNOWN_SHARE else LEAST_OF_UNKNOWN
-        if bench.share(parts) >= before + wanted:
-            found.extend(parts)
+        if bench.share(by_parts[row]) >= before + wanted:
+            found.extend(by_parts[row])
         else:
             found.append(track)
     return found

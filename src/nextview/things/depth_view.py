@@ -1,6 +1,7 @@
 """Depth images as they are compared with surfaces: few pixels, metres, and what each shows."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,9 @@ NOISIEST = 0.005  # of the depth: its deviation, where no ground shows it
 GROUND_MARGIN = 1.0  # of the size of the outline, around which the ground is looked for
 GROUND_SIDE = 48  # rows and columns of pixels that it is looked for in
 LEVEL_NOISE = 3.0  # deviations of the noise within which a pixel lies on the ground
+KEPT_IMAGES = (
+    12  # of the last objects: each is asked for to align it, and again for its pose
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,17 +151,7 @@ class MetricImage:
             raise ObservationError(
                 "the object radius in metres is not known, and surfaces are compared in metres"
             )
-        depth, kind, pose, intrinsics = _what_is_seen(observation)
-        if not (kind == THING).any():
-            return None
-
-        depth = depth * np.float32(metres)
-        pose = pose.copy()
-        pose[:3, 3] *= metres
-        some_rows = depth[:: max(1, len(depth) // NOISE_ROWS)]
-        noise = estimate_noise(some_rows, (some_rows > 0) & np.isfinite(some_rows))
-        image = cls(depth, kind, pose, intrinsics, noise, None)
-        return replace(image, ground=image._find_ground())
+        return _metric_image(observation, float(metres))
 
     def turned(self, rotation: Float) -> "MetricImage":
         """The same in an object frame that is turned about its origin.
@@ -172,7 +166,7 @@ class MetricImage:
             ground = replace(ground, normal=rotation @ ground.normal)
         return replace(self, pose=pose, ground=ground)
 
-    def _find_ground(self) -> Ground | None:
+    def find_ground(self) -> Ground | None:
         """The plane that the thing stands on."""
         rows, columns = _window(self.kind == THING, GROUND_SIDE, GROUND_MARGIN)
         chosen = np.ix_(rows, columns)
@@ -242,6 +236,22 @@ class MetricImage:
             pitch=float(1 / self.intrinsics[[0, 1], [0, 1]].mean()),
             whole=int(mask.sum()),
         )
+
+
+@lru_cache(maxsize=KEPT_IMAGES)
+def _metric_image(observation: Observation, metres: float) -> MetricImage | None:
+    """What a camera saw of a thing of this radius, metres; None if it did not see it."""
+    depth, kind, pose, intrinsics = _what_is_seen(observation)
+    if not (kind == THING).any():
+        return None
+
+    depth = depth * np.float32(metres)
+    pose = pose.copy()
+    pose[:3, 3] *= metres
+    some_rows = depth[:: max(1, len(depth) // NOISE_ROWS)]
+    noise = estimate_noise(some_rows, (some_rows > 0) & np.isfinite(some_rows))
+    image = MetricImage(depth, kind, pose, intrinsics, noise, None)
+    return replace(image, ground=image.find_ground())
 
 
 def _what_is_seen(

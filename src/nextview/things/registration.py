@@ -14,7 +14,6 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, DepthView
 from nextview.things.surface import SurfaceCaster
@@ -298,10 +297,10 @@ def centred(
         before += _overlap(view, shows)
 
         seen = np.median(view.thing_points, axis=0)
-        depth = np.where(shows, rendered.depth, np.nan)
         some = shows.any(1)
-        points = view.origin + view.rays * depth[some, :, None]
-        change[some] += (seen - np.nanmedian(points, axis=1)) / len(views)
+        depth = np.where(shows[some], rendered.depth[some], 0)
+        points = view.origin + view.rays * depth[..., None]
+        change[some] += (seen - _medians(points, shows[some])) / len(views)
 
     standing = _heights_on_the_ground(caster, alignment, views)
     if standing is not None:
@@ -316,6 +315,15 @@ def centred(
         alignment,
         centres=np.where(better[:, None], moved.centres, alignment.centres),
     )
+
+
+def _medians(points: Float, shown: Mask) -> Float:
+    """Median of those points of each row, (H, P, 3), that are shown, (H, P): (H, 3)."""
+    ordered = np.where(shown[:, None], points.swapaxes(1, 2), np.inf)
+    ordered.sort(axis=2)
+    count = shown.sum(1)
+    row = np.arange(len(points))
+    return (ordered[row, :, (count - 1) // 2] + ordered[row, :, count // 2]) / 2
 
 
 def _heights_on_the_ground(
@@ -346,19 +354,23 @@ def _overlap(view: DepthView, shows: Mask) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class _PoseEquations:
-    """By how much, and in which direction, each pixel of one view draws each hypothesis.
+    """By how much, and in which direction, pixels of one view draw hypotheses: N pulls.
 
     Attributes:
-        arms: from the centre of the hypothesis to what is drawn, (H, P, 3).
-        directions: unit vectors, (H, P, 3).
-        distances: metres, (H, P).
-        weights: inverse variances, (H, P); zero where nothing is drawn.
+        hypotheses: row of the hypothesis that is drawn, ascending, (N,) int64.
+        arms: from the centre of the hypothesis to what is drawn, (N, 3).
+        directions: unit vectors, (N, 3).
+        distances: metres, (N,).
+        weights: inverse variances, (N,).
+        count: of all hypotheses.
     """
 
+    hypotheses: Index
     arms: Float32
     directions: Float32
     distances: Float32
     weights: Float32
+    count: int
 
 
 OUTLINE_PIXELS = 1.5  # deviation of an outline, pixels
@@ -375,73 +387,94 @@ def _pulls(
     ``reach`` is the deviation of each that is to be expected beside the noise, (H,), metres.
     """
     shows = np.isfinite(rendered.depth)
-    depth = np.where(shows, rendered.depth, 0)
-    origin = view.origin.astype(np.float32)
-    points = origin + view.rays * depth[..., None]
-    arms = points - centres.astype(np.float32)[:, None]
-
     # Where the thing was measured: along the normal.
-    thing = shows & (view.kind == THING)
-    gap = np.where(thing, view.depth - depth, 0)
-    along = np.einsum("hpi,pi->hp", rendered.normals, view.rays)
-    surface = gap * along
+    measured = shows & (view.kind == THING)
     # Where the hypothesis shows, and the outline says that it does not: towards the outline.
     beyond = shows & (view.kind == ELSEWHERE) & ~rendered.hidden(view)
-    aside = view.towards @ view.camera_axes[:, :2].T.astype(np.float32)
-    off = np.where(beyond, view.edge * view.pitch * depth, 0)
-
-    directions = np.where(thing[..., None], rendered.normals, aside)
-    distances = np.where(thing, surface, off)
-
     # Where the thing was measured and the hypothesis does not show: the nearest of its pixels is
     # drawn there.
-    missing = ~shows & (view.kind == THING) & ~view.level
-    nearest, gap, aside = _nearest_shown(view, shows)
-    missing &= nearest >= 0
-    row, pixel = np.nonzero(missing)
-    from_pixel = nearest[row, pixel]
-    arms[row, pixel] = arms[row, from_pixel]
-    directions[row, pixel] = aside[row, pixel]
-    distances[row, pixel] = gap[row, pixel] * view.pitch * depth[row, from_pixel]
+    shows_somewhere = shows.any(1, keepdims=True)
+    missing = ~shows & (view.kind == THING) & ~view.level & shows_somewhere
 
-    outline = OUTLINE_PIXELS * view.pitch * np.where(shows, depth, view.depth)
-    error = rendered.errors[:, None]
-    variance = error**2 + np.where(thing, view.noise, outline) ** 2
-    expected = reach[:, None] ** 2 + (NOISE_REACH * view.noise) ** 2
-    weights = (thing | beyond | missing) / variance / (1 + distances**2 / expected)
-    return _PoseEquations(arms, directions, distances, weights.astype(np.float32))
-
-
-def _nearest_shown(view: DepthView, shows: Mask) -> tuple[Index, Float32, Float32]:
-    """For each pixel the nearest one where a hypothesis shows, (H, P), -1 where none does.
-
-    And the distance from there to the pixel, (H, P), pixels of the image, and its direction, (H, P,
-    3), object frame.
-    """
-    count = len(shows)
-    images = shows.reshape(count, *view.shape)
-    # One transform for all hypotheses: other images are too far away to be nearest.
-    apart = 2.0 * float((view.step * view.shape).sum()) + 1
-    index = distance_transform_edt(
-        ~images,
-        sampling=(apart, *view.step),
-        return_distances=False,
-        return_indices=True,
+    hypotheses, pixels = np.nonzero(np.asarray(measured | beyond | missing))
+    along_normal = measured[hypotheses, pixels]
+    absent = missing[hypotheses, pixels]
+    nearest, gap, aside = _nearest_shown(
+        view,
+        shows,
+        hypotheses[absent],
+        pixels[absent],
     )
-    same = index[0] == np.arange(count)[:, None, None]
-    rows, columns = np.indices(view.shape)
-    down = (rows - index[1]) * view.step[0]
-    right = (columns - index[2]) * view.step[1]
-    distance = np.hypot(down, right)
+    drawn = pixels.copy()
+    drawn[absent] = nearest
+    depth = rendered.depth[hypotheses, drawn]
+    rays = view.rays[drawn]
+    points = view.origin.astype(np.float32) + rays * depth[:, None]
+    arms = points - centres.astype(np.float32)[hypotheses]
 
-    scale = 1 / np.maximum(distance, 1e-9)
-    in_image = np.stack([right * scale, down * scale], -1).reshape(count, -1, 2)
-    nearest = np.where(same, index[1] * view.shape[1] + index[2], -1)
-    aside = in_image @ view.camera_axes[:, :2].T
+    normals = rendered.normals[hypotheses, pixels]
+    outwards = view.towards @ view.camera_axes[:, :2].T.astype(np.float32)
+    sideways = outwards[pixels]
+    sideways[absent] = aside
+    directions = np.where(along_normal[:, None], normals, sideways)
+
+    across = view.edge[pixels]
+    across[absent] = gap
+    behind = view.depth[pixels] - depth
+    along = np.einsum("ni,ni->n", normals, rays)
+    distances = np.where(along_normal, behind * along, across * view.pitch * depth)
+
+    farther = np.where(absent, view.depth[pixels], depth)
+    noise = view.noise[pixels]
+    deviation = np.where(along_normal, noise, OUTLINE_PIXELS * view.pitch * farther)
+    variance = rendered.errors[hypotheses] ** 2 + deviation**2
+    expected = reach[hypotheses] ** 2 + (NOISE_REACH * noise) ** 2
+    weights = 1 / variance / (1 + distances**2 / expected)
+    return _PoseEquations(
+        hypotheses,
+        arms,
+        directions,
+        distances.astype(np.float32),
+        weights.astype(np.float32),
+        len(shows),
+    )
+
+
+FAR_COLUMN = 1_000_000  # in place of a column where a row has none
+
+
+def _nearest_shown(
+    view: DepthView,
+    shows: Mask,
+    hypotheses: Index,
+    pixels: Index,
+) -> tuple[Index, Float32, Float32]:
+    """For N pixels the nearest one where a hypothesis, which shows somewhere, shows, (N,).
+
+    And the distance from there to the pixel, (N,), pixels of the image, and its direction, (N, 3),
+    object frame.
+    """
+    rows, columns = np.divmod(pixels, view.shape[1])
+    some, image = np.unique(hypotheses, return_inverse=True)
+    images = shows[some].reshape(-1, *view.shape)
+    # In each row the nearest column, then among these the nearest of all rows.
+    every = np.arange(view.shape[1])
+    left = np.maximum.accumulate(np.where(images, every, -FAR_COLUMN), axis=2)
+    from_right = np.where(images, every, FAR_COLUMN)[..., ::-1]
+    right = np.minimum.accumulate(from_right, axis=2)[..., ::-1]
+    in_row = np.where(every - left <= right - every, left, right)[image, :, columns]
+
+    down = (rows[:, None] - np.arange(view.shape[0])) * view.step[0]
+    aside = (columns[:, None] - in_row) * view.step[1]
+    best = (down**2 + aside**2).argmin(1)
+    number = np.arange(len(pixels))
+    in_image = np.stack([aside[number, best], down[number, best]], -1)
+    distance = np.linalg.norm(in_image, axis=1)
+    direction = in_image / np.maximum(distance, 1e-9)[:, None]
     return (
-        nearest.reshape(count, -1),
-        distance.reshape(count, -1).astype(np.float32),
-        aside.astype(np.float32),
+        best * view.shape[1] + in_row[number, best],
+        distance.astype(np.float32),
+        (direction @ view.camera_axes[:, :2].T).astype(np.float32),
     )
 
 
@@ -591,14 +624,20 @@ def pose_covariances(
         Covariances of turn, radians, about the centre of each surface, and place of that centre,
         metres, both in the object frame, (H, 6, 6) float64.
     """
-    left, _ = _equations(caster, alignment, views, FINE[-1], prior)
-    information = left[:, :POSE, :POSE]
+    level = FINE[-1]
+    displaced = prior.displaced(views)
+    weights, _ = _priors(caster, alignment, None, level, prior)
+    information = weights[:, :, None] * np.eye(POSE)
+
     for number, view in enumerate(views):
         rendered = render(caster, alignment, view, number)
         centres = alignment.centres + alignment.cameras[:, number]
-        information = (
-            information + _normal_equations(_outline(view, rendered, centres), prior)[0]
-        )
+        reach = level.reach(rendered.radii, displaced[number])
+        drawn = _pulls(view, rendered, centres, reach)
+        held = _outline(view, rendered, centres)
+        information += _normal_equations(drawn, prior)[0]
+        information += _normal_equations(held, prior)[0]
+
     return inverses(information)
 
 
@@ -639,17 +678,19 @@ def _outline(view: DepthView, rendered: Rendered, centres: Float) -> _PoseEquati
     in_image = inwards.reshape(-1, 2) / np.maximum(length, 1)[:, None]
     aside = in_image @ view.camera_axes[:, :2].T.astype(np.float32)
 
-    shown = np.where(rim, rendered.depth, 0)
-    points = view.origin.astype(np.float32) + view.rays * shown[..., None]
-    arms = points - centres.astype(np.float32)[:, None]
-    deviation = OUTLINE_PIXELS * view.pitch * shown
-    weights = rim / (rendered.errors[:, None] ** 2 + deviation**2)
-    directions = np.broadcast_to(aside, arms.shape)
+    hypotheses, pixels = np.nonzero(rim)
+    depth = rendered.depth[hypotheses, pixels]
+    points = view.origin.astype(np.float32) + view.rays[pixels] * depth[:, None]
+    arms = points - centres.astype(np.float32)[hypotheses]
+    deviation = OUTLINE_PIXELS * view.pitch * depth
+    weights = 1 / (rendered.errors[hypotheses] ** 2 + deviation**2)
     return _PoseEquations(
+        hypotheses,
         arms,
-        directions,
-        np.zeros_like(shown),
+        aside[pixels],
+        np.zeros_like(depth),
         weights.astype(np.float32),
+        len(rim),
     )
 
 
@@ -658,15 +699,23 @@ def _normal_equations(
     prior: RegistrationPrior,
 ) -> tuple[Float, Float]:
     """What one view says of turn and place: matrices, (H, 6, 6), and right-hand sides, (H, 6)."""
+    turning = np.cross(pulls.arms, pulls.directions)
     jacobian = np.concatenate(
-        [np.cross(pulls.arms, pulls.directions), pulls.directions],
-        -1,
+        [turning, pulls.directions, pulls.distances[:, None]],
+        axis=1,
     )
     # Neighbouring pixels err together.
-    used = np.count_nonzero(pulls.weights, axis=1)
-    share = np.minimum(1, prior.pixels / np.maximum(used, 1)).astype(np.float32)
-    weighted = (jacobian * (pulls.weights * share[:, None])[..., None]).swapaxes(1, 2)
-    return weighted @ jacobian, (weighted @ pulls.distances[..., None])[..., 0]
+    first = np.searchsorted(pulls.hypotheses, np.arange(pulls.count + 1))
+    share = np.minimum(1, prior.pixels / np.maximum(np.diff(first), 1))
+    weights = pulls.weights * share.astype(np.float32)[pulls.hypotheses]
+    weighted = jacobian[:, :POSE] * weights[:, None]
+
+    found = np.zeros((pulls.count, POSE, POSE + 1), np.float32)
+    for hypothesis in range(pulls.count):
+        own = slice(first[hypothesis], first[hypothesis + 1])
+        np.matmul(weighted[own].T, jacobian[own], out=found[hypothesis])
+    sums = found.astype(np.float64)
+    return sums[..., :POSE], sums[..., POSE]
 
 
 def _priors(

@@ -269,7 +269,7 @@ class SurfaceCaster:
         Returns:
             How many times its length each ray goes, (H, P) float32, infinity where it meets
             nothing; and the unit normal of the surface there, towards the origin, (H, P, 3)
-            float32, in the frame of the surface.
+            float32, in the frame of the surface, zero where a ray meets nothing.
         """
         directions = np.ascontiguousarray(directions, np.float32)
         starts = np.repeat(
@@ -278,12 +278,16 @@ class SurfaceCaster:
             1,
         )
         depth = np.empty(directions.shape[:2], np.float32)
-        normals = np.empty(directions.shape, np.float32)
+        across = np.zeros(directions.shape, np.float32)
         for row, thing in enumerate(np.asarray(things).tolist()):
             hits = self._scene(thing).run(starts[row], directions[row], output=1)
             depth[row] = np.where(hits["primID"] >= 0, hits["tfar"], MISSED)
-            normals[row] = hits["Ng"]
+            across[row] = hits["Ng"]
 
-        towards = -np.sign(np.einsum("hpi,hpi->hp", normals, directions))
-        scale = towards / (np.sqrt(np.einsum("hpi,hpi->hp", normals, normals)) + 1e-30)
-        return depth, normals * scale[..., None]
+        met = np.isfinite(depth)
+        own = across[met]
+        towards = -np.sign(np.einsum("ni,ni->n", own, directions[met]))
+        scale = towards / (np.sqrt(np.einsum("ni,ni->n", own, own)) + 1e-30)
+        normals = np.zeros(directions.shape, np.float32)
+        normals[met] = own * scale[:, None]
+        return depth, normals
