@@ -12,8 +12,8 @@ from nextview.scene.floating import floating
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import TableGround
 from nextview.scene.parting import (
+    MOST_CUT,
     MOST_JOINED,
-    MOST_PARTS,
     MOST_TRIMMED,
     Bench,
     merged,
@@ -99,7 +99,7 @@ def test_a_frame_full_of_scraps_is_parted_otherwise_a_few_times_only(ycb_meshes)
     judged.clear()
     assert len(part(tracks, bench, {})) == len(tracks)
     # each strip and its neighbour would be 19 tries
-    assert MOST_JOINED <= len(judged) <= MOST_JOINED + MOST_TRIMMED + 2 * MOST_PARTS
+    assert MOST_JOINED <= len(judged) <= MOST_JOINED + MOST_TRIMMED + 2 * MOST_CUT
 
 
 def test_an_object_that_ended_takes_no_pixels(ycb, ycb_meshes):

@@ -43,7 +43,7 @@ MOST_GROUP = 5  # segments that touch and are tried as one object
 MOST_TRIES = 2  # frames in which an object's pixels are parted otherwise in vain
 # objects that are judged anew in a frame at most, those with the most pixels first
 MOST_TRIMMED = 2  # that were not known before the frame
-MOST_PARTS = 4  # of those that are cut, and again of those whose rests are taken out
+MOST_CUT = 4  # parts of what is cut, and as many where rests are taken out
 MOST_JOINED = 10  # groups that are tried as one object in a frame, at most
 LEAST_TAKEN = 0.15  # share of an object's pixels that another one's scan takes over
 IN_EACH_OTHER = 0.5  # radii of the smaller of two scans between their centres, at most
@@ -501,7 +501,7 @@ def _better(
     they are tried.
     """
     tries: dict[int, list[Track]] = {}
-    left = MOST_PARTS
+    left = MOST_CUT
     for row, masks in parts.items():
         if len(masks) <= left:
             with suppress(ObservationError):

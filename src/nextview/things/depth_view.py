@@ -28,9 +28,7 @@ NOISIEST = 0.005  # of the depth: its deviation, where no ground shows it
 GROUND_MARGIN = 1.0  # of the size of the outline, around which the ground is looked for
 GROUND_SIDE = 48  # rows and columns of pixels that it is looked for in
 LEVEL_NOISE = 3.0  # deviations of the noise within which a pixel lies on the ground
-KEPT_IMAGES = (
-    12  # of the last objects: each is asked for to align it, and again for its pose
-)
+KEPT_IMAGES = 12  # of the last objects: poses are asked for after the names
 
 
 @dataclass(frozen=True, eq=False)

@@ -440,7 +440,7 @@ def _pulls(
     )
 
 
-FAR_COLUMN = 1_000_000  # in place of a column where a row has none
+FAR_ROW = 1_000_000  # in place of a row where a column has none
 
 
 def _nearest_shown(
@@ -457,22 +457,23 @@ def _nearest_shown(
     rows, columns = np.divmod(pixels, view.shape[1])
     some, image = np.unique(hypotheses, return_inverse=True)
     images = shows[some].reshape(-1, *view.shape)
-    # In each row the nearest column, then among these the nearest of all rows.
-    every = np.arange(view.shape[1])
-    left = np.maximum.accumulate(np.where(images, every, -FAR_COLUMN), axis=2)
-    from_right = np.where(images, every, FAR_COLUMN)[..., ::-1]
-    right = np.minimum.accumulate(from_right, axis=2)[..., ::-1]
-    in_row = np.where(every - left <= right - every, left, right)[image, :, columns]
+    # In each column the nearest row, then among these the nearest of all columns.
+    every = np.arange(view.shape[0])[:, None]
+    above = np.maximum.accumulate(np.where(images, every, -FAR_ROW), axis=1)
+    from_below = np.where(images, every, FAR_ROW)[:, ::-1]
+    below = np.minimum.accumulate(from_below, axis=1)[:, ::-1]
+    nearest = np.where(every - above <= below - every, above, below)
+    in_column = nearest[image, rows]
 
-    down = (rows[:, None] - np.arange(view.shape[0])) * view.step[0]
-    aside = (columns[:, None] - in_row) * view.step[1]
+    down = (rows[:, None] - in_column) * view.step[0]
+    aside = (columns[:, None] - np.arange(view.shape[1])) * view.step[1]
     best = (down**2 + aside**2).argmin(1)
     number = np.arange(len(pixels))
     in_image = np.stack([aside[number, best], down[number, best]], -1)
     distance = np.linalg.norm(in_image, axis=1)
     direction = in_image / np.maximum(distance, 1e-9)[:, None]
     return (
-        best * view.shape[1] + in_row[number, best],
+        in_column[number, best] * view.shape[1] + best,
         distance.astype(np.float32),
         (direction @ view.camera_axes[:, :2].T).astype(np.float32),
     )
