@@ -9,6 +9,7 @@ from small_tables import camera_over, view
 
 import nextview
 from nextview.scene.floating import floating
+from nextview.scene.following import parts_of, same_objects
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import TableGround
 from nextview.scene.parting import (
@@ -22,6 +23,7 @@ from nextview.scene.parting import (
     taken_over,
 )
 from nextview.scene.tracks import Track
+from nextview.sensing.frame import Frame
 from nextview.sensing.tabletop import TableTop
 
 UP = np.array([0, 0, 1.0])
@@ -146,6 +148,76 @@ def test_the_ground_is_below_what_may_be_a_thing(ycb_meshes):
     large = TableTop.of(frame, UP, widest=5.0).plane  # tables are looked for, too
     assert large.height(table) == pytest.approx(0.75, abs=0.03)
     assert TableTop.of(frame, UP).plane.height(table) == pytest.approx(0, abs=0.02)
+
+
+def test_no_ground_has_anything_below_it(ycb_meshes):
+    camera = camera_over([ycb_meshes["mug"]])
+    frame = camera.frame(view(20, elevation=35.0, distance=2.2))
+    x, y, z = (frame.along(axis) for axis in np.eye(3))
+    depth = frame.depth.copy()
+    depth[(z < -0.3) & (np.hypot(x, y) > 0.9)] = 0  # a scrap of the floor
+    scrap = Frame(depth, frame.intrinsics, frame.pose, pixel_centre=0.5)
+    top = TableTop.of(scrap, UP, widest=5.0)
+    floor = float(np.median(z[(depth > 0) & (z < -0.3)]))
+    assert top.plane.height(np.zeros(3)) == pytest.approx(-floor, abs=0.05)
+
+    depth[z < -0.3] = 0
+    alone = Frame(depth, frame.intrinsics, frame.pose, pixel_centre=0.5)
+    assert TableTop.of(alone, UP, widest=5.0).plane.height(
+        np.zeros(3)
+    ) == pytest.approx(0, abs=0.02)
+
+
+def test_a_thing_stands_on_the_table_and_the_table_on_the_ground(ycb_meshes):
+    camera = camera_over([ycb_meshes["mug"]])
+    frame = camera.frame(view(20, elevation=35.0, distance=2.2))
+    top = TableTop.of(frame, UP, widest=5.0)
+    heights = frame.along(UP)
+    mug = camera.owner == 0
+    assert top.under(mug).height(np.zeros(3)) == pytest.approx(0, abs=0.02)
+    table = heights > -0.1
+    assert top.under(table).height(np.zeros(3)) == pytest.approx(0.75, abs=0.03)
+
+    near = camera.frame(view(20, elevation=60.0, distance=0.4))
+    known = TableTop.of(near, UP, top.ground, widest=5.0)
+    assert not known.lower
+    assert known.plane is top.plane  # it is out of the picture
+
+
+def test_all_frames_are_judged_anew_once_one_shows_the_floor(ycb_meshes):
+    camera = camera_over([ycb_meshes["mug"], ycb_meshes["cracker_box"]])
+    scene = nextview.Scene("modelnet10")
+    near = camera.frame(view(20, elevation=60.0, distance=0.4))
+    scene.update(near)
+    assert scene.tops[0].plane.height(np.zeros(3)) == pytest.approx(0, abs=0.02)
+    on_the_table = [thing.number for thing in scene.objects]
+    assert on_the_table
+
+    look = scene.update(camera.frame(view(20, elevation=35.0, distance=2.2)))
+    assert [warning.name for warning in look.warnings] == ["ground"]
+    assert sorted(ended for ended, _ in look.joined) == on_the_table
+    for top in scene.tops:
+        assert top.plane.height(np.zeros(3)) == pytest.approx(0.75, abs=0.03)
+    table = max(scene.objects, key=lambda thing: np.prod(thing.size))
+    assert {whole for _, whole in look.joined} == {table.number}
+    assert set(table.pixels) == {0, 1}
+
+
+def test_objects_keep_their_numbers_if_they_keep_most_of_their_pixels():
+    def track(number, *columns):
+        masks = {}
+        for frame, own in enumerate(columns):
+            masks[frame] = np.zeros((4, 20), bool)
+            masks[frame][:, own] = True
+        return SimpleNamespace(number=number, pixels=masks)
+
+    kept = track(1, slice(0, 4), slice(0, 4))
+    cup = track(2, slice(8, 10))
+    gone = track(3, slice(18, 20))
+    now = [track(5, slice(0, 3), slice(0, 4)), track(6, slice(6, 16), slice(6, 16))]
+    same = same_objects(now, [kept, cup, gone])
+    assert same == {5: 1}
+    assert parts_of([kept, cup, gone], now, same) == ((2, 6),)
 
 
 def test_what_stands_behind_another_thing_is_not_seen(ycb, ycb_meshes):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -27,6 +27,9 @@ FEWEST_TESTED = 30  # pixels in which an object should show before it is called 
 GONE = 0.6  # share of these through which something behind it is seen
 STEP_BEHIND = 0.02  # metres by which that lies behind it, at least
 THERE = 0.6  # share of the pixels in which it should show, from which an object is seen again
+SAME_PIXELS = (
+    0.5  # share of the pixels of two objects that are of both, above which they are one
+)
 FEWEST_AGAINST = 2  # objects that a frame with a wrong pose contradicts, at least
 
 
@@ -104,7 +107,11 @@ def assign(
         rows = np.flatnonzero(shares >= SECOND)
         best = int(shares.argmax()) if len(shares) else -1
         if best < 0 or shares[best] < SAME_OBJECT_SHARE:
-            new.append(segment)
+            part = _seen_in(segment, tracks, top.frame)
+            if part is None:
+                new.append(segment)
+            else:
+                own[part] = own.get(part, np.zeros_like(segment)) | segment
         elif len(rows) == 1:
             own[best] = own.get(best, np.zeros_like(segment)) | segment
         else:
@@ -112,6 +119,35 @@ def assign(
                 own[row] = own.get(row, np.zeros_like(segment)) | mask
 
     return own, new
+
+
+def _seen_in(segment: Mask, tracks: Sequence[Track], frame: Frame) -> int | None:
+    """The object without a scan that a segment shows more of than was seen of it before.
+
+    Of what its last frame and this one see of the segment, most was the object's.
+
+    Args:
+        segment: the pixels, (H, W) bool.
+        tracks: the objects known so far.
+        frame: that shows the segment.
+
+    Returns:
+        The row of the object that has most of these points; None where there is none.
+    """
+    points = _points(segment, frame)
+    best = None
+    most = FEWEST_TESTED - 1
+    for row, track in enumerate(tracks):
+        if track.likeliest is not None:
+            continue
+        last = track.thing.sightings[-1]
+        at, off = _points_in(points, last.frame)
+        both = np.abs(off) < STEP_BEHIND
+        inside = int(np.count_nonzero(both & last.mask[at]))
+        if inside > most and inside > SAME_OBJECT_SHARE * np.count_nonzero(both):
+            best = row
+            most = inside
+    return best
 
 
 def _points(mask: Mask, frame: Frame) -> Float:
@@ -209,15 +245,7 @@ def _agreement_of_points(track: Track, frame: Frame) -> SegmentAgreement:
     few = slice(None, None, max(1, len(last.facets.planes) // SEGMENT_POINTS))
     pose = last.frame.camera_to_world
     points = last.facets.some(few).points @ pose[:3, :3].T + pose[:3, 3]
-    now = frame.camera_to_world
-    in_camera = (points - now[:3, 3]) @ now[:3, :3]
-    in_camera = in_camera[in_camera[:, 2] > 0.01]
-    column, row = np.floor(frame.camera.project(in_camera)).astype(np.int64).T
-    inside = (
-        (row >= 0) & (row < frame.shape[0]) & (column >= 0) & (column < frame.shape[1])
-    )
-    depth = frame.depth[row[inside], column[inside]]
-    off = (depth - in_camera[inside, 2])[depth > 0]
+    _, off = _points_in(points, frame)
     if not len(off):
         return SegmentAgreement(0, 0.0, 0.0)
 
@@ -228,7 +256,96 @@ def _agreement_of_points(track: Track, frame: Frame) -> SegmentAgreement:
     )
 
 
+def _points_in(points: Float, frame: Frame) -> tuple[tuple[Index, Index], Float]:
+    """Where points are in the picture of a frame.
+
+    Args:
+        points: (N, 3), world, metres.
+        frame: the frame.
+
+    Returns:
+        Row and column of each point that is in the picture, where a depth was measured, (M,) each;
+        and by how much this depth is greater than that of the point, metres, (M,).
+    """
+    now = frame.camera_to_world
+    in_camera = (points - now[:3, 3]) @ now[:3, :3]
+    in_camera = in_camera[in_camera[:, 2] > 0.01]
+    column, row = np.floor(frame.camera.project(in_camera)).astype(np.int64).T
+    inside = (
+        (row >= 0) & (row < frame.shape[0]) & (column >= 0) & (column < frame.shape[1])
+    )
+    row, column = row[inside], column[inside]
+    depth = frame.depth[row, column]
+    seen = depth > 0
+    return (row[seen], column[seen]), (depth - in_camera[inside, 2])[seen]
+
+
 def contradicted(found: Sequence[SegmentAgreement]) -> bool:
     """Whether a frame contradicts so many objects that its pose is wrong, not that they moved."""
     against = sum(one.contradicts for one in found)
     return against >= FEWEST_AGAINST and against >= sum(one.confirms for one in found)
+
+
+def same_objects(now: Sequence[Track], before: Sequence[Track]) -> dict[int, int]:
+    """Find the objects that are the same after all frames were judged anew.
+
+    Args:
+        now: the objects.
+        before: the objects as they were judged before.
+
+    Returns:
+        The number that each had before, by its number now; without those that are new.
+    """
+    same = {}
+    for one in now:
+        for other in before:
+            both = _common(one, other)
+            every = _count(one, other.pixels) + _count(other, one.pixels) - both
+            if both > SAME_PIXELS * every:
+                same[one.number] = other.number
+    return same
+
+
+def parts_of(
+    before: Sequence[Track],
+    now: Sequence[Track],
+    same: Mapping[int, int],
+) -> tuple[tuple[int, int], ...]:
+    """Find the objects that turned out to be parts of others when all frames were judged anew.
+
+    Args:
+        before: the objects as they were judged before.
+        now: the objects.
+        same: the number that each of these had before, by its number now.
+
+    Returns:
+        The number of each such part; and the number of the whole, that of before where it had one.
+    """
+    found = []
+    for part in before:
+        if part.number in same.values():
+            continue
+        for whole in now:
+            if _common(part, whole) > SAME_PIXELS * _count(part, whole.pixels):
+                found.append((part.number, same.get(whole.number, whole.number)))
+                break
+    return tuple(found)
+
+
+def _common(one: Track, other: Track) -> int:
+    """Pixels that two objects have in common, in all frames."""
+    pixels = other.pixels
+    return sum(
+        int(np.count_nonzero(mask & pixels[number]))
+        for number, mask in one.pixels.items()
+        if number in pixels
+    )
+
+
+def _count(one: Track, frames: Container[int]) -> int:
+    """Pixels of an object in some frames."""
+    return sum(
+        int(np.count_nonzero(mask))
+        for number, mask in one.pixels.items()
+        if number in frames
+    )

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -18,7 +19,14 @@ from numpy.typing import ArrayLike
 from nextview.checks import number, one_line
 from nextview.errors import ObservationError, SessionError
 from nextview.scene.floating import floating
-from nextview.scene.following import SegmentAgreement, agreement, assign, contradicted
+from nextview.scene.following import (
+    SegmentAgreement,
+    agreement,
+    assign,
+    contradicted,
+    parts_of,
+    same_objects,
+)
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import (
     FEWEST_HIDDEN,
@@ -34,6 +42,7 @@ from nextview.scene.tracks import Track, render_track
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box, upright_axes
 from nextview.sensing.plausibility import ViewWarning, check_frame
+from nextview.sensing.support import GroundPlane
 from nextview.sensing.tabletop import TableTop
 from nextview.session.system import System, load
 from nextview.types import Float, Mask
@@ -52,6 +61,10 @@ MOVED_OR_POSE = ViewWarning(
     "pose",
     "what was known is not where it was, and nothing else stands where it was: it is taken to have"
     " moved, but the frame's pose may be wrong",
+)
+LOWER_GROUND = ViewWarning(
+    "ground",
+    "this frame shows that the ground is lower than it was taken to be: all frames are judged anew",
 )
 EMPTY_WARNING = ViewWarning("empty", "nothing stands on the plane in this frame")
 
@@ -191,9 +204,9 @@ class Scene:
         """
         self._refuse(frame)
         with self._lock:
-            known = [_sphere(track) for track in self._tracks]
-            plane = self._tops[0].plane if self._tops else None
-            top = TableTop.of(frame, self.up, plane, known, self.region, self._widest)
+            top = self._top_of(frame, self._tops[0].ground if self._tops else None)
+            if top.lower:
+                return self._begin_anew(top)
             found = [agreement(track, top) for track in self._tracks]
             if contradicted(found):
                 return Look(False, warnings=(ViewWarning("pose", WRONG_POSE),))
@@ -233,6 +246,56 @@ class Scene:
             raise ObservationError(
                 "a second frame needs a pose, and the first one too: how else do they fit together?"
             )
+
+    def _top_of(self, frame: Frame, ground: GroundPlane | None) -> TableTop:
+        """What a frame shows on the ground, which is looked for if it is not known.
+
+        Raises:
+            ObservationError: no support plane is seen.
+        """
+        known = [_sphere(track) for track in self._tracks]
+        return TableTop.of(frame, self.up, ground, known, self.region, self._widest)
+
+    def _begin_anew(self, last: TableTop) -> Look:
+        """Judge all frames anew, on the lower ground that a new one shows.
+
+        Args:
+            last: what the new frame shows.
+        """
+        anew = copy(self)
+        anew._tops = []
+        anew._tracks = []
+        anew._touching = set()
+        tops = [anew._top_of(frame, last.ground) for frame in self.frames]
+        for top in (*tops, last):
+            found = [agreement(track, top) for track in anew._tracks]
+            if not contradicted(found):
+                look = anew._take(top, found)
+            elif top is last:
+                return Look(False, warnings=(ViewWarning("pose", WRONG_POSE),))
+
+        same = same_objects(anew._tracks, self._tracks)
+        joined = parts_of(self._tracks, anew._tracks, same)
+        known = {track.number for track in self._tracks}
+        self._tops = anew._tops
+        self._tracks = [
+            replace(track, number=same.get(track.number, track.number))
+            for track in anew._tracks
+        ]
+        pairs = [(same.get(a, a), same.get(b, b)) for a, b in anew._touching]
+        self._touching = {(min(pair), max(pair)) for pair in pairs}
+        self._next_number = anew._next_number
+        self._target = None
+
+        now = {track.number for track in self._tracks}
+        return replace(
+            look,
+            appeared=tuple(sorted(now - known)),
+            gone=tuple(sorted(known - now - {ended for ended, _ in joined})),
+            moved=(),
+            joined=joined,
+            warnings=(*look.warnings, LOWER_GROUND),
+        )
 
     def _take(self, top: TableTop, found: Sequence[SegmentAgreement]) -> Look:
         """Take in a frame that fits."""

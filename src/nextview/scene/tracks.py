@@ -142,7 +142,7 @@ class Track:
         Raises:
             ObservationError: too little is seen of the object.
         """
-        sighting = sighting_of(top.frame, mask, top.plane, top.noise)
+        sighting = sighting_of(top.frame, mask, top.under(mask), top.noise)
         kept = [
             (frame, one)
             for frame, one in zip(self.frames, self.thing.sightings, strict=True)

@@ -7,7 +7,7 @@ part of the object.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -103,11 +103,40 @@ def _only(chosen: Index, count: int) -> Mask:
     return mask
 
 
-def ground_of(samples: Samples, first: Plane, widest: float) -> Plane:
+@dataclass(frozen=True)
+class GroundPlane:
+    """What things stand on.
+
+    Attributes:
+        plane: level.
+        seen: whether it is in the picture. Else it is as low as anything that is seen.
+        wide: whether it is wider than any thing that may stand there, and so no part of one.
+    """
+
+    plane: Plane
+    seen: bool = True
+    wide: bool = True
+
+    def is_below(self, other: GroundPlane, samples: Samples) -> bool:
+        """Whether it shows that another ground is none: what was taken for it is a part of a thing.
+
+        Args:
+            other: as another frame shows it.
+            samples: of the frame that shows this one.
+        """
+        middle = np.median(samples.points, axis=0)
+        away = float(np.linalg.norm(middle - samples.camera))
+        deeper = float(self.plane.height(middle) - other.plane.height(middle))
+        step = GROUND_BELOW * away
+        return deeper > step or (self.seen and not other.seen and deeper > -step)
+
+
+def ground_of(samples: Samples, first: Plane, widest: float) -> GroundPlane:
     """The level plane that things of a known size stand on, not one that is a part of them.
 
     The top of a table carries cups, but where tables and chairs are looked for it is a part of one
-    of them, and they stand on the floor, if that is seen.
+    of them, and they stand on the floor. Nothing is seen below the floor. So where something is
+    seen below the lowest level plane the floor is hidden or out of the picture.
 
     Args:
         samples: of the frame.
@@ -116,21 +145,31 @@ def ground_of(samples: Samples, first: Plane, widest: float) -> Plane:
 
     Returns:
         The lowest level plane that is seen at most so far below the first; the first where there
-        is none, or where it is wider than such a thing.
+        is none, or where it is wider than such a thing; a plane through the lowest points where
+        these lie below it.
     """
     surface = first.extent(samples)
     if (
         not len(surface)
         or np.linalg.norm(np.ptp(_in_plane(surface, first), axis=0)) > widest
     ):
-        return first
+        return GroundPlane(first)
 
-    away = float(np.median(np.linalg.norm(surface - samples.camera, axis=1)))
+    step = GROUND_BELOW * float(
+        np.median(np.linalg.norm(surface - samples.camera, axis=1))
+    )
     middle = np.median(surface, axis=0)
+    lowest = first
     for plane in reversed(level_planes(samples, first)):
-        if GROUND_BELOW * away < plane.height(middle) < widest:
-            return plane
-    return first
+        if step < plane.height(middle) < widest:
+            lowest = plane
+            break
+
+    below = -lowest.height(samples.points)
+    if np.mean((below > step) & (below < widest)) < LEAST_LEVEL_SHARE:
+        return GroundPlane(lowest, wide=False)
+    near = samples.some(below < widest)
+    return GroundPlane(through_lowest(near, first.normal), seen=False, wide=False)
 
 
 def through_lowest(samples: Samples, up: Float, most: float = np.inf) -> Plane:

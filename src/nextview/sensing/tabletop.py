@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -16,9 +17,14 @@ from nextview.sensing.facets import Noise, noise_of
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, upright_axes
-from nextview.sensing.planes import Plane, Samples, sample
+from nextview.sensing.planes import LEAST_SUPPORT, Plane, Samples, sample
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
-from nextview.sensing.support_plane import NO_SUPPORT, find_support_plane
+from nextview.sensing.support import GroundPlane
+from nextview.sensing.support_plane import (
+    MASK_POINTS,
+    NO_SUPPORT,
+    find_support_plane,
+)
 from nextview.sensing.walls import before_walls, find_walls
 from nextview.types import Float, Float32, Index, Mask
 
@@ -54,27 +60,32 @@ class TableTop:
     Attributes:
         frame: the frame.
         noise: of its depth.
-        plane: that things stand on.
+        ground: that things stand on.
         up: direction against gravity, (3,), world.
         above: pixels above the plane, before all walls and inside the region, (H, W) bool.
         free: pixels before all walls, (H, W) bool; None where there is no wall.
         height: of each pixel over the plane, (H, W) float32, metres.
+        levels: level planes over a ground that may be a part of a thing, the highest first: table
+            tops, seats. On one of them another thing may stand.
+        lower: whether the frame shows that the ground of earlier frames is none, and a lower one.
     """
 
     frame: Frame
     noise: Noise
-    plane: Plane
+    ground: GroundPlane
     up: Float
     above: Mask
     free: Mask | None
     height: Float32
+    levels: tuple[Plane, ...] = ()
+    lower: bool = False
 
     @classmethod
     def of(
         cls,
         frame: Frame,
         up: Float | None,
-        earlier: Plane | None = None,
+        ground: GroundPlane | None = None,
         known: Sequence[tuple[Float, float]] = (),
         region: Box | None = None,
         widest: float | None = None,
@@ -84,7 +95,7 @@ class TableTop:
         Args:
             frame: of a depth camera; a mask, if it has one, says where is looked.
             up: direction against gravity, (3,), world; None: the normal of the plane.
-            earlier: the plane as an earlier frame shows it.
+            ground: that things stand on as an earlier frame shows it; None: it is looked for.
             known: centres, (3,), and radii of things that stand on it, metres.
             region: what is outside of this upright box is left out.
             widest: diameter of the largest thing that is looked for, metres: a level plane that is
@@ -95,12 +106,24 @@ class TableTop:
         """
         noise = noise_of(frame)
         samples = sample(frame, frame.depth > 0, noise)
-        if earlier is None:
-            plane = _find_support(frame, samples, up)
-            if widest is not None:
-                plane = support.ground_of(samples, plane, widest)
+        lower = False
+        if ground is None:
+            ground = _find_ground(frame, samples, up, widest)
         else:
-            plane = planes.find_again(earlier, samples, _near(samples, known))
+            own = None
+            if not ground.wide:
+                with suppress(ObservationError):
+                    own = _find_ground(frame, samples, up, widest)
+            if own is not None and own.is_below(ground, samples):
+                lower = True
+                ground = own
+            elif ground.seen:
+                near = _near(samples, known)
+                plane = planes.find_again(ground.plane, samples, near)
+                # few samples fit a plane that leans: a later frame may not show the floor
+                if ground.wide or plane.holds(samples).mean() > LEAST_SUPPORT:
+                    ground = replace(ground, plane=plane)
+        plane = ground.plane
 
         above = segmentation.above_plane(frame, plane, noise)
         walls = find_walls(samples, plane, np.random.default_rng(0))
@@ -114,7 +137,40 @@ class TableTop:
         height = frame.along(plane.normal, plane.offset)
         above &= height > UNEVEN_DEVIATIONS * _unevenness(frame, height)
         upwards = plane.normal if up is None or frame.pose is None else up
-        return cls(frame, noise, plane, upwards, above, free, height)
+        levels = () if ground.wide else support.level_planes(samples, plane)[:-1]
+        return cls(
+            frame,
+            noise,
+            ground,
+            upwards,
+            above,
+            free,
+            height,
+            tuple(levels),
+            lower,
+        )
+
+    @property
+    def plane(self) -> Plane:
+        """The plane that things stand on."""
+        return self.ground.plane
+
+    def under(self, mask: Mask) -> Plane:
+        """The plane that a thing stands on: the highest beside its bottom, or the ground.
+
+        Args:
+            mask: its pixels, (H, W) bool.
+        """
+        if not self.levels:
+            return self.plane
+        rows, columns = np.nonzero(mask & (self.frame.depth > 0))
+        if not len(rows):
+            return self.plane
+        few = slice(None, None, max(1, len(rows) // MASK_POINTS))
+        points = self.frame.positions(rows[few], columns[few])
+        others = sample(self.frame, (self.frame.depth > 0) & ~mask, self.noise)
+        found = support.under_points(others, list(self.levels), points)
+        return self.plane if found is None else found
 
     def segments(
         self,
@@ -227,13 +283,30 @@ class TableTop:
         return bool(len(apart)) and float(np.median(apart)) < step
 
 
-def _find_support(frame: Frame, samples: Samples, up: Float | None) -> Plane:
-    """The plane on which things stand, in a first frame."""
+def _find_ground(
+    frame: Frame,
+    samples: Samples,
+    up: Float | None,
+    widest: float | None,
+) -> GroundPlane:
+    """What things stand on, by one frame alone.
+
+    Args:
+        frame: of a depth camera.
+        samples: of it.
+        up: direction against gravity, (3,), world; None: the normal of the plane.
+        widest: diameter of the largest thing that is looked for, metres; None: it is not known.
+
+    Raises:
+        ObservationError: no support plane is seen.
+    """
     upright = None if up is None or frame.pose is None else upright_axes(up)[2]
     plane = find_support_plane(frame, samples, upright, np.random.default_rng(0))
     if plane is None:
         raise ObservationError(NO_SUPPORT)
-    return plane
+    if widest is None:
+        return GroundPlane(plane)
+    return support.ground_of(samples, plane, widest)
 
 
 def _unevenness(frame: Frame, height: Float32) -> float:
