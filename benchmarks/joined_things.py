@@ -5,7 +5,7 @@
 Each argument is the folder of a run. Its name is that of the set in the table. Every test of every
 run, of all things and of the confusable half, counts in Holm's correction. A p-value in the table
 is the corrected one; ceilings are not tested. "Fewer" is by how much fewer views than random a
-policy takes until it is sure: of all views, and of those after the first, where all begin alike.
+policy takes until it is confident: of all views, and of those after the first, where all begin alike.
 """
 
 from pathlib import Path
@@ -30,11 +30,11 @@ COLUMNS = (
     "3",
     "5",
     "points after 2",
-    "until sure",
+    "until confident",
     "fewer",
 )
-COLUMNS += ("wrong, of the sure", "pose, mm: median, 95 %", "its change")
-SURE = "views until sure"
+COLUMNS += ("wrong, of the confident", "pose, mm: median, 95 %", "its change")
+SURE = "views until confident"
 
 
 def read_runs(runs: list[Path]) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -74,7 +74,7 @@ def row_of(values: pd.DataFrame, tests: pd.DataFrame, reference: float) -> list[
     Args:
         values: its measures.
         tests: its differences to random.
-        reference: views until random is sure.
+        reference: views until random is confident.
     """
     found = values.set_index(["measure", "views"])["value"]
     right = [found.get(("accuracy", k), np.nan) for k in (1, 2, 3, 5)]
@@ -89,7 +89,7 @@ def row_of(values: pd.DataFrame, tests: pd.DataFrame, reference: float) -> list[
     cells.append(f"{until:.2f}")
     fewer = f"{of_all:.0f} %, {after_first:.0f} %"
     cells.append(fewer + corrected(apart.loc[SURE, 0]) if has_tests else "")
-    cells.append(f"{found['wrong, of the sure', 0]:.3f}")
+    cells.append(f"{found['wrong, of the confident', 0]:.3f}")
     pose = [found[f"pose error, {name}", POSE_AFTER] for name in ("median", "95 %")]
     cells.append(", ".join(f"{error:.1f}" for error in pose))
     cells.append(tested(apart.loc[FAR_POSE, POSE_AFTER], 1, " mm") if has_tests else "")

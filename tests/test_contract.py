@@ -347,9 +347,10 @@ def test_episodes(name, golden):
         wanted["answer"],
         wanted["confident"],
     )
+    # Other processors round otherwise: 1.5e-8 in the way of the arm.
     assert [found["travel"], found["arc"]] == pytest.approx(
         [wanted["travel"], wanted["arc"]],
-        abs=1e-9,
+        abs=1e-6,
     )
     np.testing.assert_allclose(found["belief"], wanted["belief"], rtol=0, atol=1e-5)
     # ONNX Runtime takes other kernels on other processors: 4e-4 between two of them.

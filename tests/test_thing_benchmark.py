@@ -115,7 +115,7 @@ def test_the_command_prints_and_writes_tables_of_all_policies(
     main([str(word) for word in line])
     shown = capsys.readouterr().out
     assert "geometry" in shown
-    assert "until sure" in shown
+    assert "until confident" in shown
     text = (results / "tables.md").read_text()
     assert text.count("| geometry | ") == 2 + 2 * 3  # two tables; three tests for each
     for name in (
@@ -351,9 +351,9 @@ def test_what_is_explained_badly_is_not_sure_as_in_a_session():
     how = Compared(("random",), (1, 2, 3), 0.97, False, 100)
     measures = summarise_things([episode], alike, how).measures
     values = measures.set_index("measure")["value"]
-    assert values["views until sure"] == 2
-    assert values["sure"] == 1
-    assert values["wrong, of the sure"] == 0
+    assert values["views until confident"] == 2
+    assert values["confident"] == 1
+    assert values["wrong, of the confident"] == 0
 
 
 def test_measures_are_those_of_a_hand_count():
@@ -375,9 +375,9 @@ def test_measures_are_those_of_a_hand_count():
     random = rows["all", "random"]
     assert random["accuracy", 2] == pytest.approx(1 / 3)
     assert random["accuracy", 3] == 1
-    assert random["views until sure", 0] == pytest.approx((2 + 3 + 2) / 3)
-    assert random["sure", 0] == 1
-    assert random["wrong, of the sure", 0] == pytest.approx(2 / 3)
+    assert random["views until confident", 0] == pytest.approx((2 + 3 + 2) / 3)
+    assert random["confident", 0] == 1
+    assert random["wrong, of the confident", 0] == pytest.approx(2 / 3)
     assert random["pose error, 95 %", 3] == 1
     steps = np.pi / 4 * np.cos(EPISODE_SPHERE.elevation[0])
     assert random["travel, rad", 2] == pytest.approx(

@@ -116,11 +116,16 @@ def markdown(tables: ThingTables) -> str:
 def _table(tables: ThingTables, things: str) -> list[str]:
     values = values_of(tables, things)
     views = views_of(tables)
-    head = ["policy", *(f"right after {k}" for k in views), "views until sure", "sure"]
+    head = [
+        "policy",
+        *(f"right after {k}" for k in views),
+        "views until confident",
+        "confident",
+    ]
     head += [
-        "wrong, of the sure",
+        "wrong, of the confident",
         f"travel to view {views[-1]}, rad",
-        "travel until sure, rad",
+        "travel until confident, rad",
     ]
     later = [k for k in views if k > 1]
     head += [f"pose error after {k}, mm: median, 95 %" for k in later]
@@ -140,14 +145,14 @@ def _table(tables: ThingTables, things: str) -> list[str]:
         cells = [
             policy,
             *(shown("accuracy", k) for k in views),
-            shown("views until sure", 0, 2),
+            shown("views until confident", 0, 2),
         ]
         cells += [
-            shown("sure"),
-            shown("wrong, of the sure"),
+            shown("confident"),
+            shown("wrong, of the confident"),
             shown("travel, rad", views[-1], 2),
         ]
-        cells += [shown("travel until sure, rad", 0, 2)]
+        cells += [shown("travel until confident, rad", 0, 2)]
         cells += [
             f"{shown('pose error, median', k, 1)}, {shown('pose error, 95 %', k, 1)}"
             for k in later
@@ -194,7 +199,7 @@ def latex(tables: ThingTables) -> str:
         " views until the belief reaches the threshold.}",
         "\\begin{tabular}{@{}l" + "r" * len(views) + "rr@{}}",
         "\\toprule",
-        " & ".join(["", *map(str, views), "until sure", "wrong"]) + " \\\\",
+        " & ".join(["", *map(str, views), "until confident", "wrong"]) + " \\\\",
     ]
 
     for things in groups_of(tables):
@@ -206,8 +211,8 @@ def latex(tables: ThingTables) -> str:
         for policy in policies_of_tables(tables):
             cells = [_plain_tex(policy)]
             cells += [f"{100 * values[policy, 'accuracy', k][0]:.1f}" for k in views]
-            cells.append(f"{values[policy, 'views until sure', 0][0]:.2f}")
-            wrong = values[policy, "wrong, of the sure", 0][0]
+            cells.append(f"{values[policy, 'views until confident', 0][0]:.2f}")
+            wrong = values[policy, "wrong, of the confident", 0][0]
             cells.append("--" if np.isnan(wrong) else f"{100 * wrong:.1f}")
             lines.append(" & ".join(cells) + " \\\\")
     return "\n".join([*lines, "\\bottomrule", "\\end{tabular}", "\\end{table}", ""])

@@ -73,10 +73,10 @@ class _Runs:
         things: whose they are, (R,) int64.
         weight: of each: together 1 for each thing, (R,).
         right: after each view, (R, K) float64.
-        sure: whether it was ever sure, as a session is: it believes, and the thing is explained no
-            worse than known things usually are, (R,) float64.
-        wrong: whether it was sure and wrong, (R,) float64.
-        until: views until it was sure; all if it never was, (R,).
+        sure: whether it was ever confident, as a session is: it believes, and the residual is no
+            worse than that of known things, (R,) float64.
+        wrong: whether it was confident and wrong, (R,) float64.
+        until: views until it was confident; all if it never was, (R,).
         travel: radians on the sphere up to each view, (R, K).
         pose: error, millimetres, (R, K); NaN where the thing was not named right.
         decision: seconds of each choice.
@@ -100,7 +100,7 @@ class _Runs:
 
         Args:
             runs: pairs of a thing's number and a run.
-            threshold: belief from which on a run is sure.
+            threshold: belief from which on a run is confident.
         """
         things = np.array([thing for thing, _ in runs])
         right = np.array([each.right for _, each in runs], np.float64)
@@ -181,10 +181,10 @@ def _sampled(runs: _Runs, views: tuple[int, ...], drawn: Float) -> Sampled:
     rows = np.arange(len(runs.things))
     way = runs.travel[rows, runs.until.astype(np.int64) - 1]
     sure = runs.mean(runs.sure, drawn)
-    found["views until sure", 0] = runs.mean(runs.until, drawn)
-    found["travel until sure, rad", 0] = runs.mean(way, drawn)
-    found["sure", 0] = sure
-    found["wrong, of the sure", 0] = runs.mean(runs.wrong, drawn) / np.where(
+    found["views until confident", 0] = runs.mean(runs.until, drawn)
+    found["travel until confident, rad", 0] = runs.mean(way, drawn)
+    found["confident", 0] = sure
+    found["wrong, of the confident", 0] = runs.mean(runs.wrong, drawn) / np.where(
         sure > 0,
         sure,
         np.nan,
@@ -301,7 +301,7 @@ def _is_tested(measure: str, views: int) -> bool:
     """Whether a measure is compared with that of random views; the first view is the same."""
     if measure == FAR_POSE:
         return views == POSE_AFTER
-    return (measure == "accuracy" and views > 1) or measure == "views until sure"
+    return (measure == "accuracy" and views > 1) or measure == "views until confident"
 
 
 def _p_value(apart: Float, measure: str) -> float:

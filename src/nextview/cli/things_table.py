@@ -38,7 +38,7 @@ def _table(found: ThingTables, things: str) -> Table:
 
     table = Table(title=f"{things}: share named right after views", box=box.SIMPLE_HEAD)
     table.add_column("policy", no_wrap=True)
-    for head in (*map(str, views), "until sure", "wrong", "travel", "choice, ms"):
+    for head in (*map(str, views), "until confident", "wrong", "travel", "choice, ms"):
         table.add_column(head, justify="right")
     for policy in policies_of_tables(found):
 
@@ -50,8 +50,8 @@ def _table(found: ThingTables, things: str) -> Table:
         table.add_row(
             policy,
             *(shown("accuracy", k, 3) for k in views),
-            shown("views until sure", 0, 2),
-            shown("wrong, of the sure", 0, 3),
+            shown("views until confident", 0, 2),
+            shown("wrong, of the confident", 0, 3),
             shown("travel, rad", views[-1], 2),
             shown("decision, ms, median", 0, 0),
         )
