@@ -5,7 +5,8 @@
 Each argument is the folder of a run. Its name is that of the set in the table. Every test of every
 run, of all things and of the confusable half, counts in Holm's correction. A p-value in the table
 is the corrected one; ceilings are not tested. "Fewer" is by how much fewer views than random a
-policy takes until it is confident: of all views, and of those after the first, where all begin alike.
+policy takes until it is confident: of all views, and of those after the first, where all begin
+alike.
 """
 
 from pathlib import Path
