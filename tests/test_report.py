@@ -165,7 +165,17 @@ def test_the_page_shows_levels_and_the_terminal_says_what_differs(scenes, capsys
     print_leaderboard(scenes)
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
-    sentence = level_differences(scenes.tables, "random")
+    assert level_differences(scenes.tables, "random") is None  # of two scenes a level
+
+
+def test_the_terminal_says_which_policies_differ_by_clutter(scenes, capsys):
+    levels = scenes.tables.levels.copy()
+    levels.loc[levels["policy"] == "visibility", "p_holm"] = 0.001
+    found = replace(scenes, tables=replace(scenes.tables, levels=levels))
+    print_leaderboard(found)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    sentence = level_differences(found.tables, "random")
     assert sentence.startswith(
         "With no threshold, significantly different from random: visibility by "
     )

@@ -53,9 +53,7 @@ def _run(arguments: list[str]) -> None:
     print(f"usage: {usage} [ARGUMENTS]\n\n{ABOUT}\n")
     for name, line in listed.items():
         print(f"  {name:18}  {line}")
-    print(
-        f"\n{usage} --help explains a command; nextview --version prints the version."
-    )
+    print(f"\n{usage} --help explains a command; --version prints the version.")
 
 
 def _call(name: str, arguments: list[str]) -> None:
