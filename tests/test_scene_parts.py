@@ -10,6 +10,7 @@ from small_tables import camera_over, view
 import nextview
 from nextview.scene.floating import floating
 from nextview.scene.following import parts_of, same_objects
+from nextview.scene.fragments import fragments
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import TableGround
 from nextview.scene.parting import (
@@ -235,6 +236,27 @@ def test_what_stands_behind_another_thing_is_not_seen(ycb, ycb_meshes):
     before_the_can = np.append(can[:2] - 0.5 * away, 0.08)
     assert ground.share_visible(before_the_can, tracks["tomato_soup_can"]) == 1
     assert ground.share_visible(behind_the_box, tracks["tomato_soup_can"]) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("pixels", "touching", "expected"),
+    [
+        ((300, 6000), {(1, 2)}, [True, False]),  # the tip of a banana
+        ((300, 6000), set(), [False, False]),  # a die that stands alone
+        ((300, 900), {(1, 2)}, [False, False]),  # beside one that is as small
+        ((900, 6000), {(1, 2)}, [False, False]),
+    ],
+)
+def test_few_pixels_beside_a_larger_object_may_be_a_part_of_it(
+    pixels,
+    touching,
+    expected,
+):
+    tracks = []
+    for number, count in enumerate(pixels, start=1):
+        mask = np.arange(10_000).reshape(100, 100) < count
+        tracks.append(SimpleNamespace(number=number, pixels={0: mask, 1: mask[:1]}))
+    assert fragments(tracks, touching) == expected
 
 
 def test_a_thing_floats_unless_it_stands_on_the_plane_or_on_another_object(

@@ -19,6 +19,10 @@ FLOATING = ViewWarning(
     "floating",
     "the scan, where it was found, floats above the plane: the name is likely to be wrong",
 )
+FRAGMENT = ViewWarning(
+    "fragment",
+    "few pixels show it, and it touches a larger object: it may be a part of that",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +43,8 @@ class SceneObject:
         result: all that is known of it.
         floats: whether its scan, where it was found, stands neither on the plane nor on another
             object. Then the name is not confident.
+        is_fragment: whether it may be a part of a larger object that it touches. Then the name is
+            not confident either.
     """
 
     number: int
@@ -52,6 +58,7 @@ class SceneObject:
     touches: tuple[int, ...]
     result: Recognition = field(repr=False)
     floats: bool = False
+    is_fragment: bool = False
 
     @classmethod
     def of(cls, track: Track, touching: Collection[tuple[int, int]]) -> SceneObject:
@@ -81,6 +88,7 @@ class SceneObject:
             touches=tuple(others),
             result=result,
             floats=track.floats,
+            is_fragment=track.is_fragment,
         )
 
     @property
@@ -112,7 +120,11 @@ class SceneObject:
         of_views = tuple(
             warning for view in self.result.views for warning in view.warnings
         )
-        return (*of_views, FLOATING) if self.floats else of_views
+        if self.floats:
+            of_views += (FLOATING,)
+        if self.is_fragment and self.result.answer is not None:
+            of_views += (FRAGMENT,)
+        return of_views
 
     def __repr__(self) -> str:
         """One line: ``3: mug, belief 0.998, confident, at [0.412, -0.103, 0.050] m``."""

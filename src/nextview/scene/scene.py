@@ -27,6 +27,7 @@ from nextview.scene.following import (
     parts_of,
     same_objects,
 )
+from nextview.scene.fragments import fragments
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import (
     FEWEST_HIDDEN,
@@ -379,6 +380,11 @@ class Scene:
         changed = {*gone, *moved, *(ended for ended, _ in joined)}
         self._touching = {pair for pair in self._touching if not set(pair) & changed}
         self._note_touching(top, number)
+        small = fragments(self._tracks, self._touching)
+        self._tracks = [
+            replace(track, is_fragment=is_fragment)
+            for track, is_fragment in zip(self._tracks, small, strict=True)
+        ]
         warnings = tuple(check_frame(top.frame))
         if not kept:
             warnings += (EMPTY_WARNING,)

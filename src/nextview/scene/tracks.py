@@ -46,6 +46,7 @@ class Track:
             taken in as sightings.
         absorbed: numbers of objects whose pixels all became its own since the last frame.
         floats: whether its scan stands neither on the plane nor on another object.
+        is_fragment: whether it may be a part of a larger object that it touches.
     """
 
     number: int
@@ -56,11 +57,14 @@ class Track:
     again: tuple[tuple[int, Mask], ...] = ()
     absorbed: tuple[int, ...] = ()
     floats: bool = False
+    is_fragment: bool = False
 
     @property
     def confident(self) -> bool:
         """Whether its name may be acted on."""
-        return self.result is not None and self.result.confident and not self.floats
+        if self.result is None or self.floats or self.is_fragment:
+            return False
+        return self.result.confident
 
     @property
     def posed(self) -> PoseCandidate | None:
