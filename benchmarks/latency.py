@@ -135,9 +135,8 @@ def main(
             seen = rng.integers(0, 256, (1, channels, size, size), np.uint8)
         values = {session.get_inputs()[0].name: seen}
         work = flops(card, seen.shape)
-        limit = (
-            2 * SIDE**3 / np.median(seconds(product, 5))
-        )  # beside each network: clocks change
+        # beside each network: clocks change
+        limit = 2 * SIDE**3 / np.median(seconds(product, 5))
         took = seconds(lambda s=session, v=values: s.run(None, v), rounds)  # type: ignore[misc]
         rate = work / np.median(took)
         share = f"{rate / limit:.2f} of {limit / 1e9:.0f}"

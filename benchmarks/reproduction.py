@@ -86,10 +86,8 @@ def tests_of(tables: Tables, measure: str) -> dict[tuple[str, float], Compared]:
 
 
 def page(predictions: Path, samples: int = 2000) -> str:
-    table = replace(
-        Predictions.load(predictions),
-        calibration=PLAIN_SUM,
-    )  # as published
+    # as published
+    table = replace(Predictions.load(predictions), calibration=PLAIN_SUM)
     specs = make_specs(table, 10, 0)
     grid = Grid(specs, 10, THESIS_THRESHOLDS, 5, 0)
     list(run_grid(grid, default_entries(specs)))

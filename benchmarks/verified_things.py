@@ -66,12 +66,10 @@ SPHERE = ViewSphere((0.0, 18.0, 36.0, 54.0, 72.0), 8)
 CONFIDENT = 0.97
 REJECTED = 0.02  # p-value below which a thing is called unknown
 POINTS = 1000  # of a surface, for symmetries and ADD-S
-SYMMETRIC = (
-    0.1  # largest distance to a turned copy, diameters, of a symmetric thing, as in BOP
-)
-UPRIGHT = (
-    20.0  # degrees that the vertical of a thing in the right resting pose may be off
-)
+# largest distance to a turned copy, diameters, of a symmetric thing, as in BOP
+SYMMETRIC = 0.1
+# degrees that the vertical of a thing in the right resting pose may be off
+UPRIGHT = 20.0
 COLUMNS = (
     "views",
     "features",

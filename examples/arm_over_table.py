@@ -46,23 +46,19 @@ NEEDED = ("research", "mujoco", "mink", "gymnasium_robotics")
 MIDDLE = np.array([0.48, 0.0, 0.05])  # of the things, metres from the arm's base
 WIDEST = 0.24  # metres from there within which things are put
 AROUND = 0.36  # metres from the middle of the things within which is looked
-GAPS = (
-    0.01,
-    0.04,
-)  # metres between a thing and what hides it; the first: between any two
+# metres between a thing and what hides it; the first: between any two
+GAPS = (0.01, 0.04)
 ASIDE = 0.01  # metres by which a hidden thing stands beside the line of sight
 TRIES = 50  # places that are tried for a thing
 FIRST_VIEW = np.radians([30.0, 240.0])  # elevation and azimuth, seen from ``MIDDLE``
 DISTANCE = 0.5  # metres from ``MIDDLE`` to the camera
 STRANGER_RADIUS = 0.07  # metres
-HIDDEN = (
-    0.5  # share of its pixels of which a thing shows less that is hidden behind others
-)
+# share of its pixels of which a thing shows less that is hidden behind others
+HIDDEN = 0.5
 HIDDEN_THINGS = 3
 SMALLEST = 0.05  # metres across: what is smaller shows on too few pixels
-LARGE = (
-    0.25  # share of the scans, the largest ones, of which those are that hide others
-)
+# share of the scans, the largest ones, of which those are that hide others
+LARGE = 0.25
 DRAWS = 500
 FORMATS = (".ply", ".obj", ".stl", ".off", ".glb")
 COARSE = 4  # only each so many-th pixel is looked at to see what is hidden

@@ -33,9 +33,8 @@ SIDE = 348  # width of what is shown beside it, pixels
 INSET = 12  # pixels
 FINER = 2  # rays for a pixel, along each side
 RATE = 12  # frames a second
-SLOWER = (
-    4.0  # so many times slower than at the joints' velocity limits motions are shown
-)
+# so many times slower than at the joints' velocity limits motions are shown
+SLOWER = 4.0
 STILL = 1.4  # seconds that are shown after a look
 LAST = 4.0  # and at the end
 FOCAL = 1.45  # of the camera that films, widths of the picture
@@ -45,16 +44,14 @@ AWAY = 2.05  # metres
 CLAY = np.array([0.60, 0.57, 0.53])
 TABLE = np.array([0.66, 0.58, 0.47])
 LAMP = 0.09  # radius of the lamp, a unit away
-SHADOW_SAMPLES = (
-    5  # rays to the lamp from each point on which the arm may throw its shadow
-)
+# rays to the lamp from each point on which the arm may throw its shadow
+SHADOW_SAMPLES = 5
 SKY_SAMPLES = 48
 PLAN = 0.31  # metres from its middle to the border of the view from above
 COLOURS_IN_GIF = 255
 FRAMES_OF_PALETTE = 10  # from which the palette is made
-NO_RED = tuple(
-    OBJECT_COLOURS[k] for k in (0, 2, 3, 4, 5, 7, 8)
-)  # red is for what is wrong
+# red is for what is wrong
+NO_RED = tuple(OBJECT_COLOURS[k] for k in (0, 2, 3, 4, 5, 7, 8))
 BESIDE = 24  # pixels beside what was found that are shown with it
 ABOVE = np.array([0, 0, 0.035])  # metres from the top of a thing to its name
 VIEW = 0.42  # metres to where the view of the camera on the wrist is drawn

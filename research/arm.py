@@ -166,9 +166,8 @@ def _model(things: Sequence[Triangles]) -> Any:
             rgba=[0.15, 0.15, 0.18, 1],
             mass=0.05,
         )
-    shell = (
-        mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-    )  # of meshes that enclose no volume, too
+    # of meshes that enclose no volume, too
+    shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     for k, (vertices, faces) in enumerate(things):
         name = f"thing{k}"
         spec.add_mesh(

@@ -98,9 +98,8 @@ class BentSurface(Surface):
         place = self.places.ravel()
         begin = second
         end = second - second % 3 + (second + 1) % 3
-        same = (
-            place[first] == place[begin]
-        )  # the neighbour may run along the edge either way
+        # the neighbour may run along the edge either way
+        same = place[first] == place[begin]
         ahead = first - first % 3 + (first + 1) % 3
         one = np.concatenate([first, ahead])
         other = np.concatenate([np.where(same, begin, end), np.where(same, end, begin)])

@@ -62,9 +62,8 @@ from research.film_stage import (
 )
 
 PAIRS = 6
-SURE = (
-    0.97  # belief in a name from which an episode ends, unless the thing may be unknown
-)
+# belief in a name from which an episode ends, unless the thing may be unknown
+SURE = 0.97
 COLOURS = (
     (0.10, 0.42, 0.68),
     (0.78, 0.16, 0.10),
@@ -79,10 +78,8 @@ TABLE = (0.50, 0.36, 0.24)
 SPACING = 0.5  # metres between things
 TABLE_RADIUS = 0.42  # metres, as of a thing: how wide the whole table is drawn
 TABLE_MIDDLE = np.array([0.02, -0.05, -0.2])
-OVER_THE_TABLE = (
-    48.0,
-    -90.0,
-)  # elevation and azimuth from which the whole table is drawn, degrees
+# elevation and azimuth from which the whole table is drawn, degrees
+OVER_THE_TABLE = (48.0, -90.0)
 RIVAL_SIDE = 120  # pixels of the pictures of rivals
 STEP = 0.5  # seconds a view is shown
 PAUSE = 0.7  # seconds an answer is shown

@@ -98,10 +98,8 @@ class FaceCamera:
         self.surface = Surface(mesh.vertices, mesh.faces)
         self.intrinsics = pinhole(size, distance)
         self._scene = embree_scene([(mesh.vertices, mesh.faces)])
-        focal, centre = self.intrinsics[
-            0,
-            [0, 2],
-        ]  # in single precision, as in ``SimulatedCamera``
+        # in single precision, as in ``SimulatedCamera``
+        focal, centre = self.intrinsics[0, [0, 2]]
         across = (
             np.arange(size, dtype=np.float32) + np.float32(0.5 - centre)
         ) / np.float32(focal)
@@ -167,9 +165,8 @@ def _fill(found: NDArray[np.int32], z: NDArray[np.float32], step: int) -> None:
 
     The inverse depth of a plane changes evenly over the picture.
     """
-    reach = (
-        (found.shape[1] - 1) // (2 * step) * 2 * step
-    )  # the last column that was asked
+    # the last column that was asked
+    reach = (found.shape[1] - 1) // (2 * step) * 2 * step
     left, middle, right = (
         slice(begin, begin + reach, 2 * step) for begin in (0, step, 2 * step)
     )

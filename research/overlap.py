@@ -59,10 +59,8 @@ def shared_points(
     cloud = points.reshape(-1, 3)
     share = np.zeros((v, v), np.float32)
     for other in range(v):
-        p = np.pad(
-            depth[other],
-            1,
-        )  # the largest depth of each pixel and the four beside it
+        # the largest depth of each pixel and the four beside it
+        p = np.pad(depth[other], 1)
         reach = np.maximum.reduce(
             [depth[other], p[:-2, 1:-1], p[2:, 1:-1], p[1:-1, :-2], p[1:-1, 2:]]
         )

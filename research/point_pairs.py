@@ -54,9 +54,8 @@ Float = NDArray[np.float64]
 Cloud = NDArray[np.float32]  # points and unit normals, (N, 6), metres
 
 MODEL_POINTS = 2500  # on each surface, before the detector thins them
-SCENE_SIDE = (
-    48  # rows and columns of pixels that are chosen over the outline of what is seen
-)
+# rows and columns of pixels that are chosen over the outline of what is seen
+SCENE_SIDE = 48
 NEIGHBOURS = 12  # points that a normal is found from
 SAMPLING_STEP = 0.09  # of the samples, sides of the box around the model
 DISTANCE_STEP = 0.05  # of distances between points, in diameters
@@ -67,9 +66,8 @@ STEPS = 10  # of a refinement
 FEWEST = 6  # points near a surface that a step needs
 DAMPING = 1e-6
 FARTHEST = 0.01  # metres: what is farther from a thing counts as so far
-SOFTNESS = (
-    0.0005  # metres of mean distance that make a thing less likely by a factor of e
-)
+# metres of mean distance that make a thing less likely by a factor of e
+SOFTNESS = 0.0005
 
 
 @dataclass(frozen=True, eq=False)

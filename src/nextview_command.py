@@ -15,10 +15,8 @@ def main() -> None:
 
     signal.signal(signal.SIGINT, before)
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-        signal.signal(
-            signal.SIGTERM,
-            signal.default_int_handler,
-        )  # temporary files go then, too
+        # temporary files go then, too
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     run()
 
 

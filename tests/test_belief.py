@@ -123,10 +123,8 @@ def test_what_is_said_of_sides_is_said_of_where_side_0_points():
 
 def test_between_two_steps_what_is_said_of_sides_is_interpolated():
     azimuth_bins = np.random.default_rng(0).normal(size=(1, 3, 4))
-    between = reorient(
-        azimuth_bins,
-        np.array([0.75 * np.pi]),
-    )  # one and a half of four steps
+    # one and a half of four steps
+    between = reorient(azimuth_bins, np.array([0.75 * np.pi]))
     beside = [
         np.exp(reorient(azimuth_bins, np.array([step * np.pi]))) for step in (0.5, 1.0)
     ]

@@ -101,10 +101,8 @@ def test_every_visible_pixel_has_the_same_chance():
 
 def test_clouds_are_scaled_by_their_own_global_extent():
     points = np.random.default_rng(0).uniform(-1, 1, (5, 100, 3)).astype(np.float32)
-    poses = look_at_origin(
-        np.linspace(0, 1, 5),
-        np.zeros(5),
-    )  # at azimuth 0 nothing is turned
+    # at azimuth 0 nothing is turned
+    poses = look_at_origin(np.linspace(0, 1, 5), np.zeros(5))
     clouds = cloud_input(points, poses)
     assert (clouds.shape, clouds.dtype) == ((5, 100, 3), np.float32)
     for cloud, raw in zip(clouds, points, strict=True):

@@ -112,10 +112,8 @@ def test_objects_of_files_and_folders(tmp_path):
     shutil.copy(SAMPLES / "chair.off", tmp_path / "loose.off")
     shown = [(shown.name, shown.label) for shown in shown_objects(tmp_path)]
     assert shown == [("chair_1", "chair"), ("loose", None), ("table_1", "table")]
-    shutil.copy(
-        SAMPLES / "chair.off",
-        tmp_path / "loose.ply",
-    )  # another format of the same model
+    # another format of the same model
+    shutil.copy(SAMPLES / "chair.off", tmp_path / "loose.ply")
     assert len(shown_objects(tmp_path)) == 3
     (tmp_path / "empty").mkdir()
     with pytest.raises(DatasetError, match="no meshes"):
@@ -139,9 +137,7 @@ def test_the_objects_of_a_store_are_seen_as_they_were_rendered(tmp_path):
     nearby = exploration.walks[0].look(
         exploration.pose_towards(SPHERE.directions[12] + (0, 0, 0.02))
     )
-    np.testing.assert_array_equal(
-        nearby.observation.pose,
-        SPHERE.poses[12],
-    )  # its own pose counts
+    # its own pose counts
+    np.testing.assert_array_equal(nearby.observation.pose, SPHERE.poses[12])
     with pytest.raises(UsageError, match="seat has only stored views"):
         exploration.use_sensor("kinect")

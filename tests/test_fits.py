@@ -64,9 +64,8 @@ def correlated(
     of an object.
     """
     rng, spread = np.random.default_rng(seed), 1.5
-    labels = (rng.random(n) < 0.8).astype(
-        np.int64
-    )  # a mix that the even weights have to undo
+    # a mix that the even weights have to undo
+    labels = (rng.random(n) < 0.8).astype(np.int64)
     shared, own = rng.normal(size=(n, 1)), rng.normal(size=(n, len(SMALL)))
     seen = (
         2.0 * labels[:, None]
@@ -404,9 +403,8 @@ def test_a_calibration_by_a_bad_sensor_trusts_views_less(
     p = Predictions.load(path)
     change_card(card, held_out=list(p.names[:60]))
     clean = fit_calibration(path, card).calibration
-    order = np.random.default_rng(1).permutation(
-        90
-    )  # the same objects, in another order
+    # the same objects, in another order
+    order = np.random.default_rng(1).permutation(90)
     noise = np.random.default_rng(2).normal(0, 4, p.logits.shape)
     sensed = replace(p, logits=(p.logits + noise).astype(np.float32)).of_objects(order)
     sensed.save(tmp_path / "sensed.npz")

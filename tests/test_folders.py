@@ -314,7 +314,6 @@ def test_a_dataset_without_meshes_is_refused_and_says_what_it_holds(tmp_path, ca
         )
     list_dataset(meshes(tmp_path / "loose", "loose.off", "cup/a.off"))
     assert "loose: left out: loose.off: not in a class folder" in caplog.text
-    flat = list_dataset(
-        meshes(tmp_path / "flat", "a.off", "b.off")
-    )  # each is a class of its own
+    # each is a class of its own
+    flat = list_dataset(meshes(tmp_path / "flat", "a.off", "b.off"))
     assert [(entry.label, entry.name) for entry in flat] == [("a", "a"), ("b", "b")]

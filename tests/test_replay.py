@@ -357,11 +357,8 @@ def test_the_contestants_are_those_that_the_predictions_allow(specs):
     p = specs.predictions
     with_lcm = make_specs(replace(p, maps={**p.maps, "lcm": p.maps["lem"]}), 1, 0)
     assert {"lcm", "lcm-peak", "lcm-oracle-valley"} <= set(default_entries(with_lcm))
-    other = make_specs(
-        replace(p, maps={"view_area": p.maps["lem"]}),
-        4,
-        0,
-    )  # of no valley classes
+    # of no valley classes
+    other = make_specs(replace(p, maps={"view_area": p.maps["lem"]}), 4, 0)
     assert [name for name in default_entries(other) if "view_area" in name] == [
         "view_area",
         "view_area-peak",
@@ -392,9 +389,8 @@ class ToItsBack:
 
     def next_views(self, state, rng):
         n, rows = self.sphere.azimuths, np.arange(len(state.current))
-        seen = (state.belief[:, :, None] * state.azimuth_bins).sum(
-            1
-        )  # (B, azimuth bins)
+        # (B, azimuth bins)
+        seen = (state.belief[:, :, None] * state.azimuth_bins).sum(1)
         to = (
             self.sphere.azimuth_index[state.current][:, None] + n // 2 - np.arange(n)
         ) % n

@@ -250,9 +250,8 @@ def captured(camera: TableCamera, degrees, folder) -> None:
         np.savetxt(f"{name}.pose.txt", frame.pose)
 
 
-_CENTRE = np.array(
-    [[0, 0, 1], [0, 0, 1], [0, 0, 0.0]]
-)  # OpenCV counts from the first pixel's
+# OpenCV counts from the first pixel's
+_CENTRE = np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0.0]])
 
 
 def test_the_command_says_what_is_on_the_table(ycb_meshes, tmp_path, capsys):

@@ -119,9 +119,8 @@ def test_a_look_tells_which_numbers_end_in_another_object(ycb, ycb_meshes):
     scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20)))
     mug = next(track for track in scene._tracks if track.result.answer == "mug")
-    scene._tracks.append(
-        replace(mug, number=7)
-    )  # as if another frame had shown it as another one
+    # as if another frame had shown it as another one
+    scene._tracks.append(replace(mug, number=7))
     look = scene.update(camera.frame(view(140)))
     assert look.joined == ((7, mug.number),)
     assert look.appeared == look.gone == look.moved == ()

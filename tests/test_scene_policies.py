@@ -325,10 +325,8 @@ def test_scenes_around_one_target_are_drawn_together():
     weights = target_weights(names, 200, np.random.default_rng(0))
     for same in (2, 4):
         np.testing.assert_array_equal(weights[:, 0], weights[:, same])
-    np.testing.assert_array_equal(
-        weights[:, [0, 1, 3]].sum(1),
-        3,
-    )  # as many targets as there are
+    # as many targets as there are
+    np.testing.assert_array_equal(weights[:, [0, 1, 3]].sum(1), 3)
     plain = statistics.resample(5, 200, np.random.default_rng(0))
     np.testing.assert_array_equal(
         target_weights(tuple("abcde"), 200, np.random.default_rng(0)),

@@ -53,9 +53,8 @@ def test_a_wall_before_one_half_hides_exactly_half():
     camera = OccludedCamera(scene_of(Block(1.6, 1.5, 0.0, 0.1, 3.0, 3.0)), 112)
     assert camera.visible_share(FRONT) == pytest.approx(0.5, abs=0.005)
     assert camera.visible_share(GRID.poses[4]) == 1  # from behind
-    seen = camera.observe(
-        FRONT
-    )  # x to the right in the picture is +y: looking along -x with z up
+    # x to the right in the picture is +y: looking along -x with z up
+    seen = camera.observe(FRONT)
     columns = np.flatnonzero(seen.depth.any(0))
     assert columns.max() < 56 or columns.min() >= 56
     np.testing.assert_array_equal(seen.depth > 0, seen.picture > 0)

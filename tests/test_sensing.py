@@ -178,9 +178,8 @@ def test_what_touches_an_object_is_a_part_of_it_where_that_is_much_less_novel():
     def by_radius(weight):
         return lambda seen: weight * seen[-1].radius / apart
 
-    thing.reconsider(
-        by_radius(-1)
-    )  # 1 is too little: the joint radius is less than twice as large
+    # 1 is too little: the joint radius is less than twice as large
+    thing.reconsider(by_radius(-1))
     assert thing.object_frame.radius == apart
     thing.reconsider(by_radius(-9))
     assert thing.object_frame.radius > 1.3 * apart
@@ -350,12 +349,8 @@ def test_the_table_is_no_part_of_an_object_where_the_poses_of_an_arm_err(thing, 
         )
 
         plane = seen.sightings[-1].plane
-        on_table = np.linalg.inv(pose) @ [
-            0.2,
-            -0.1,
-            0,
-            1,
-        ]  # a point of it, as the camera sees it
+        # a point of it, as the camera sees it
+        on_table = np.linalg.inv(pose) @ [0.2, -0.1, 0, 1]
         stands = seen.sightings[-1].frame.camera_to_world
         assert abs(plane.height((stands @ on_table)[:3])) < 0.002
 

@@ -60,10 +60,8 @@ def two_surfaces():
 def kept(kind):
     """Which pixels are measured."""
     rows, columns = np.mgrid[:120, :160]
-    turned = np.zeros(
-        (120, 160),
-        bool,
-    )  # a low resolution aligned to a high one, a little turned
+    # a low resolution aligned to a high one, a little turned
+    turned = np.zeros((120, 160), bool)
     y, x = np.mgrid[:60, :80] * 2.25
     at = (
         np.rint(y + 0.02 * x).astype(int).ravel(),

@@ -108,9 +108,8 @@ def test_a_session_of_several_can_be_pickled(system, meshes):  # noqa: F811
     camera = nextview.SimulatedCamera(meshes["mug"])
     session.update(camera.observe(session.pose))
     other = pickle.loads(pickle.dumps(session))
-    other.update(
-        camera.observe(other.pose)
-    )  # what was said of the first view is asked anew
+    # what was said of the first view is asked anew
+    other.update(camera.observe(other.pose))
     assert len(other.views) == 2
     assert len(session.views) == 1
 

@@ -119,9 +119,8 @@ def test_a_wall_that_runs_past_the_camera_is_seen_to_the_border():
     ],
 )
 def test_a_bump_appears_on_the_side_derived_by_hand(view, towards, row, column):
-    stay = trimesh.creation.icosphere(
-        radius=0.1
-    )  # keeps the bounding box around the origin
+    # keeps the bounding box around the origin
+    stay = trimesh.creation.icosphere(radius=0.1)
     ends = [
         stay.copy().apply_translation(p)
         for p in np.vstack([np.eye(3), -np.eye(3)]) * 1.5

@@ -81,10 +81,8 @@ def test_the_weight_is_the_most_likely_one():
     labels = rng.integers(0, 2, n)
     logs = rng.normal(np.log([0.3, 0.6])[labels], 0.5)
     density = norm.logpdf(np.log(RADII)[None], np.log([[0.3], [0.6]]), 0.5)
-    shape = rng.normal(
-        np.where(labels == 0, 1, -1),
-        np.sqrt(2),
-    )  # log-odds of the first class
+    # log-odds of the first class
+    shape = rng.normal(np.where(labels == 0, 1, -1), np.sqrt(2))
     # three views, all alike
     logits = np.stack([shape, np.zeros(n)], 1)[:, None].repeat(3, 1).astype(np.float32)
     data = train_predictions(logits, labels, ViewSphere((0.0,), 3), ("a", "b"))

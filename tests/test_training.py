@@ -101,9 +101,8 @@ def test_balanced_draws_even_out_the_classes():
         recipe,
     )
     seen = np.concatenate([label for _, label in views])
-    share = 10**0.5 / (
-        10**0.5 + 90**0.5
-    )  # a class of n objects is drawn with weight n / sqrt(n)
+    # a class of n objects is drawn with weight n / sqrt(n)
+    share = 10**0.5 / (10**0.5 + 90**0.5)
     assert (seen == 1).mean() == pytest.approx(
         share,
         abs=4 * (share * (1 - share) / len(seen)) ** 0.5,
@@ -150,10 +149,8 @@ def test_augment_says_which_views_it_mirrored():
 def test_map_batches_hold_each_view_with_its_own_map():
     sphere, rng = ViewSphere.named("40"), np.random.default_rng(0)
     values = rng.random((7, 40)).astype(np.float32)
-    seen = np.zeros(
-        (7, 40, 4, 2, 2),
-        np.uint8,
-    )  # object and view, in the left half of the image
+    # object and view, in the left half of the image
+    seen = np.zeros((7, 40, 4, 2, 2), np.uint8)
     seen[..., 0, 0, 0], seen[..., 1, 0, 0] = (
         np.arange(7)[:, None] + 1,
         np.arange(40) + 1,

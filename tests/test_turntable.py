@@ -19,9 +19,8 @@ from nextview.simulation.scene import square
 from nextview.teaching.learn import learn
 
 RADIUS, N, SHAPE = 0.3, 24, (240, 320)
-K = np.array(
-    [[262.5, 0, 159.5], [0, 262.5, 119.5], [0, 0, 1]]
-)  # first pixel's centre at 0
+# first pixel's centre at 0
+K = np.array([[262.5, 0, 159.5], [0, 262.5, 119.5], [0, 0, 1]])
 POSE = look_at_origin(np.radians(35), np.radians(20), 4.2 * RADIUS)
 POSE[2, 3] += 0.4 * RADIUS
 

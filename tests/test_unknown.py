@@ -258,9 +258,8 @@ def test_the_share_of_an_outline_that_is_hidden_is_that_beside_something_nearer(
     share,
 ):
     depth, target = np.full((60, 60), 3.0, np.float32), np.zeros((60, 60), bool)
-    target[20:40, 20:40] = (
-        True  # with 76 pixels of outline: 20 to each side, and 4 near a corner
-    )
+    # with 76 pixels of outline: 20 to each side, and 4 near a corner
+    target[20:40, 20:40] = True
     depth[20:40, 40:] = beside
     depth[20:40, 42:] = 5.0
     assert hidden_share(

@@ -328,9 +328,8 @@ def test_a_pose_that_is_hardly_determined_has_no_negative_variance():
     )
 
     turns, _ = np.linalg.qr(factors)
-    strengths = np.array(
-        [1e12, 1e11, 1e9, 1e4, 1e-7, -1e-5]
-    )  # the last ones by rounding
+    # the last ones by rounding
+    strengths = np.array([1e12, 1e11, 1e9, 1e4, 1e-7, -1e-5])
     singular = (turns * strengths) @ turns.swapaxes(1, 2)
     assert (np.linalg.eigvalsh(inverses(singular)) > 0).all()
     assert (np.trace(inverses(singular), axis1=1, axis2=2) > 1e-6).all()

@@ -119,11 +119,8 @@ def test_a_level_pose_stands_in_its_direction_and_a_great_circle_joins_its_ends(
     assert pose[2, 0] == 0  # its right is level
     arc = great_circle(a, b, 9)
     np.testing.assert_allclose(np.linalg.norm(arc, axis=1), 1)
-    np.testing.assert_allclose(
-        arc @ np.cross(a, b),
-        0,
-        atol=1e-12,
-    )  # all in the plane through both
+    # all in the plane through both
+    np.testing.assert_allclose(arc @ np.cross(a, b), 0, atol=1e-12)
     np.testing.assert_allclose(arc[[0, -1]], [a, b], atol=1e-12)
     np.testing.assert_allclose(arc[4], (a + b) / np.linalg.norm(a + b), atol=1e-12)
 

@@ -111,17 +111,13 @@ def on_page_markdown(
             and not path.startswith("docs/")
             and (ROOT / path).exists()
         ):
-            return label.strip(
-                "[]"
-            )  # a file of the repository that the site does not show
+            # a file of the repository that the site does not show
+            return label.strip("[]")
         found = REPOSITORY_PAGES.get(path, path.removeprefix("docs/"))
         return f"{label}({posixpath.relpath(found, posixpath.dirname(uri) or '.')}{anchor})"
 
-    texts = re.split(
-        r"(^```.*?^```)",
-        markdown,
-        flags=re.M | re.S,
-    )  # every second one is code
+    # every second one is code
+    texts = re.split(r"(^```.*?^```)", markdown, flags=re.M | re.S)
     texts[::2] = [LINK.sub(mended, text) for text in texts[::2]]
     return "".join(texts)
 

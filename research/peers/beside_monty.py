@@ -40,10 +40,8 @@ from benchmarks.verified_things import (
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import UsageError
 
-RIGHT = (
-    "correct",
-    "correct_mlh",
-)  # the second: by the likeliest hypothesis, out of steps
+# the second: by the likeliest hypothesis, out of steps
+RIGHT = ("correct", "correct_mlh")
 TESTED = "tested"  # folders below WORK
 EPISODES = "eval_stats.csv"
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # from Monty's axes, y up

@@ -79,10 +79,8 @@ def test_an_object_is_drawn_with_the_horizon_lowest(views):
     row = store.names.index("thing_0")
     top, bottom = object_figure(store, row).subfigs
     mosaic = top.axes[0].images[0].get_array()
-    np.testing.assert_array_equal(
-        mosaic[-32:, 32:64],
-        store.image(row)[1],
-    )  # ring 0, azimuth 1
+    # ring 0, azimuth 1
+    np.testing.assert_array_equal(mosaic[-32:, 32:64], store.image(row)[1])
     np.testing.assert_array_equal(mosaic[:32, -32:], store.image(row)[39])
     np.testing.assert_array_equal(
         bottom.axes[0].images[0].get_array().ravel(),

@@ -270,10 +270,8 @@ def test_a_wire_before_a_wall_is_seen_in_each_pixel_that_it_fills(gap, aside):
     """As wide as one pixel, so that the pixels on both sides of it show one face of the wall."""
     wall = np.array([[-0.6, -0.6, 0], [0.6, -0.6, 0], [0.6, 0.6, 0], [-0.6, 0.6, 0]])
     wire = wall * [0.012, 0.9, 0] + [aside, 0, gap]
-    corners = np.concatenate([wall, wire])[
-        :,
-        [2, 0, 1],
-    ]  # they face x, where the camera is
+    # they face x, where the camera is
+    corners = np.concatenate([wall, wire])[:, [2, 0, 1]]
     mesh = Mesh(
         corners,
         np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]),

@@ -7,11 +7,10 @@ it and exits with status 2. Any other exception is a bug and keeps its traceback
 import struct
 import zipfile
 import zlib
-from pickle import UnpicklingError  # torch raises it where it refuses to unpickle
 
-# What the readers of NumPy, zarr, Pillow, torch and others raise for a damaged file, which may lead
-# them anywhere. A package that is missing, memory that runs out, and a bug in this package's own
-# names are not among them.
+# What the readers of NumPy, zarr, Pillow and others raise for a damaged file, which may lead them
+# anywhere. A package that is missing, memory that runs out, and a bug in this package's own names
+# are not among them.
 DAMAGED = (
     ArithmeticError,
     AttributeError,
@@ -21,7 +20,6 @@ DAMAGED = (
     RuntimeError,
     SyntaxError,
     TypeError,
-    UnpicklingError,
     ValueError,
     struct.error,
     zipfile.BadZipFile,

@@ -31,16 +31,13 @@ T = TypeVar("T")
 # a field of a record: a hash in hexadecimal digits
 HashText = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # errors of a full disk
-MARKER = (
-    "nextview-unfinished.json"  # in each temporary folder: an ``Unfinished`` record
-)
-LONGEST_OUTPUT_NAME = (
-    40  # letters of an output's name that the name of its temporary folder holds
-)
+# in each temporary folder: an ``Unfinished`` record
+MARKER = "nextview-unfinished.json"
+# letters of an output's name that the name of its temporary folder holds
+LONGEST_OUTPUT_NAME = 40
 LONGEST_PATH = 300  # letters of a path that a sentence shows
-LARGEST_RECORD = (
-    64 * 2**20
-)  # bytes of a JSON record; a card takes some hundred thousand
+# bytes of a JSON record; a card takes some hundred thousand
+LARGEST_RECORD = 64 * 2**20
 
 
 def check_new(path: Path, overwrite: bool = False, folder: bool = False) -> None:
@@ -325,10 +322,8 @@ def _sync_folder(path: Path) -> None:
         return
     # no file is lost without it: some network file systems refuse it, as does a folder that
     with suppress(OSError):
-        descriptor = os.open(
-            path,
-            os.O_RDONLY | os.O_DIRECTORY,
-        )  # can be written but not read
+        # can be written but not read
+        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
         try:
             os.fsync(descriptor)
         finally:

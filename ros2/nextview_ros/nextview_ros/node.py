@@ -78,9 +78,8 @@ class RecogniseNode(Node):
             threading.Event(),
             threading.Condition(),
         )
-        self.begun = (
-            threading.Event()
-        )  # set while no accepted goal waits for its session
+        # set while no accepted goal waits for its session
+        self.begun = threading.Event()
         self.latest = None
         group = ReentrantCallbackGroup()
         self.poses = CameraPoses(

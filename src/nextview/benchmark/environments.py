@@ -112,9 +112,8 @@ class Rules:
                 raise UsageError(f"{value!r} is none of {', '.join(known)}")
         number(self.view_price, "the view_price", 0)
         number(self.travel_price, "the travel_price", 0)
-        Stopping(
-            0.5 if self.threshold is None else self.threshold
-        )  # says what is wrong with it
+        # says what is wrong with it
+        Stopping(0.5 if self.threshold is None else self.threshold)
 
     @property
     def maps(self) -> tuple[str, ...]:

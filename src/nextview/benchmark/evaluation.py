@@ -302,9 +302,8 @@ def _reliability(right: Mask, confidence: Float32) -> pd.DataFrame:
     rows = []
     v = len(right)
     for n_views in [k for k in RELIABILITY_LOOKS if k < v] + [v]:
-        turns = (
-            slice(None) if n_views < v else slice(1)
-        )  # all views are the same in every order
+        # all views are the same in every order
+        turns = slice(None) if n_views < v else slice(1)
         belief = confidence[n_views - 1, :, turns].ravel().astype(np.float64)
         answers = right[n_views - 1, :, turns]
         sure, share, count = metrics.reliability(belief, answers.ravel())

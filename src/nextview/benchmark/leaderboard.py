@@ -128,9 +128,8 @@ def too_few(tables: Tables, threshold: float, objects: int) -> str | None:
         The warning; None if there are enough.
     """
     tests = _robot_tests(tables, threshold)
-    half = float(
-        (tests["high"] - tests["low"]).median() / 2
-    )  # NaN if nothing was compared
+    # NaN if nothing was compared
+    half = float((tests["high"] - tests["low"]).median() / 2)
     if objects >= FEW_OBJECTS and not half > WIDE_INTERVAL:
         return None
     unclear = (

@@ -45,10 +45,8 @@ EPISODE_SPHERE = ViewSphere.named("40")
 NEAREST_SURFACE = 0.25  # metres between the camera and the surface, at least
 USUAL_DISTANCE = 0.45  # metres between the camera and the centre, at most
 RADII_AWAY = 5.0  # of the camera from the centre, between these
-VISIBLE_SHARES = {
-    "half": (0.45, 0.65),
-    "heavy": (0.25, 0.45),
-}  # means over the viewpoints
+# means over the viewpoints
+VISIBLE_SHARES = {"half": (0.45, 0.65), "heavy": (0.25, 0.45)}
 FEWEST_BOXES = 3  # around a thing that is partly hidden
 MOST_BOXES = 40
 BOX_LAYOUTS_TRIED = 60  # of boxes; then the one that comes nearest is taken

@@ -29,9 +29,8 @@ THING_POLICIES = (
     "ceiling",
 )
 CEILINGS = ("foresight", "ceiling")  # they know what no robot does
-TURN_AHEAD = (
-    3  # azimuth steps of the fixed sequence, of 8 a turn: it comes to all of them
-)
+# azimuth steps of the fixed sequence, of 8 a turn: it comes to all of them
+TURN_AHEAD = 3
 TRUTH_BELIEF = 0.01  # in the true pose, beside the hypotheses, for the ceiling
 SETTLED_BELIEF = 0.97  # in the truth, after which foresight looks for nothing better
 

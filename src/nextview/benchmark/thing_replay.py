@@ -84,10 +84,8 @@ def run(
             return ThingRun(views=views, **made)
 
         begun = time.process_time()
-        state = episode.state(
-            views,
-            policy.needs,
-        )  # what is foreseen counts as its time
+        # what is foreseen counts as its time
+        state = episode.state(views, policy.needs)
         view = int(policy.next_views(state, rng)[0])
         made["decision"].append(time.process_time() - begun)
         if not state.free[0, view]:

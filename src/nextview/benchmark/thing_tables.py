@@ -106,9 +106,8 @@ class _Runs:
         right = np.array([each.right for _, each in runs], np.float64)
         believed = np.array([each.confidence for _, each in runs], np.float64)
         explained = np.array([each.p_value for _, each in runs], np.float64)
-        suspicious = (
-            explained < SUSPICIOUS * UNKNOWN_ALPHA
-        )  # False where it is not known
+        # False where it is not known
+        suspicious = explained < SUSPICIOUS * UNKNOWN_ALPHA
         sure = (believed >= threshold) & ~suspicious
         ever = sure.any(1)
         last = np.where(ever, sure.argmax(1), sure.shape[1] - 1)
@@ -156,10 +155,8 @@ class _Runs:
         return np.asarray(values[order][first], np.float64)
 
 
-Sampled = dict[
-    tuple[str, int],
-    Float,
-]  # by measure and number of views, a value a sample
+# by measure and number of views, a value a sample
+Sampled = dict[tuple[str, int], Float]
 
 
 def _sampled(runs: _Runs, views: tuple[int, ...], drawn: Float) -> Sampled:

@@ -44,9 +44,8 @@ RAW = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TF = "tf2_msgs/msg/TFMessage"
-STATIC_TRANSFORMS = (
-    "tf_static"  # the end of the name of the topic of transforms that never change
-)
+# the end of the name of the topic of transforms that never change
+STATIC_TRANSFORMS = "tf_static"
 NANOSECONDS = 1e-9
 
 

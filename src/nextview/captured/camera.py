@@ -20,12 +20,10 @@ from nextview.types import Float
 
 # the axes of a world that may be called up by name
 UP = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-PIXELS_AROUND_CENTRE = (
-    3  # pixels around the object's centre that tell whether it is hidden
-)
-HIDING_DISTANCE = (
-    1.5  # object radii before its centre from which something else hides it
-)
+# pixels around the object's centre that tell whether it is hidden
+PIXELS_AROUND_CENTRE = 3
+# object radii before its centre from which something else hides it
+HIDING_DISTANCE = 1.5
 
 
 @dataclass(frozen=True)

@@ -25,25 +25,20 @@ from nextview.sensing.agreement import (
 )
 from nextview.sensing.frame import Frame
 
-MOST_COMPARED_FRAMES = (
-    60  # frames of a capture that are compared with each other, evenly spread
-)
+# frames of a capture that are compared with each other, evenly spread
+MOST_COMPARED_FRAMES = 60
 MOST_REFUSED = 0.1  # share of the frames that may be left out; a single one always may
 CONTRADICTED_SHARE = 0.5  # a frame of which less is confirmed contradicts the others
-CONTRADICTED_SHARPLY = (
-    0.3  # the same, looked at sharply, if it is also so many times what is usual
-)
+# the same, looked at sharply, if it is also so many times what is usual
+CONTRADICTED_SHARPLY = 0.3
 TIMES_USUAL = 4.0
 # share of what stands on the plane that is contradicted where frames disagree altogether
 CONTRADICTED_IN_ALL = 0.3
 FEWEST_TO_BLAME = 5  # frames of which one may be blamed if they disagree
-PLAUSIBLE_DEPTH = (
-    0.05,
-    15.0,
-)  # metres that a capture of an object may have as its median depth
-NEVER_A_DEPTH = (
-    25  # times by which a depth scale is hardly ever wrong, and a unit of length often
-)
+# metres that a capture of an object may have as its median depth
+PLAUSIBLE_DEPTH = (0.05, 15.0)
+# times by which a depth scale is hardly ever wrong, and a unit of length often
+NEVER_A_DEPTH = 25
 NAMED_FRAMES = 3  # frames that are named in a sentence; of others the number is told
 DEPTH_SOURCES = {
     "BOP": "depth_scale in scene_camera.json",

@@ -44,15 +44,13 @@ from nextview.types import Float
 # the pinhole matrix in a folder of TUM or 7-Scenes, as in 3DMatch
 INTRINSICS = "camera-intrinsics.txt"
 TUM_STEP = 1 / 5000  # metres that one step of TUM's depth images stands for
-STAMP_DIFFERENCE = (
-    0.02  # seconds that an image and its pose, or depth and colour, may be apart
-)
+# seconds that an image and its pose, or depth and colour, may be apart
+STAMP_DIFFERENCE = 0.02
 MOST_LOST = 0.1  # share of the lines of a trajectory that may hold no pose
 # fx, fy, cx, cy of the depth camera of 7-Scenes, for all of its scenes
 KINECT = (585.0, 585.0, 320.0, 240.0)
-LARGEST_SCALE = (
-    0.05  # metres that a step of a depth image may stand for; a float image has 1
-)
+# metres that a step of a depth image may stand for; a float image has 1
+LARGEST_SCALE = 0.05
 ThreeNumbers = Annotated[list[float], Meta(min_length=3, max_length=3)]
 Nine = Annotated[list[float], Meta(min_length=9, max_length=9)]
 # as given by hand, see ``read_capture``

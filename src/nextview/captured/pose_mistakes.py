@@ -15,9 +15,8 @@ from nextview.sensing.agreement import Agreement, SurfaceView, compare
 from nextview.sensing.frame import CAMERA_AXES
 from nextview.types import Float, Index
 
-FEWEST_JUDGED = (
-    100  # points that two frames or more have to share before anything is said
-)
+# points that two frames or more have to share before anything is said
+FEWEST_JUDGED = 100
 CERTAIN_SHARE = 0.99  # share of confirmed points from which no mistake is searched for
 # a mistake is named if FEWER_CONTRADICTIONS are left without it, of at least this share of the
 # points that it concerns

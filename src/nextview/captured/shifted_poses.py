@@ -17,9 +17,8 @@ from nextview.types import Float, Index, Mask
 
 FRAME_SHIFTS = (1, -1, 2, -2)  # frames by which the poses of a part may be late
 MOST_SHIFTED = 4  # frames by which poses may be late after several parts
-MOST_PARTS = (
-    3  # parts that are searched for, one inside the other or one after the other
-)
+# parts that are searched for, one inside the other or one after the other
+MOST_PARTS = 3
 # the shift is named if at most this part of the contradictions is left without it
 FEWER_CONTRADICTIONS = 0.5
 LEAST_EXPLAINED = 100  # contradictions that a shift has to explain

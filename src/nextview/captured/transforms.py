@@ -12,9 +12,8 @@ from nextview.captured.messages import matrix_of
 from nextview.errors import DatasetError
 from nextview.types import Float
 
-LONGEST_GAP = (
-    0.5  # seconds between two transforms from which a pose between them is interpolated
-)
+# seconds between two transforms from which a pose between them is interpolated
+LONGEST_GAP = 0.5
 BEYOND = 0.02  # seconds before the first or after the last transform that it still counts for
 
 

@@ -27,9 +27,8 @@ from nextview.types import Float
 ROUNDS = 40
 TURN_POINTS = 800
 CLOSEST_TURN = 0.7
-TURN_PARTS = (
-    6  # a sixth of a circle, or one step, lies between two frames that are compared
-)
+# a sixth of a circle, or one step, lies between two frames that are compared
+TURN_PARTS = 6
 # how far apart this share of the frames may lie, parts of the thing's radius, beyond noise
 AGREE = 0.008
 AGREEING_SHARE = 0.8

@@ -38,9 +38,8 @@ def print_episode(
         float(result.stopping.threshold_at(step))
         for step in range(1, len(result.views) + 1)
     ]
-    has_threshold = bool(
-        np.isfinite(stops).any()
-    )  # a rule of your own need not stop at a belief
+    # a rule of your own need not stop at a belief
+    has_threshold = bool(np.isfinite(stops).any())
 
     console = Terminal()
     console.print(

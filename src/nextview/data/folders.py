@@ -380,9 +380,8 @@ def _walk(root: Path, suffixes: tuple[str, ...], skip: Mapping[Path, str]) -> _C
 
 
 def _real(path: Path) -> Path:
-    return Path(
-        os.path.realpath(path)
-    )  # Path.resolve raises where links lead in a circle
+    # Path.resolve raises where links lead in a circle
+    return Path(os.path.realpath(path))
 
 
 def _not_entered(folder: Path) -> str | None:

@@ -255,9 +255,8 @@ def measure(
         Number of objects done so far, and the number of all.
     """
     names = names_of(names, views is not depth_views)
-    ViewStore.open(path).array(
-        "depth"
-    )  # says if it is missing, before anything is begun
+    # says if it is missing, before anything is begun
+    ViewStore.open(path).array("depth")
     function = partial(_measure, names, views)
     yield from keep(
         path,

@@ -51,13 +51,11 @@ from nextview.simulation.simulated import OccludedCamera, SimulatedCamera
 from nextview.types import Float
 
 AnySensor = Sensor | SensorMix | None
-LARGEST_CHUNK = (
-    2**31 - 2**20
-)  # bytes that may be compressed at once, the compressor's own included
+# bytes that may be compressed at once, the compressor's own included
+LARGEST_CHUNK = 2**31 - 2**20
 ODD_MESHES = 10  # that are named
-FARTHEST_STORED = (
-    np.iinfo(np.uint16).max * DEPTH_UNIT
-)  # depth that can be stored, object radii
+# depth that can be stored, object radii
+FARTHEST_STORED = np.iinfo(np.uint16).max * DEPTH_UNIT
 # sets the draws of a sensor apart from those of a deformation: no byte of a name is as large
 SENSING = 256
 

@@ -32,9 +32,8 @@ from nextview.simulation.scene import footprint, mesh_hash, separation
 from nextview.simulation.scene_layout import SUFFIX
 from nextview.types import Float
 
-ROOM_NAME = (
-    "room"  # in the names of rooms, where other scenes have their level of clutter
-)
+# in the names of rooms, where other scenes have their level of clutter
+ROOM_NAME = "room"
 ROOM_LAYOUTS_TRIED = 60
 VIEWS_TRIED = 60  # first views of one layout
 
@@ -54,11 +53,8 @@ TABLE_LEG = 0.05
 TABLE_EDGE = 0.08  # metres from the edge of the table to what lies on it, at least
 LEAST_SPACING = 0.08  # metres between two things on a table, at least
 MOST_BESIDE = 2
-BOOK = (
-    (0.05, 0.25),
-    (0.05, 0.2),
-    (0.03, 0.15),
-)  # width, depth and height of boxes on a table
+# width, depth and height of boxes on a table
+BOOK = ((0.05, 0.25), (0.05, 0.2), (0.03, 0.15))
 CABINET = ((0.4, 1.2), (0.3, 0.5), (0.6, 2.0))
 
 # of the first view: metres from the target, metres over the floor, and over a table
@@ -69,17 +65,15 @@ CLOSEST_CAMERA = 0.8  # metres from the target's sphere
 TABLE_DISTANCE = (0.4, 0.7)
 CLOSEST_TO_SMALL = 0.25
 TABLE_ELEVATION = (20.0, 60.0)  # degrees
-AIM_OFF = (
-    0.02  # standard deviation of where the camera is aimed, as a part of its distance
-)
+# standard deviation of where the camera is aimed, as a part of its distance
+AIM_OFF = 0.02
 # share of the target's picture that nothing else hides in the first view, at least
 LEAST_SHOWN = 0.7
 PREVIEW_SIDE = 96  # pixels across, in which that is measured
 FIELD = 0.9  # of that picture: its half width at unit distance
 
-NO_POSE = tuple(
-    np.eye(4).ravel().tolist()
-)  # the first pose of a layout that has none yet
+# the first pose of a layout that has none yet
+NO_POSE = tuple(np.eye(4).ravel().tolist())
 
 # the target, the other things, and the boxes beside them
 Furnished = tuple[Standing, list[Standing], list[Slab]]

@@ -61,14 +61,10 @@ THING_GAP = 0.04  # between things, at least, object radii
 # from the target's middle, object radii
 CLUTTER_DISTANCES = {"light": (0.5, 2.6), "medium": (0.5, 2.3), "heavy": (0.5, 2.1)}
 OBJECT_RADIUS = (0.5, 1.1)
-FEWEST_OBJECTS = (
-    2  # of things that are no boxes or walls, if there are any meshes for them
-)
-OBJECTS = {
-    "light": 0.7,
-    "medium": 0.6,
-    "heavy": 0.4,
-}  # share of objects among objects and boxes
+# of things that are no boxes or walls, if there are any meshes for them
+FEWEST_OBJECTS = 2
+# share of objects among objects and boxes
+OBJECTS = {"light": 0.7, "medium": 0.6, "heavy": 0.4}
 # what is low hides nothing from above
 BOX_HEIGHT = {"light": BLOCK_HEIGHT, "medium": BLOCK_HEIGHT, "heavy": (1.4, 2.9)}
 # what a thing hides at least: the table is soon full

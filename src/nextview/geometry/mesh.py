@@ -20,9 +20,8 @@ from nextview.geometry.mesh_parts import (
 from nextview.geometry.triangles import MAX_FACES, check_faces, no_faces
 from nextview.types import Float, Floats, Index
 
-BYTES_PER_FACE = (
-    60  # how many bytes a mesh file may have for each triangle that it may have
-)
+# how many bytes a mesh file may have for each triangle that it may have
+BYTES_PER_FACE = 60
 FORMATS = tuple(READERS)
 UNITS = {
     "mm": 0.001,

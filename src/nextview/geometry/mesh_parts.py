@@ -19,16 +19,14 @@ HASH_FACTORS = np.array(
 )
 FLAT_PART = 0.05  # thickness of a part, over its width, below which it is a plate
 SMALL_PART = 0.01  # of the surface of the largest part: smaller ones are crumbs
-FAR_PARTS = (
-    3.0  # how many times as large as its main part a mesh has to be to be asked about
-)
+# how many times as large as its main part a mesh has to be to be asked about
+FAR_PARTS = 3.0
 WIDE_PLANE = 2.0  # how many times as large as what stands on it
 MOST_WIDE_PLANE = 25.0  # more, and what is beside it is no object but a bump
 # how much more of what is not in the plane is on one side of it: 0 as much on both, 1 all
 ONE_SIDED = 0.8
-PLANE_THICKNESS = (
-    0.05  # of the mesh's size: what lies no farther from a plane belongs to it
-)
+# of the mesh's size: what lies no farther from a plane belongs to it
+PLANE_THICKNESS = 0.05
 PLANE_FACES = 100_000  # that are looked at in search of a plane
 PLANE_ANGLE = np.cos(np.radians(15))  # between its normal and those of its faces
 # object radii between two numbers of single precision, from where on a shape is lost
@@ -99,9 +97,8 @@ class Parts:
 
 def _places(vertices: Float) -> NDArray[np.intp]:
     """A number for each vertex, (V,), the same for those in the same place."""
-    bits = np.ascontiguousarray(vertices + 0.0).view(
-        np.uint64
-    )  # of zeros there are two
+    # of zeros there are two
+    bits = np.ascontiguousarray(vertices + 0.0).view(np.uint64)
     mixed = bits ^ (bits >> np.uint64(32))
     _, places = np.unique(
         (mixed * HASH_FACTORS).sum(1, dtype=np.uint64),

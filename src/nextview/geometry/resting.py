@@ -13,12 +13,10 @@ from nextview.types import Float
 
 LIKELY_POSE = 0.1  # resting poses less likely than this are left out
 MOST_RESTING_POSES = 4  # and all but so many, the mesh's own among them
-SAME_TILT = np.radians(
-    20
-)  # resting poses whose directions up are within this angle are one
-RARE_REST = (
-    0.05  # this share of the throws, those into the rarest poses, is not looked at
-)
+# resting poses whose directions up are within this angle are one
+SAME_TILT = np.radians(20)
+# this share of the throws, those into the rarest poses, is not looked at
+RARE_REST = 0.05
 # thickness, object radii, below which an object is a sheet: it has two sides and no convex hull
 FLAT_SHEET = 1e-4
 

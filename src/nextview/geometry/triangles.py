@@ -148,10 +148,8 @@ def _fan_is_right(points: Float) -> Mask:
     """
     with np.errstate(over="ignore", invalid="ignore"):
         spokes = points[:, 1:] - points[:, :1]
-        crosses = np.cross(
-            spokes[:, :-1],
-            spokes[:, 1:],
-        )  # twice the areas of the fan's triangles
+        # twice the areas of the fan's triangles
+        crosses = np.cross(spokes[:, :-1], spokes[:, 1:])
         normals = crosses.sum(1)
         squares = (normals**2).sum(1)
         along = np.einsum("nki,ni->nk", crosses, normals)

@@ -17,9 +17,8 @@ from nextview.checks import number, one_line, points, whole
 from nextview.errors import UsageError
 from nextview.types import Float, Index
 
-CAMERA_DISTANCE = (
-    3.0  # distance of the camera from the object's centre, in object radii
-)
+# distance of the camera from the object's centre, in object radii
+CAMERA_DISTANCE = 3.0
 # elevation and azimuth of a cell, in which travel off any grid is counted
 TRAVEL_CELL = np.radians((18.0, 45.0))
 # viewpoints that there may be: distances between all of them are kept, 200 MB at this number

@@ -11,9 +11,8 @@ from nextview.policies.base import EpisodeState, best_view, check_weight, travel
 from nextview.things.memory import AZIMUTHS, RINGS, open_memory
 from nextview.types import Float, Floats, Index, Mask
 
-WEIGHT = (
-    40.0  # of a cosine, as a log-likelihood: for one view whose noise is not known yet
-)
+# of a cosine, as a log-likelihood: for one view whose noise is not known yet
+WEIGHT = 40.0
 # pairs of a thing, in a resting pose, and an azimuth that are weighed: those believed most
 LEADING = 24
 

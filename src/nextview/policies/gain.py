@@ -251,9 +251,8 @@ class Gain:
 
     def __post_init__(self) -> None:
         maps = maps_of(self.inputs)
-        unknown = [
-            name for name in maps if name not in maps_among(maps)
-        ]  # other needs of policies
+        # other needs of policies
+        unknown = [name for name in maps if name not in maps_among(maps)]
         if unknown or not self.inputs:
             known = ", ".join((*INPUTS, VISIBILITY))
             other = ", ".join(unknown) or "nothing"

@@ -152,9 +152,8 @@ class OffGrid:
         visited &= ~reachable  # a cell with several views may have one that is free
         current = ring * n
         visited[rows[:, 0], current] = True
-        lost = ~(reachable & ~visited).any(
-            1
-        )  # the only free view lies in the camera's own cell
+        # the only free view lies in the camera's own cell
+        lost = ~(reachable & ~visited).any(1)
         reachable[lost] = True
         visibility = state.visibility
         if visibility is not None:  # that of the view nearest to each cell

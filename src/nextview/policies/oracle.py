@@ -127,10 +127,8 @@ class OracleGain:
             The next view of each episode, (B,) int64.
         """
         b = len(state.current)
-        parts = np.split(
-            np.arange(b),
-            range(500, b, 500),
-        )  # all at once would fill the memory
+        # all at once would fill the memory
+        parts = np.split(np.arange(b), range(500, b, 500))
         gain = np.concatenate([self._gains(state, rows) for rows in parts])
         if self.scope == "global":
             return best_view(self.sphere, state, gain)

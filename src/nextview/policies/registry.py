@@ -40,9 +40,8 @@ POLICIES: dict[str, Callable[[Any], Policy]] = {
     "spread-local": lambda sphere: Spread(sphere, "local"),
     "visibility": MostVisible,
 }
-POLICY_ENTRY_POINTS = (
-    "nextview.policies"  # entry points by which packages add policies of their own
-)
+# entry points by which packages add policies of their own
+POLICY_ENTRY_POINTS = "nextview.policies"
 ANYWHERE = ("random-all", "spread", "visibility")  # those that need no grid
 # before a gain policy's name: its values times the share that is expected to show
 VISIBLE = "visible-"

@@ -401,9 +401,8 @@ class Calibration(
 # share of a class that is smaller than usual, and larger; times beyond that which none has
 RARE = 0.05
 MUCH = 2.0
-PLAIN_SUM = (
-    Calibration()
-)  # trusts the sum of the logits as it stands, as the thesis did
+# trusts the sum of the logits as it stands, as the thesis did
+PLAIN_SUM = Calibration()
 
 
 class SizeEvidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):

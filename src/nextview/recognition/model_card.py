@@ -26,9 +26,8 @@ RECOGNISER = "recogniser-modelnet10"
 # the bundled network that knows no classes: what taught things are remembered by
 FEATURE_NETWORK = "features"
 MEMORY_SUFFIX = ".safetensors"
-DISCRIMINATE = (
-    "discriminate"  # the policy of a memory of things; its card is that of the memory
-)
+# the policy of a memory of things; its card is that of the memory
+DISCRIMINATE = "discriminate"
 # bundled recognisers, by the name of their models
 COLLECTIONS = {"modelnet10": RECOGNISER, "ycb": "ycb"}
 # the map networks that are bundled, by the name of the map
@@ -38,13 +37,11 @@ SCHEMA = 2  # of the cards of models; those of policies have 1
 LARGEST_CARD_NUMBER = 1e9  # of a card; densities, gains and sizes are far smaller
 LARGEST_WEIGHT = 1e6  # of a cosine; what is fitted is below a hundred
 LARGEST_ORDER = 1000  # of a symmetry; what is found is below ten
-UNIT_LENGTH = (
-    1e-3  # by which the axis of a symmetry may be too long: cards hold rounded numbers
-)
+# by which the axis of a symmetry may be too long: cards hold rounded numbers
+UNIT_LENGTH = 1e-3
 MOST_TAUGHT_POSES = 1000  # of a thing; what is taught has a handful
-SHORT_HASH = (
-    16  # hexadecimal digits of the SHA-256 of a memory that its file's name holds
-)
+# hexadecimal digits of the SHA-256 of a memory that its file's name holds
+SHORT_HASH = 16
 
 
 class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

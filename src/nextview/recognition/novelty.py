@@ -22,12 +22,8 @@ from nextview.files import arrays_in, checked_bytes, new_file
 from nextview.geometry.observation import Observation, SceneView
 from nextview.types import Float, Float32, Floats, Index, Mask
 
-ARRAYS = (
-    "quantiles",
-    "objects",
-    "neighbours",
-    "standard",
-)  # in the file of a novelty score
+# in the file of a novelty score
+ARRAYS = ("quantiles", "objects", "neighbours", "standard")
 NEIGHBOUR = 10  # the distance to this one of the nearest known views counts
 ROUNDED = 0.01  # by how much the length of a unit vector in half precision may be off
 # novelty by the share of an outline that is hidden: the least that keeps half hidden objects known

@@ -11,9 +11,8 @@ from nextview.scene.tracks import Track
 from nextview.sensing.planes import Plane
 from nextview.types import Float, Mask
 
-FLOATING_HEIGHT = (
-    0.02  # metres from the plane to the lowest point of a thing that stands on it
-)
+# metres from the plane to the lowest point of a thing that stands on it
+FLOATING_HEIGHT = 0.02
 
 
 def floating(tracks: Sequence[Track], plane: Plane) -> list[bool]:

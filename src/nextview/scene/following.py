@@ -18,18 +18,16 @@ from nextview.types import Float, Index, Mask
 
 # metres around an object, seen from above, within which pixels may be its own
 SEGMENT_MARGIN = 0.012
-SAME_OBJECT_SHARE = (
-    0.5  # share of a segment over an object, from which it is that object
-)
+# share of a segment over an object, from which it is that object
+SAME_OBJECT_SHARE = 0.5
 SECOND = 0.2  # share of a segment over another object, from which the segment is cut
 SEGMENT_POINTS = 400  # points of a segment that are looked at
 FEWEST_TESTED = 30  # pixels in which an object should show before it is called gone
 GONE = 0.6  # share of these through which something behind it is seen
 STEP_BEHIND = 0.02  # metres by which that lies behind it, at least
 THERE = 0.6  # share of the pixels in which it should show, from which an object is seen again
-SAME_PIXELS = (
-    0.5  # share of the pixels of two objects that are of both, above which they are one
-)
+# share of the pixels of two objects that are of both, above which they are one
+SAME_PIXELS = 0.5
 FEWEST_AGAINST = 2  # objects that a frame with a wrong pose contradicts, at least
 
 

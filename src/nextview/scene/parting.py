@@ -29,15 +29,13 @@ GOOD_FIT = 0.85  # share of an object's pixels that its scan explains, from whic
 LEAST_GAIN = 0.03  # by which another parting explains more of the pixels, at least
 # the same where an unknown object is cut: any surface has small parts that some thing explains
 LEAST_OF_UNKNOWN = 0.3
-KNOWN_SHARE = (
-    0.5  # share of an object's pixels that are explained, from which it is a known one
-)
+# share of an object's pixels that are explained, from which it is a known one
+KNOWN_SHARE = 0.5
 MOST_PLANE_SHARE = 0.25  # share of an object's pixels that may be the plane's
 LEAST_TRIMMED = 0.02
 SHARED = 0.5  # share of a segment that another object's scan explains, from which they may be one
-NEAR_GAP = (
-    0.02  # metres between segments in the picture that are tried as one object, at most
-)
+# metres between segments in the picture that are tried as one object, at most
+NEAR_GAP = 0.02
 NEAR_STEP = 0.03  # metres between their depths there, at most
 MOST_GROUP = 5  # segments that touch and are tried as one object
 MOST_TRIES = 2  # frames in which an object's pixels are parted otherwise in vain

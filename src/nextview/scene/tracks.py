@@ -21,9 +21,8 @@ from nextview.session.result import Recognition
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.types import Float, Float32, Mask
 
-RENDERED_ROWS = (
-    120  # rows and columns in which a scan is rendered into a frame, at most
-)
+# rows and columns in which a scan is rendered into a frame, at most
+RENDERED_ROWS = 120
 AGREES = 0.006  # metres by which depth may be off from a scan, beside the noise
 AGREES_NOISE = 3.0  # standard deviations of the noise by which it may
 # metres by which a frame may show a thing displaced that was not aligned with it

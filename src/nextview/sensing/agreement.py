@@ -28,9 +28,8 @@ NOISE_TOLERANCE = 3.0  # standard deviations of the noise
 SMOOTH_STEP = 0.05
 # height over the largest plane, as a part of the depth, from which a point is not on it
 ABOVE_PLANE = 0.012
-FAR_BEHIND = (
-    1.5  # times the depth in the middle of the picture: what lies farther is background
-)
+# times the depth in the middle of the picture: what lies farther is background
+FAR_BEHIND = 1.5
 SMALLEST_MIDDLE = 20  # grid points in the middle of the picture that tell its depth
 LEAST_DEPTH = 1e-6  # metres before a camera from which a point can be in its picture
 

@@ -21,15 +21,11 @@ from nextview.sensing.convex_pieces import Pieces
 from nextview.sensing.frame import Frame
 from nextview.types import Float, Index, Mask
 
-Joins = Literal[
-    "by their border",
-    "never",
-    "always",
-]  # whether things that touch are one thing
+# whether things that touch are one thing
+Joins = Literal["by their border", "never", "always"]
 
-FOOTPRINT_CELL = (
-    0.01  # side of a cell of the footprint, in distances of the camera from the object
-)
+# side of a cell of the footprint, in distances of the camera from the object
+FOOTPRINT_CELL = 0.01
 # share of the cells of a piece that lie over another one of the same frame, from which they are one
 OVERLAP = 0.25
 # strength of the link of two pieces that touch: what lies over each other in two frames is joined
@@ -50,9 +46,8 @@ ON_OUTLINE = 0.5  # cells up to which one outside of an outline lies on it
 OUTLINED = 25  # cells of a piece with an outline, at least
 MOST_COMPARED_CELLS = 50  # cells of a piece that are compared with those of another one
 FOOTPRINT_DIRECTIONS = 24
-SURROUNDED = (
-    0.85  # share of the directions from what lies within a piece in which it has cells
-)
+# share of the directions from what lies within a piece in which it has cells
+SURROUNDED = 0.85
 TWO = 0.25  # share of the cells of an object that a part of it has which may be another thing
 # share of a thing's pixels over what is seen of the plane, at least: it may hide most of it
 OVER_PLANE = 0.1

@@ -105,9 +105,8 @@ def cut(
     mask = mask | bottom
     inverse = _smooth(z, mask)
     usual = np.where(mask, z, 1).astype(np.float32)
-    error = (2 * noise.at(usual) * usual).astype(
-        np.float32
-    )  # as a part of the distance
+    # as a part of the distance
+    error = (2 * noise.at(usual) * usual).astype(np.float32)
     tolerance = (VALLEY + error) / usual
     found: Any
     found, count = ndimage.label(mask & ~_concave(inverse, tolerance))
@@ -267,10 +266,8 @@ def _touching(label: Index, inverse: Float32, tolerance: Float32) -> Mask:
 
 def _enclosed(label: Index) -> Mask:
     """Which pieces have most of their border to which other one, (pieces + 1, pieces + 1) bool."""
-    label = np.pad(
-        label,
-        1,
-    )  # a piece has a border where the part of the picture ends, too
+    # a piece has a border where the part of the picture ends, too
+    label = np.pad(label, 1)
     count = _borders(label, [np.ones(label[a].shape, bool) for a, _ in NEXT])
     inside = count > ENCLOSED * count.sum(1, keepdims=True)
     inside[0] = inside[:, 0] = False

@@ -51,13 +51,11 @@ exact a twentieth of the shifts is larger than twice that.
 """
 # standard deviations that noise does not explain, from which a shift is allowed for
 MENDED_DEVIATIONS = 3.0
-LEAST_MENDED = (
-    0.006  # parts of the distance from the camera: smaller shifts are left as they are
-)
+# parts of the distance from the camera: smaller shifts are left as they are
+LEAST_MENDED = 0.006
 NOT_WORTH = 0.3  # parts of the least shift that is mended
-DISPLACEMENT_NOTICED = (
-    2.5  # standard deviations that noise and depth errors do not explain
-)
+# standard deviations that noise and depth errors do not explain
+DISPLACEMENT_NOTICED = 2.5
 
 
 @dataclass(frozen=True)

@@ -195,14 +195,12 @@ BLOCK = 4  # voxels along the side of the blocks that stand for parts of the obj
 UNSEEN_PART = 0.01
 """Weight of an unseen voxel of the object's unit ball, where one of the object has 1: before
 anything of the object was seen they are all there is."""
-DENSITY = (
-    0.2  # how often unseen space is filled, per object radius: between the two bounds
-)
+# how often unseen space is filled, per object radius: between the two bounds
+DENSITY = 0.2
 SOLID = 1e3  # a density, per voxel, through which nothing is seen
 LINES_TOGETHER = 400  # lines that are drawn at once
-LOW_POINTS = (
-    0.02  # share of a frame's points that may lie below the height of the table: noise
-)
+# share of a frame's points that may lie below the height of the table: noise
+LOW_POINTS = 0.02
 
 
 @dataclass(frozen=True)

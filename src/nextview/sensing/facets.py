@@ -19,12 +19,10 @@ from nextview.sensing.frame import Frame
 from nextview.types import Float, Float32, Floats, Index, Mask
 
 SIZE = 224  # side of the observations' images: what the bundled networks take
-CLOSE_ENOUGH = (
-    1.5  # standard deviations of noise that a window may deviate from its plane
-)
-STEEPEST_ERROR = (
-    0.1  # error of the slope (tangent) that noise may leave: six degrees of the normal
-)
+# standard deviations of noise that a window may deviate from its plane
+CLOSE_ENOUGH = 1.5
+# error of the slope (tangent) that noise may leave: six degrees of the normal
+STEEPEST_ERROR = 0.1
 LEAST_NOISE = 2e-4  # relative noise of depth that even the best frame is taken to have
 # slope towards the ray beyond which neighbouring pixels are taken for two surfaces
 STEEPEST_FACET = np.tan(np.radians(85.0))
@@ -220,9 +218,8 @@ def fit_facets(
         usable = drop_flying(depth, usable, noise, 1 / focal.mean())
         near = ndimage.maximum_filter(usable, 5, mode="constant")
         closed = ~ndimage.maximum_filter(~near, 5, mode="constant", cval=0)
-        wanted = usable | (
-            closed & (mask | (depth == 0))
-        )  # what was not measured, or dropped, too
+        # what was not measured, or dropped, too
+        wanted = usable | (closed & (mask | (depth == 0)))
     if not usable.any():
         none = np.zeros(0, np.int64)
         return Facets(np.zeros((0, 3)), np.zeros((0, 3)), none, none, coarse / focal)
@@ -260,11 +257,8 @@ def fit_facets(
     # Back from coordinates about the middle:
     planes[:, 2] += middle[2] - planes[:, 0] * middle[0] - planes[:, 1] * middle[1]
     rays = np.stack([x[columns], y[rows], np.ones(len(rows))], 1)
-    towards = np.einsum(
-        "ni,ni->n",
-        planes,
-        rays,
-    )  # inverse depth; NaN where there is no plane
+    # inverse depth; NaN where there is no plane
+    towards = np.einsum("ni,ni->n", planes, rays)
     good = np.isfinite(towards) & (towards > 0.2 * middle[2])
     half = (coarse - 1) // 2
     rows = corner[0] + coarse * rows + half

@@ -16,9 +16,8 @@ from nextview.types import Float, Float32, Floats, Index, Mask
 
 Part = tuple[slice, slice]  # rows and columns of a picture
 WHOLE = slice(None), slice(None)
-FARTHEST_DEPTH = (
-    65.0  # metres: float depth beyond is nothing; uint16 millimetres reach as far
-)
+# metres: float depth beyond is nothing; uint16 millimetres reach as far
+FARTHEST_DEPTH = 65.0
 # metres; a depth image beyond is of another unit: inches are 39 times as many
 LARGEST_MEDIAN = 20.0
 NEAREST_MEDIAN = 0.01  # metres; no depth camera measures nearer

@@ -9,18 +9,14 @@ import numpy as np
 from nextview.types import Float32, Index, Mask
 
 LONGEST_PERIOD = 8  # pixels after which gaps come again, at most
-FEWEST_GAPS = (
-    0.01  # so many gaps begin in a row or a column for each measured pixel, at least
-)
-SAME_STEP = (
-    0.35  # share of the gaps after which another one begins one period later, at least
-)
-DISTINCT = (
-    2.0  # times as often as after some other distance: random gaps begin anywhere
-)
-ONE_SURFACE = (
-    0.015  # part by which inverse depth may change from pixel to pixel on one surface
-)
+# so many gaps begin in a row or a column for each measured pixel, at least
+FEWEST_GAPS = 0.01
+# share of the gaps after which another one begins one period later, at least
+SAME_STEP = 0.35
+# times as often as after some other distance: random gaps begin anywhere
+DISTINCT = 2.0
+# part by which inverse depth may change from pixel to pixel on one surface
+ONE_SURFACE = 0.015
 PASSES = 2  # first between two measured pixels, then between rows or columns that were filled
 
 

@@ -15,9 +15,8 @@ DEPTH_LEAN = np.radians(2.0)
 the camera sees it: of fifty frames of a real Kinect whose poses are exact, half lean by 1.3 degrees
 or more, and a tenth by 2.7.
 """
-FRAME_LEAN = np.radians(
-    0.5
-)  # by how much the pose of a single frame leans it, beside its noise
+# by how much the pose of a single frame leans it, beside its noise
+FRAME_LEAN = np.radians(0.5)
 UNKNOWN_LEAN = np.radians(30.0)  # deviation of a lean of which nothing is known
 LEAN_NOTICED = 3.0  # standard deviations that errors do not explain
 LEAST_LEAN = np.radians(1.0)  # below which it does not matter

@@ -213,9 +213,8 @@ def smallest_circle(points: Float) -> tuple[Float, float]:
             np.array,
             chain(combinations(corners, 2), combinations(corners, 3)),
         ):
-            edges = (
-                chosen[1:] - chosen[0]
-            )  # equally far from all, or the middle of those in line:
+            # equally far from all, or the middle of those in line:
+            edges = chosen[1:] - chosen[0]
             middle = (
                 chosen[0] + np.linalg.lstsq(edges, (edges**2).sum(1) / 2, rcond=None)[0]
             )

@@ -562,6 +562,7 @@ class ObservedObject:
         if before.sightings:
             last = before.sightings[-1].frame_as_given
             warnings += plausibility.check_pose_moved(frame, last)
+
         if before.frame is not None:
             radius = after.frame.radius
             warnings += plausibility.check_size(radius, before.frame.radius)

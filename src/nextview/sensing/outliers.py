@@ -13,17 +13,14 @@ from scipy import ndimage
 from nextview.sensing.facets import Facets, Noise, count_beside
 from nextview.types import Float, Index, Mask
 
-NEIGHBOUR_WINDOW = (
-    2  # pixels to each side among which the neighbours of a point are looked for
-)
-FEWEST_NEIGHBOURS = (
-    5  # of 24: at the tip of a thing that is two pixels thin there are as many
-)
+# pixels to each side among which the neighbours of a point are looked for
+NEIGHBOUR_WINDOW = 2
+# of 24: at the tip of a thing that is two pixels thin there are as many
+FEWEST_NEIGHBOURS = 5
 STEEPEST_SLOPE = 4.0  # of a surface towards the ray, between neighbours
 NOISE_GAP = 4.0  # standard deviations of depth that neighbours may differ by
-SMALLEST_GROUP = (
-    0.01  # share of all points that a group away from the others has at least
-)
+# share of all points that a group away from the others has at least
+SMALLEST_GROUP = 0.01
 GAP_PIXELS = 6  # pixels that two groups are apart
 # share of the nearest and the farthest points left out, by the noise as a part of the size
 TRIMMED_BY_NOISE = 0.1

@@ -18,9 +18,8 @@ FEWEST_DEPTHS = 20  # pixels with a depth below which nothing is seen
 # how far from the origin a surface may be, object radii: centre and radius are estimates
 OUTERMOST = 1.15
 INNERMOST = 0.4  # how far from the origin the outermost of what is seen has to be
-CONTRADICTION = (
-    0.2  # views contradict if one misses this share of the surface that the other saw
-)
+# views contradict if one misses this share of the surface that the other saw
+CONTRADICTION = 0.2
 COMPARED_VIEWS = 3  # views before the last one with which it is compared
 # how far a principal point is from the middle of an uncropped picture, at most, half sides of it
 OFF_CENTRE = 0.25
@@ -50,20 +49,17 @@ MOST_AGREES = 0.8
 """Share of the surface on which two frames agree: from which their depth scale is right, and
 that names another one.
 """
-FEWEST_SHARED = (
-    50  # points on which two frames have to agree or not before a depth scale is named
-)
+# points on which two frames have to agree or not before a depth scale is named
+FEWEST_SHARED = 50
 # metres from the origin of the world, within which robots work; where positions in millimetres
 # begin
 FAR_ORIGIN = 30.0
-FARTHEST_MILLIMETRES = (
-    20_000.0  # from the world's origin within which a robot's camera is
-)
+# from the world's origin within which a robot's camera is
+FARTHEST_MILLIMETRES = 20_000.0
 SAME_HEIGHT = 0.1  # part of a height up to which another one is the same
 SAME_STEPS = 0.03  # the same, of heights that tell the steps of the depth
-ORDER_OF_SIZE = np.sqrt(
-    10
-)  # factor from which a radius is nearer to ten times than to once
+# factor from which a radius is nearer to ten times than to once
+ORDER_OF_SIZE = np.sqrt(10)
 
 
 @dataclass(frozen=True)
@@ -589,9 +585,8 @@ def _seen_through(first: Observation, second: Observation) -> float:
     height, width = depth.shape
     at = PinholeCamera.of(k, depth.shape).project(points)
     column, row = np.floor(at).astype(np.int64).T
-    margin = (
-        max(2, width // 50) if scene is None else 2
-    )  # what the object frame may be off
+    # what the object frame may be off
+    margin = max(2, width // 50) if scene is None else 2
     inside = (
         (column >= margin)
         & (column < width - margin)

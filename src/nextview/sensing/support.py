@@ -31,28 +31,24 @@ GROUND_WIDTH = 1.5
 AIM = 0.12
 # distances of the camera between the object's point and what stands on a plane, at most
 POINT_ASIDE = 0.08
-LARGEST_AREA_ABOVE = (
-    0.25  # area, seen from above, of what stands on a plane, as a part of the plane's
-)
+# area, seen from above, of what stands on a plane, as a part of the plane's
+LARGEST_AREA_ABOVE = 0.25
 # what stands on a plane has its middle in the plane's outline, drawn together to so much of it
 WELL_INSIDE = 0.85
 # samples of a part of a level surface, of those of its largest part: smaller ones are scraps
 LARGE_PART = 0.2
 # extent of a thing, as a part of that of the plane, below which it may stand at the plane's edge
 NARROW = 0.35
-LOWEST_THING = (
-    0.015  # height of what stands on a plane, as a part of its distance, at least
-)
-GROUND_STEP = (
-    0.25  # the same of a level surface: at a grazing angle its samples lie far apart
-)
+# height of what stands on a plane, as a part of its distance, at least
+LOWEST_THING = 0.015
+# the same of a level surface: at a grazing angle its samples lie far apart
+GROUND_STEP = 0.25
 # tolerance of samples that tell a plane from the next one, as a part of the height between them
 TOLD_APART = 0.5
 # neighbouring samples of one surface differ by at most this part of their depth, and noise
 SURFACE_STEP = 0.04
-BOTTOM_SHARE = (
-    0.04  # share of a mask's points that may lie lower than its bottom: noise
-)
+# share of a mask's points that may lie lower than its bottom: noise
+BOTTOM_SHARE = 0.04
 # height over a plane of the bottom of what stands on it, as a part of the distance
 BOTTOM_MARGIN = 0.02
 # from there, to the side, to where the plane is seen, at most, as a part of the distance

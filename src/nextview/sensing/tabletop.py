@@ -28,25 +28,19 @@ from nextview.sensing.support_plane import (
 from nextview.sensing.walls import before_walls, find_walls
 from nextview.types import Float, Float32, Index, Mask
 
-LOWEST_TOP = (
-    0.008  # metres above the plane that a thing reaches, at least: else it is a stain
-)
-LOWEST_SHARE = (
-    0.012  # the same as a part of its distance, where the depth is less exact
-)
-TOP_SHARE = (
-    0.9  # share of a thing's pixels that are below its top, flying pixels left out
-)
-SMALLEST_AREA = (
-    1.5e-4  # square metres that are seen of a thing, at least: of a die a little more
-)
+# metres above the plane that a thing reaches, at least: else it is a stain
+LOWEST_TOP = 0.008
+# the same as a part of its distance, where the depth is less exact
+LOWEST_SHARE = 0.012
+# share of a thing's pixels that are below its top, flying pixels left out
+TOP_SHARE = 0.9
+# square metres that are seen of a thing, at least: of a die a little more
+SMALLEST_AREA = 1.5e-4
 THINNEST = 0.006  # metres across a thing at its thickest, at least: scraps of edges are thinner
-NEAR_TABLE = (
-    0.015  # metres from the plane within which what is seen is likely to be the plane's
-)
-UNEVEN_DEVIATIONS = (
-    3.0  # deviations of the plane's own pixels above which something stands on it
-)
+# metres from the plane within which what is seen is likely to be the plane's
+NEAR_TABLE = 0.015
+# deviations of the plane's own pixels above which something stands on it
+UNEVEN_DEVIATIONS = 3.0
 MEDIAN_DEVIATION = 1.4826  # of a Gaussian, by the median of what it deviates
 TOUCHING_GAP = 0.006  # metres between two things that touch, at most
 TOUCHING_STEP = 0.015  # metres between their depths where they are nearest, at most

@@ -32,9 +32,8 @@ SIDE_CELLS = 1  # columns of the grid of samples that count as the side of the p
 MOST_SAMPLES_BEHIND = 0.1
 OVER_CAMERA = 0.3  # metres of a ceiling over the camera, at least
 CEILINGS_TRIED = 50  # heights
-PARALLEL_WALLS = np.cos(
-    np.radians(25.0)
-)  # cosine of the angle up to which two planes are parallel
+# cosine of the angle up to which two planes are parallel
+PARALLEL_WALLS = np.cos(np.radians(25.0))
 COARSE_WIDTH = 320  # columns of the picture in which pixels are compared with walls
 # pixels of that picture across the square over which the distance from a wall is averaged
 MEAN_SIDE = 3
@@ -45,9 +44,8 @@ WALL_ERROR = 0.006
 CAMERA_BEHIND = 0.1
 # from the next wall to a sample of a wall that meets it, as a part of its distance, at most
 CORNER_GAP = 0.05
-NEAREST_TO_PLACE = (
-    0.02  # metres that the place of an object lies before a wall, at least
-)
+# metres that the place of an object lies before a wall, at least
+NEAREST_TO_PLACE = 0.02
 
 
 def find_walls(

@@ -106,10 +106,8 @@ class Taken:
 
 # expected share of the object that shows from each view, (B, V)
 Visible = Callable[[EpisodeState], Float]
-Constrain = Callable[
-    [EpisodeState],
-    EpisodeState,
-]  # with where robots can go, and what it costs
+# with where robots can go, and what it costs
+Constrain = Callable[[EpisodeState], EpisodeState]
 # see ``protocol.JudgesTogether.together``
 Together = Callable[[Sequence[Observation], Float, int], JointBelief]
 # see ``protocol.LooksAhead.outlook``

@@ -64,9 +64,8 @@ from nextview.types import Float, Mask
 if TYPE_CHECKING:
     from nextview.sensing.observed_object import ObservedObject
 
-THING_SIZE = (
-    1.3  # times that the size of a taught thing is off, half hidden say, which none has
-)
+# times that the size of a taught thing is off, half hidden say, which none has
+THING_SIZE = 1.3
 FARTHEST_TARGET = 60.0
 """Object radii: a camera looks at a thing of 0.01 m radius from 0.6 m; in millimetres it would
 be a thousand times.
@@ -1045,11 +1044,8 @@ class Session:
 
     def _impossible(self) -> tuple[str, ...]:
         """Classes whose objects have not the size of this one; none where it is not known."""
-        card = getattr(
-            self.models.recogniser,
-            "card",
-            None,
-        )  # a recogniser of your own has none
+        # a recogniser of your own has none
+        card = getattr(self.models.recogniser, "card", None)
         sizes = card and card.size
         radius = self.views[-1].observation.radius if self.views else None
         if sizes is None or radius is None:

@@ -12,18 +12,15 @@ from nextview.geometry.ray_caster import RayCaster, Triangles, embree_scene
 from nextview.session.style import GROUND, WOOD, rgb
 from nextview.types import Floats
 
-TORN = (
-    0.08  # a surface ends where depth jumps by more from pixel to pixel, object radii
-)
+# a surface ends where depth jumps by more from pixel to pixel, object radii
+TORN = 0.08
 # half a side of the ground that may lie in shadow, object radii, and its points along it
 SHADOW_REACH = 2.6
 SHADOW_GRID = 72
-SKY = np.random.default_rng(0).normal(
-    size=(150, 3)
-)  # directions of a ball, of any length
-SHADE = np.array(
-    [0.52, 0.57, 0.64]
-)  # how much darker the ground is in full shadow: warm
+# directions of a ball, of any length
+SKY = np.random.default_rng(0).normal(size=(150, 3))
+# how much darker the ground is in full shadow: warm
+SHADE = np.array([0.52, 0.57, 0.64])
 # towards the lamp, camera frame: from above, left, behind the camera
 LAMP_DIRECTION = np.array([-0.45, -0.75, -0.8])
 

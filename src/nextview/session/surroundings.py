@@ -19,9 +19,8 @@ JUMP = 0.03
 NEAR_SUPPORT = 0.02
 OWN_RADIUS = 1.1  # object radii around the centre within which a surface counts as the object's own
 FEWEST_NEAR_POINTS = 3  # that are measured near a place before it counts as occupied
-SIGHT_WINDOW = (
-    2  # pixels to each side that tell what lies on the line of sight to a place
-)
+# pixels to each side that tell what lies on the line of sight to a place
+SIGHT_WINDOW = 2
 NARROWEST_WALL = 0.5  # metres that a frame shows of a wall, at least
 WALL_TOLERANCE = 0.02  # metres, beside the noise
 BEHIND = 0.15  # metres behind a wall from which on a point does not belong to it

@@ -54,12 +54,8 @@ MOST_THREADS = 1024
 # the models that ship with the package, and their share of false alarms
 DEFAULT_MODELS = "modelnet10"
 UNKNOWN_ALPHA = 0.02
-FRAME_FILES = (
-    ".mcap",
-    ".db3",
-    ".bag",
-    ".png",
-)  # files of captured frames, not of meshes
+# files of captured frames, not of meshes
+FRAME_FILES = (".mcap", ".db3", ".bag", ".png")
 
 
 @dataclass(frozen=True, repr=False)
@@ -349,10 +345,8 @@ def load(
     names = _names_of(models)
     given["models"] = names if len(names) > 1 else names[0]
     _check_options(policy, threads, risk, unknown)
-    Stopping(
-        threshold,
-        max_views,
-    )  # says what is wrong with it, before anything is opened
+    # says what is wrong with it, before anything is opened
+    Stopping(threshold, max_views)
 
     collections = {name: find_models(name) for name in names}
     found = collections[names[-1]]

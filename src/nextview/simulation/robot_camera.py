@@ -64,9 +64,8 @@ class RobotCamera:
     allows to be answered from near. The errors of the sensor are drawn by seed 0.
     """
 
-    knows_reach = (
-        True  # the scene says where a camera can stand; see ``session.FrameCamera``
-    )
+    # the scene says where a camera can stand; see ``session.FrameCamera``
+    knows_reach = True
 
     def __init__(
         self,

@@ -18,15 +18,13 @@ from nextview.simulation.scene import cached_mesh, mesh_hash, upright_boxes
 from nextview.simulation.sensor import Sensor
 from nextview.types import Float, Mask
 
-UNEVEN_HEIGHT = (
-    0.001  # metres, standard deviation of the height of a floor or a table top
-)
+# metres, standard deviation of the height of a floor or a table top
+UNEVEN_HEIGHT = 0.001
 WAVES = 12  # that an uneven top is made of
 SHORTEST_WAVE = 0.25  # metres
 LONGEST_WAVE = 2.0
-CORNER_SPACING = (
-    0.1  # metres between the corners of an uneven top; fewer than MOST_CORNERS a side
-)
+# metres between the corners of an uneven top; fewer than MOST_CORNERS a side
+CORNER_SPACING = 0.1
 MOST_CORNERS = 60
 LOWEST_CAMERA = 0.06  # metres above what the target stands on: the camera's own housing
 HIGHEST_CAMERA = 1.8  # metres above the floor: what a mobile robot reaches

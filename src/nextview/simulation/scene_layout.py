@@ -9,14 +9,10 @@ from msgspec import Meta, Struct
 from nextview.errors import DatasetError
 from nextview.files import read_record, write_record
 
-CLUTTER_LEVELS = {
-    "light": 0.85,
-    "medium": 0.65,
-    "heavy": 0.45,
-}  # mean share of the target that shows
-NAMED = re.compile(
-    r".*@(\w+)-\d+"
-)  # names of scenes that were drawn: target, level and number
+# mean share of the target that shows
+CLUTTER_LEVELS = {"light": 0.85, "medium": 0.65, "heavy": 0.45}
+# names of scenes that were drawn: target, level and number
+NAMED = re.compile(r".*@(\w+)-\d+")
 SUFFIX = ".json"
 LAYOUT_VIEWS = 40
 # or radians: what is computed with more has no precision left

@@ -26,9 +26,8 @@ STEEPEST_INCIDENCE = np.radians(80.0)
 # pixels: a window that holds one pixel; the narrowest shadow
 NO_GRAIN = 0.1
 NARROWEST = 1.0
-WIDEST_STEP = (
-    8  # projector columns that two neighbouring pixels of one surface may lie apart
-)
+# projector columns that two neighbouring pixels of one surface may lie apart
+WIDEST_STEP = 8
 # limits of numbers, sides of pictures, grain and strength
 LARGEST_SETTING = 10_000
 SIDE = 4096
@@ -219,9 +218,8 @@ class Sensor:
         if self.grazing:
             share = normal_field(grazing, q.shape, self.grain)
             cosine = np.cos(angle)
-            steep = (
-                cosine < self.grazing
-            )  # no share of it, which is 1 at most, is less elsewhere
+            # no share of it, which is 1 at most, is less elsewhere
+            steep = cosine < self.grazing
             lost[steep] |= cosine[steep] < self.grazing * ndtr(share[steep])
         changed = q
         if self.flying:
@@ -269,9 +267,8 @@ class Sensor:
         return np.where(q > 0, q + sigma * normal_field(rng, q.shape, self.grain), 0)
 
 
-ERRORS = tuple(field.name for field in fields(Sensor))[
-    10:
-]  # the strengths, from axial on
+# the strengths, from axial on
+ERRORS = tuple(field.name for field in fields(Sensor))[10:]
 
 _SETUP: dict[str, Any] = {
     "turned": 0.3,
@@ -461,9 +458,8 @@ def shifted(
     column = np.arange(q.shape[1])
     at_row = np.clip(row + down, 0, len(q) - 1)
     at_column = np.clip(column + right, 0, q.shape[1] - 1)
-    at = (
-        at_row * q.shape[1] + at_column
-    )  # one index into all rows: NumPy takes half the time
+    # one index into all rows: NumPy takes half the time
+    at = at_row * q.shape[1] + at_column
     there = q.take(at)
     moved = (
         there

@@ -37,10 +37,8 @@ def _dot(a: Float32, b: Float32) -> Float32:
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
-SHOWS_NOTHING, SHOWS_TARGET, SHOWS_OTHER, SHOWS_TABLE = np.arange(
-    4,
-    dtype=np.uint8,
-)  # what a pixel shows
+# what a pixel shows
+SHOWS_NOTHING, SHOWS_TARGET, SHOWS_OTHER, SHOWS_TABLE = np.arange(4, dtype=np.uint8)
 # how much nearer than the target something has to be to hide it, object radii: the table touches it
 OCCLUDER_GAP = 1e-4
 LARGEST_IMAGE = 16_384  # pixels that an image may be high or wide

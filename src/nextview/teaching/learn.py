@@ -79,9 +79,8 @@ from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 from nextview.types import Index
 
-MEMORY_NAME = (
-    "memory"  # of the card in a folder of taught things, and of the file beside it
-)
+# of the card in a folder of taught things, and of the file beside it
+MEMORY_NAME = "memory"
 CARD = f"{MEMORY_NAME}.json"
 MEMORY_FILE = f"{MEMORY_NAME}{MEMORY_SUFFIX}"
 LEARNED_PICTURE = "learned.png"

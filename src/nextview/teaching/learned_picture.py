@@ -61,11 +61,8 @@ def draw_learned(path: Path, pictures: ThingPictures, fit: Fit) -> None:
     _draw_things(page, pictures, shown)
     _draw_bars(figure, fit, height)
     _draw_pairs(page, pictures, pairs, TITLE_HEIGHT + rows * ROW + LINE)
-    page.set(
-        xlim=(0, PAGE_WIDTH),
-        ylim=(height, 0),
-        aspect="auto",
-    )  # a picture sets them anew
+    # a picture sets them anew
+    page.set(xlim=(0, PAGE_WIDTH), ylim=(height, 0), aspect="auto")
     figure.savefig(path)
 
 

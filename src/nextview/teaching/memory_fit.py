@@ -87,9 +87,8 @@ def fit_memory(
             alike[row][:, (fold[thing] == fold[t]) & several[thing]] = NO_LIKENESS
     heads, whole = _heads(views, thing, label, several, fold, held_out, judged)
     size = size_evidence(radii, label)
-    measured = radii * np.exp(
-        rng.normal(0, SIZE_ERROR, len(radii))
-    )  # as a sensor would measure it
+    # as a sensor would measure it
+    measured = radii * np.exp(rng.normal(0, SIZE_ERROR, len(radii)))
     sizes = np.float32(0) if size is None else size.logits(measured)[judged, None]
     drawn = np.stack(
         [

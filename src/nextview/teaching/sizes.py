@@ -11,9 +11,8 @@ from nextview.types import Floats
 
 # a thing so many times larger or smaller than the median of the others is asked about
 ODD_SIZE = 300
-LARGEST_MEDIAN_RADIUS = (
-    20.0  # metres, of the median thing: no camera looks at larger ones from all around
-)
+# metres, of the median thing: no camera looks at larger ones from all around
+LARGEST_MEDIAN_RADIUS = 20.0
 SMALLEST_RADIUS = 0.001  # and at smaller ones no depth camera
 USUAL_RADII = (0.01, 3.0)  # metres, of things of which one takes views
 

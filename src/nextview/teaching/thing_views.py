@@ -45,9 +45,8 @@ Arrays = dict[str, NDArray]
 HELD_OUT = 8  # views of each thing that are not remembered
 SETUP = 8  # views that share the errors of one setup: a wrong centre, a wrong size
 VIEWS_PER_BATCH = 20
-NEAR_CAPTURED = np.radians(
-    30
-)  # a captured view teaches what the thing looks like from no farther than this
+# a captured view teaches what the thing looks like from no farther than this
+NEAR_CAPTURED = np.radians(30)
 MEMORY_GRID = ViewSphere(RINGS, AZIMUTHS)
 # poses of views through the sensor
 SENSED = MEMORY_GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape(

@@ -8,9 +8,8 @@ import numpy as np
 from nextview.checks import extras
 from nextview.types import Float32, Floats, Index
 
-LARGE_RING = (
-    20_000  # views of a ring from which looking at all of them takes more than 10 ms
-)
+# views of a ring from which looking at all of them takes more than 10 ms
+LARGE_RING = 20_000
 INDEX = "PCA64,IVF256,SQ8"  # 64 numbers of a byte for each view, in 256 cells
 PROBED = 16  # cells that are searched
 VIEWS_SAMPLED = 10_240  # views from which an index learns its cells

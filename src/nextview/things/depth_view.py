@@ -18,9 +18,8 @@ NOT_MEASURED, ELSEWHERE, THING = np.arange(3, dtype=np.uint8)
 """What a pixel shows: nothing was measured; something else, or nothing at all, was; the thing."""
 
 WINDOW_MARGIN = 0.35  # of the size of the thing's outline that is looked at around it
-USUAL_FILL = (
-    0.2  # share of the pixels that show the thing, below which more of them are chosen
-)
+# share of the pixels that show the thing, below which more of them are chosen
+USUAL_FILL = 0.2
 MOST_DENSE = 2.0  # times as many rows and columns at most
 SMALLEST_MARGIN = 4  # pixels of the image around the outline, at least
 NOISE_ROWS = 40  # rows of an image in which its noise is measured

@@ -19,15 +19,13 @@ from nextview.things.unseen_space import MeasuredDepth, chance_of_sight
 from nextview.types import Float, Float32, Mask
 
 LOWEST_COSINE = 0.15  # of incidence, in the judgement of a pixel
-SUPPORT_NEAR = (
-    0.01  # metres from the height of the support, within which a point lies on it
-)
+# metres from the height of the support, within which a point lies on it
+SUPPORT_NEAR = 0.01
 OWN_MARGIN = 0.005  # metres around the thing, within which a point may be its own
 OBSTACLE_REACH = 4.0  # radii of the thing, within which an obstacle may hide it
 OBSTACLE_ROWS = 120  # rows of a depth image that are looked through for obstacles
-UNSEEN_REACH = (
-    4.0  # radii of the thing, within which something that no view shows may hide it
-)
+# radii of the thing, within which something that no view shows may hide it
+UNSEEN_REACH = 4.0
 UNSEEN_EVERY = 2  # every so many rows and columns of pixels, unseen space is looked up
 
 

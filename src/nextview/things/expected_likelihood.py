@@ -23,16 +23,13 @@ from nextview.things.registration import SCAN_ERROR, RegistrationPrior
 from nextview.things.verification import PixelModel
 from nextview.types import Float, Float32, Index, Mask
 
-FITTED_EVERY = (
-    3  # every so many pixels take part in the fit of one hypothesis to another
-)
+# every so many pixels take part in the fit of one hypothesis to another
+FITTED_EVERY = 3
 FITTED_REACH = 0.004  # metres of deviation at which a pixel of this fit counts half
-GRAZING_COSINE = (
-    0.3  # of incidence, below which holes become usual: see the cameras of simulation
-)
-FITTED_SURFACE_ERROR = (
-    0.001  # metres by which a surface is off from its scan, in this fit
-)
+# of incidence, below which holes become usual: see the cameras of simulation
+GRAZING_COSINE = 0.3
+# metres by which a surface is off from its scan, in this fit
+FITTED_SURFACE_ERROR = 0.001
 LARGEST_DEVIATION = 12.0  # standard deviations, beyond which a pixel is an outlier
 TABLE_STEPS = 20  # entries of a table per standard deviation
 

@@ -20,9 +20,8 @@ FINEST_CELL = 0.0015  # metres: what depth cameras tell apart
 CELLS = 45.0  # in a radius, of a large thing
 SQUARE = 0.75  # half the side of a square, cells: neighbours overlap
 MOST_FUSED_POINTS = 20_000  # of a frame; an even choice of more is taken
-STEEPEST_COSINE = (
-    0.25  # cosine of the angle of incidence below which a pixel does not count
-)
+# cosine of the angle of incidence below which a pixel does not count
+STEEPEST_COSINE = 0.25
 FEW_SHARE = 0.1  # of what a usual cell was seen, below which it is an error
 FEWEST_SQUARES = 50
 

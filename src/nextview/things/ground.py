@@ -12,9 +12,8 @@ LEAST_PLANE_SHARE = 0.25  # of what is measured beside the thing
 # thickness of the layer that the plane is looked for in, half sizes of the thing
 PLANE_LAYER = 0.15
 THINNEST_LAYER = 0.006  # metres
-LEAST_VERTICAL = np.cos(
-    np.radians(15.0)
-)  # vertical part of the normal: the vertical is known up to this
+# vertical part of the normal: the vertical is known up to this
+LEAST_VERTICAL = np.cos(np.radians(15.0))
 FITS = 4
 NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal number
 
@@ -106,9 +105,8 @@ def _noise(
     """Deviation of inverse depth from a plane, 1/metres, of points by their heights, (N,)."""
     away = points - origin
     depth = away @ axis
-    along = (
-        np.abs(away @ normal) / depth
-    )  # by how much a metre of depth changes the height
+    # by how much a metre of depth changes the height
+    along = np.abs(away @ normal) / depth
     deviation = np.abs(off) / np.maximum(along, 0.05) / depth**2
     return float(np.median(deviation)) / NORMAL_MEDIAN
 

@@ -9,9 +9,8 @@ from nextview.types import Float, Index
 
 MOST_LEADING = 10  # hypotheses that are rendered
 FEW_THINGS = 5  # likeliest things whose best hypothesis is always among them
-LEAST_LEADING_SHARE = (
-    1e-4  # of the likeliest hypothesis' belief, below which one does not count
-)
+# of the likeliest hypothesis' belief, below which one does not count
+LEAST_LEADING_SHARE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +46,8 @@ class Hypotheses:
         share = verified.probabilities / np.maximum(in_thing[verified.things], 1e-300)
         belief = verified.belief[verified.things] * share
 
-        first = np.unique(verified.things, return_index=True)[
-            1
-        ]  # the best hypothesis of each
+        # the best hypothesis of each
+        first = np.unique(verified.things, return_index=True)[1]
         first = first[
             np.argsort(-verified.belief[verified.things[first]], kind="stable")
         ]

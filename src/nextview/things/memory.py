@@ -24,9 +24,8 @@ from nextview.types import Float32, Floats, Index
 RINGS = (0.0, 18.0, 36.0, 54.0, 72.0)  # elevations of the remembered views, degrees
 AZIMUTHS = 16  # remembered views on a ring: the azimuth bins of a memory
 THING_PICTURE = 64  # side of the picture of a thing, pixels
-LARGEST_THING_RADIUS = (
-    1e4  # of a thing, metres; nothing as large is looked at from around
-)
+# of a thing, metres; nothing as large is looked at from around
+LARGEST_THING_RADIUS = 1e4
 LARGEST_LOGIT = 700.0  # that a head can say: the exponential of more is no number
 
 

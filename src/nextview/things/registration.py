@@ -190,17 +190,14 @@ def start(things: NDArray[np.integer], rotations: Float, views: int) -> Alignmen
 
 
 SCAN_ERROR = 0.0007  # deviation of a surface from the thing itself, metres
-RELATIVE_SCAN_ERROR = (
-    0.005  # and a part of its radius: large things are scanned less exactly
-)
+# and a part of its radius: large things are scanned less exactly
+RELATIVE_SCAN_ERROR = 0.005
 SUNK = 0.005  # metres that a hypothesis may be below the ground, beside the errors of the scan
-HIDING = (
-    0.005  # metres by which something stands before a surface that it hides, at least
-)
+# metres by which something stands before a surface that it hides, at least
+HIDING = 0.005
 HIDING_NOISE = 4.0  # deviations of the noise by which it does
-NOISE_REACH = (
-    2.0  # deviations of the noise at which a pixel counts half, however fine the level
-)
+# deviations of the noise at which a pixel counts half, however fine the level
+NOISE_REACH = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -649,9 +646,8 @@ def inverses(information: Float) -> Float:
     eigenvalue: it counts as determined as little as that precision tells.
     """
     scale = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), FREE_WEIGHT))
-    scaled = information / (
-        scale[:, :, None] * scale[:, None]
-    )  # turns and places have other units
+    # turns and places have other units
+    scaled = information / (scale[:, :, None] * scale[:, None])
     values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
     values = np.maximum(values, np.finfo(np.float32).eps)
     inverse = (vectors / values[:, None]) @ vectors.swapaxes(1, 2)

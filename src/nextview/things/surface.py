@@ -14,16 +14,14 @@ from nextview.geometry.mesh import UNITS, Mesh
 from nextview.geometry.ray_caster import embree_scene
 from nextview.types import Float, Float32, Index
 
-FEWEST_FACES = (
-    500  # a simplified surface has at least so many triangles, if it had as many
-)
+# a simplified surface has at least so many triangles, if it had as many
+FEWEST_FACES = 500
 # metres by which a simplified surface may be off: less than depth cameras measure
 FINEST_ERROR = 0.0004
 SURFACE_SAMPLES = 2000  # points at which the error of a simplified surface is measured
 LARGEST_ERROR = 5.0  # errors by which no point of a simplified surface is off
-NEARBY_SAMPLES = (
-    50_000  # points of a simplified surface that others are looked for beside
-)
+# points of a simplified surface that others are looked for beside
+NEARBY_SAMPLES = 50_000
 MISSED = np.float32(np.inf)  # depth along a ray that meets nothing
 
 
@@ -169,9 +167,8 @@ class Surface:
         chosen = self.triangles_by_area(count, rng)
 
         shares = rng.random((count, 2))
-        outside = (
-            shares.sum(1) > 1
-        )  # of the triangle, in the other half of the parallelogram
+        # of the triangle, in the other half of the parallelogram
+        outside = shares.sum(1) > 1
         shares[outside] = 1 - shares[outside]
         return corners[chosen, 0] + (shares[:, :, None] * edges[chosen]).sum(1)
 

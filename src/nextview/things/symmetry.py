@@ -22,9 +22,8 @@ LEAST_TOLERANCE = 0.005
 SYMMETRY_TOLERANCE = 0.02  # of the diameter: a camera stands farther from a large thing
 COMPARED_SHARE = 0.95  # share of the surface that has to be that near: scans have spurs
 HIGHEST_ORDER = 8
-ANY_TURNS = (
-    np.arange(1, 24, 2) / 48
-)  # of a full turn, that are tried for a symmetry of any angle
+# of a full turn, that are tried for a symmetry of any angle
+ANY_TURNS = np.arange(1, 24, 2) / 48
 SYMMETRY_POINTS = 20_000  # of the surface that is compared with
 TURNED_POINTS = 500  # of its turned copy
 STEP_ACROSS = np.radians(5)  # between axes that are tried across one of a symmetry

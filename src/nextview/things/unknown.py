@@ -10,16 +10,13 @@ from nextview.types import Float
 # number of residuals that the mean of all things counts for, beside those of a thing
 SHRINKAGE = 2.0
 LEAST_RESIDUAL = 0.02  # below which residuals do not differ
-NOISE_RESIDUAL = (
-    0.5  # of pixels that are off by just the noise: half a squared standard normal
-)
+# of pixels that are off by just the noise: half a squared standard normal
+NOISE_RESIDUAL = 0.5
 NOISE_SHARE = 0.8  # of a thing's pixels that the surface explains, if only the noise is in the way
-MOSTLY_NOISE = (
-    0.5  # part of the noise in the variance of a depth, from which it is in the way
-)
-NOISE_KNOWN = (
-    1.5  # by what factor the noise of a real camera may be larger than it is measured
-)
+# part of the noise in the variance of a depth, from which it is in the way
+MOSTLY_NOISE = 0.5
+# by what factor the noise of a real camera may be larger than it is measured
+NOISE_KNOWN = 1.5
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,9 +17,8 @@ from nextview.types import Float, Float32, Mask
 
 SIGHT_STEPS = 20  # places on each line of sight that are looked up
 UNSEEN_FILLED = 4.0  # how much oftener unknown space is filled than known space
-BEFORE = (
-    0.01  # metres before a measured surface, from which on space is known to be free
-)
+# metres before a measured surface, from which on space is known to be free
+BEFORE = 0.01
 
 
 @dataclass(frozen=True, eq=False)

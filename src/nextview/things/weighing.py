@@ -10,9 +10,8 @@ from nextview.errors import ModelError
 from nextview.types import Float, Index
 
 NEVER = -1e9  # log-likelihood of a thing that was not aligned
-LEAST_TRUE_BELIEF = (
-    1e-9  # belief in the truth below which it is not told how wrong it was
-)
+# belief in the truth below which it is not told how wrong it was
+LEAST_TRUE_BELIEF = 1e-9
 
 GEOMETRY_WEIGHTS = (5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0)
 FEATURE_WEIGHTS = (0.2, 0.4, 0.6, 0.8, 1.0)

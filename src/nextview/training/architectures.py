@@ -172,10 +172,8 @@ class LiteNet(RecogniserNetwork):
 
 
 def _norm(width: int) -> nn.BatchNorm2d:
-    return nn.BatchNorm2d(
-        width,
-        eps=1e-3,
-    )  # EfficientNet's epsilon: checkpoints count on it
+    # EfficientNet's epsilon: checkpoints count on it
+    return nn.BatchNorm2d(width, eps=1e-3)
 
 
 RESNETS = {

@@ -51,10 +51,8 @@ with extras():
     import torch
     from torch import Tensor, nn
 
-Best = tuple[
-    tuple[Gain, ...],
-    Value,
-]  # policies, one for each fold, and their mean value
+# policies, one for each fold, and their mean value
+Best = tuple[tuple[Gain, ...], Value]
 BOUND = 1e-5
 """Largest difference of the file's answers from those of the networks in double precision, relative
 to the largest answer beyond 1. For gains a fiftieth of the lowest travel weight that is tried."""

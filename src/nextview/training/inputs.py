@@ -75,9 +75,8 @@ def inputs_path(store: Path, size: int, kind: InputKind = "geometry") -> Path:
     Returns:
         The folder.
     """
-    store = (
-        Path(os.path.realpath(store)) if store.name in ("", "..") else store
-    )  # "." has no name
+    # "." has no name
+    store = Path(os.path.realpath(store)) if store.name in ("", "..") else store
     return store.with_name(
         f"{store.name}.{'inputs' if kind == 'geometry' else kind}{size}"
     )

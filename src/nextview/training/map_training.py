@@ -36,9 +36,8 @@ with extras():
     from torch import Tensor, nn
     from torch.nn import functional as F
 
-NetworkViews = (
-    NDArray[Any] | PackedViews
-)  # of N objects from V views, what the network sees
+# of N objects from V views, what the network sees
+NetworkViews = NDArray[Any] | PackedViews
 
 
 class Windows(OwnBatches):

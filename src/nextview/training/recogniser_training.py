@@ -347,9 +347,8 @@ def mirror_planes(store: ViewStore, objects: Index) -> Float:
     n = store.sphere.azimuths
     measured = store.measure()[objects].reshape(len(objects), -1, n).astype(np.float64)
     measured -= measured.mean((1, 2), keepdims=True)
-    planes = range(
-        max(1, n // 2)
-    )  # the plane through a view also holds the one opposite
+    # the plane through a view also holds the one opposite
+    planes = range(max(1, n // 2))
     mirrored = [measured[:, :, (2 * plane - np.arange(n)) % n] for plane in planes]
     symmetry = np.stack([(measured * image).sum((1, 2)) for image in mirrored], 1)
     of_class = [

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
+from pickle import UnpicklingError  # raised by torch where it refuses to unpickle
 from typing import Any, Literal, TypeVar
 
 import msgspec
@@ -142,10 +143,8 @@ def save_whole(values: dict[str, Any], path: Path) -> None:
         path: of the file, which is replaced.
     """
     written = io.BytesIO()
-    torch.save(
-        values,
-        written,
-    )  # into a file it would turn a full disk into a RuntimeError
+    # into a file it would turn a full disk into a RuntimeError
+    torch.save(values, written)
     with new_file(path, overwrite=True) as part:
         part.write_bytes(written.getbuffer())
 
@@ -159,7 +158,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             return torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise ModelError(f"{path}: there is no such checkpoint") from None
-    except DAMAGED as error:
+    except (*DAMAGED, UnpicklingError) as error:
         what = f"a damaged checkpoint or one that torch cannot read safely ({type(error).__name__})"
         raise ModelError(
             f"{path}: {what}; give another, or delete it to begin this training anew"

@@ -214,11 +214,8 @@ def fit_novelty(
     )
 
     objects, conditions, views = scores.shape
-    ways = scores.reshape(
-        objects,
-        2,
-        conditions // 2 * views,
-    )  # through a sensor, and without one
+    # through a sensor, and without one
+    ways = scores.reshape(objects, 2, conditions // 2 * views)
     standard = np.stack([ways.mean((0, 2)), ways.std((0, 2))], 1).astype(np.float32)
 
     of_condition = standard[np.repeat([0, 1], conditions // 2)]

@@ -34,9 +34,8 @@ NO_ANSWER = "nothing"
 CLEAN = "clean renders"
 APART = 8.5  # between two objects side by side, object radii
 LAMP_PLACE = (-4.0, -5.0, 8.0)  # where it hangs
-PAUSE = (
-    0.5  # between the views of a policy that walks, seconds: long enough to see each
-)
+# between the views of a policy that walks, seconds: long enough to see each
+PAUSE = 0.5
 HELP = """Click a **ball** to look from there, or drag the **arrows**. The large **red** ball is where the policy would
 look next. Yellow views promise most, violet ones least; small dark ones are done."""
 _starting = threading.Lock()
@@ -71,11 +70,8 @@ class Page:
         )
         gui.set_panel_label("nextview explore")
         scene.set_up_direction("+z")
-        sky = np.linspace(
-            rgb(PAPER),
-            rgb(SAND),
-            256,
-        )  # darkens a little towards the ground
+        # darkens a little towards the ground
+        sky = np.linspace(rgb(PAPER), rgb(SAND), 256)
         scene.set_background_image(sky.astype(np.uint8)[:, None])
         scene.configure_default_lights(False)
         scene.configure_environment_map(None)
@@ -124,9 +120,8 @@ class Page:
             list(exploration.objects),
             initial_value=exploration.shown.name,
         )
-        self._label = gui.add_html(
-            ""
-        )  # and no Markdown: viser would take a name for HTML
+        # and no Markdown: viser would take a name for HTML
+        self._label = gui.add_html("")
         self._policy = gui.add_dropdown(
             "Policy",
             policies,

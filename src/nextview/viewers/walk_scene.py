@@ -19,9 +19,8 @@ with extras():
 
 BALL = 0.09  # radius of a candidate view, object radii
 TABLE_RADIUS = 2.4  # radius of what the object stands on
-SMOOTH = (
-    10_000  # faces of a mesh from which its vertices are shaded, not its faces: scans
-)
+# faces of a mesh from which its vertices are shaded, not its faces: scans
+SMOOTH = 10_000
 
 
 class WalkScene:
@@ -210,10 +209,8 @@ def _rings(places: Float) -> Float32:
     heights = np.unique(np.round(places[:, 2], 3))
     heights = heights[: 0 if len(heights) > 12 else None]
     radius = np.sqrt(np.maximum((places[0] ** 2).sum() - heights**2, 0))[:, None]
-    height = np.broadcast_to(
-        heights[:, None] - BALL,
-        (len(heights), 97),
-    )  # the balls lie on them
+    # the balls lie on them
+    height = np.broadcast_to(heights[:, None] - BALL, (len(heights), 97))
     circles = np.stack([radius * np.cos(around), radius * np.sin(around), height], -1)
     return (
         np.stack([circles[:, :-1], circles[:, 1:]], 2)
