@@ -204,16 +204,54 @@ def test_one_of_several_topics_is_named_and_the_world_too(tmp_path):
     np.testing.assert_allclose(capture.frames[0].pose, MOUNTED, atol=1e-6)
 
 
-def test_a_camera_that_tf_does_not_move_gives_one_image_whose_plane_tells_up(tmp_path):
+def standing(times):
+    """A bag of a camera on a stand."""
     stand = transform_message(MOUNTED, "optical", 0.0, "camera_link")
-    said = [("/tf_static", START, tf_message(stand)), *images_at([1.0, 1.1, 1.2])]
-    bag = write_bag(tmp_path / "bag", said)
+    return [("/tf_static", START, tf_message(stand)), *images_at(times)]
+
+
+def test_a_camera_that_tf_does_not_move_gives_one_image_whose_plane_tells_up(tmp_path):
+    bag = write_bag(tmp_path / "bag", standing([1.0, 1.1, 1.2]))
     capture = read_capture(bag)
     assert len(capture.frames) == 1
     assert capture.up is None
-    assert "tf does not move the camera: one image is used" in capture.notes
+    assert any(
+        note.startswith("tf does not move the camera: its image at 1.000 s is used")
+        for note in capture.notes
+    )
     # who names the frame says that its z axis is up
     assert read_capture(bag, world_frame="camera_link").up == (0, 0, 1)
+
+
+@pytest.mark.parametrize("most", [120, 4])
+def test_the_image_of_a_standing_camera_can_be_chosen(
+    most,
+    tmp_path,
+    monkeypatch,
+    capsys,
+):
+    """Also of a recording that is too long for all of its images to be sampled."""
+    monkeypatch.setattr(bag_reader, "MOST_FRAMES", most)
+    times = [1.0, 2.5, 4.0, 5.5, 7.0, 7.2]
+    bag = write_bag(tmp_path / "bag", standing(times))
+    chosen = {None: 0, "first": 0, "last": 5, 0: 0, 2.5: 1, 2.6: 2, 7.1: 5}
+    for at, number in chosen.items():
+        capture = read_capture(bag, at=at)
+        (captured,) = capture.frames
+        depth = depth_image(number)
+        np.testing.assert_allclose(captured.read().depth, depth, atol=1e-6)
+        assert f"its image at {times[number]:.3f} s is used" in f"{capture!r}"
+    with pytest.raises(DatasetError, match=r"no image from 9 s on; the last is at 7.2"):
+        read_capture(bag, at=9)
+    assert "is a number of at least 0, not -1" in refused(
+        capsys,
+        "recognise",
+        str(bag),
+        "--at",
+        "-1",
+    )
+    moving = write_bag(tmp_path / "moving", [*tf_of_an_arm(), *images_at([1.0, 2.0])])
+    assert "tf moves its camera" in refused(capsys, "look", str(moving), "--at", "last")
 
 
 def test_images_before_and_after_tf_are_left_out(tmp_path):
@@ -691,5 +729,7 @@ def test_one_image_with_intrinsics_is_a_capture(views, tmp_path, capsys):
         read_capture(image)
     with pytest.raises(DatasetError, match="give --depth-scale"):
         read_capture(image, (300, 300, 159.5, 119.5))
-    with pytest.raises(UsageError, match="topics and tf frames are of ROS 2 bags"):
+    with pytest.raises(
+        UsageError, match="topics, tf frames and moments are of ROS 2 bags"
+    ):
         read_capture(image, depth_topic="/depth")

@@ -15,7 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from nextview.errors import MissingExtraError, ModelError, NextviewError, UsageError
+from nextview.errors import (
+    MissingExtraError,
+    ModelError,
+    NextviewError,
+    UsageError,
+    printable,
+)
 from nextview.types import Float
 
 EXTRAS = {  # packages by the optional part of the installation that brings them
@@ -101,10 +107,7 @@ def one_line(text: str, most: int = 80) -> str:
         text: anything.
         most: length in characters.
     """
-    text = " ".join(text[: 10 * most].split())
-    text = "".join(
-        c if c.isprintable() else c.encode("unicode_escape").decode() for c in text
-    )
+    text = printable(" ".join(text[: 10 * most].split()))
     return text if len(text) <= most else text[: most - 3] + "..."
 
 

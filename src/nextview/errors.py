@@ -27,6 +27,22 @@ DAMAGED = (
 )
 
 
+def printable(text: str) -> str:
+    r"""A text in which line breaks and whatever else cannot be printed are escaped.
+
+    Names in files come from elsewhere: a terminal would obey what they hold.
+
+    >>> print(printable("a\x1b[31m"))
+    a\x1b[31m
+
+    Args:
+        text: anything.
+    """
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode() for c in text
+    )
+
+
 class NextviewError(ValueError):
     """The base class of all errors that nextview raises on purpose.
 
@@ -34,6 +50,9 @@ class NextviewError(ValueError):
         >>> issubclass(nextview.MeshError, nextview.NextviewError)
         True
     """
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(printable(message))
 
 
 class UsageError(NextviewError):

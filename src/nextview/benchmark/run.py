@@ -124,7 +124,7 @@ def run_benchmark(
     grid, names, promised = _prepare(predictions, settings)
     track(run_grid(grid, names), len(names), "replaying policies")
     if not grid.paths:
-        raise EntryError("\n".join(grid.failures.values()))
+        raise EntryError("; ".join(grid.failures.values()))
 
     rng = np.random.default_rng([settings.seed, 1])
     tables = summarise(

@@ -4,6 +4,8 @@ A bag is a folder with ``metadata.yaml``, or one file of it (.mcap, .db3). It is
 image; of a long one only a sample is used.
 """
 
+import io
+import os
 import weakref
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -11,7 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +23,7 @@ from nextview.captured.messages import (
     ENCODING_STEPS,
     ENCODINGS,
     compressed_encoding,
+    compressed_size,
     depth_of,
     depth_of_compressed,
     intrinsics_of,
@@ -28,8 +31,16 @@ from nextview.captured.messages import (
     seconds,
 )
 from nextview.captured.transforms import NoTransformError, TransformError, TransformTree
-from nextview.checks import extras, one_line
-from nextview.errors import DAMAGED, DatasetError, NextviewError, ObservationError
+from nextview.captured.yaml_fields import read_yaml
+from nextview.checks import extras, number, one_line
+from nextview.errors import (
+    DAMAGED,
+    DatasetError,
+    NextviewError,
+    ObservationError,
+    UsageError,
+)
+from nextview.files import regular_file
 from nextview.types import Float, Float32
 
 if TYPE_CHECKING:
@@ -47,6 +58,16 @@ TF = "tf2_msgs/msg/TFMessage"
 # the end of the name of the topic of transforms that never change
 STATIC_TRANSFORMS = "tf_static"
 NANOSECONDS = 1e-9
+# in place of the encoding of a topic whose messages are announced and missing
+NOT_THERE = "announced, and none is there"
+LARGEST_METADATA = 2**24  # bytes of metadata.yaml
+# bytes of a chunk of a file, or of one message, once they are decompressed: recorders fill chunks
+# of a few megabytes, and one image or cloud of a message takes less than a hundred
+LARGEST_CHUNK = 2**28
+# nanoseconds before a moment in which its last image is looked for; then twice as many
+FIRST_REACH = 1_000_000_000
+# which image of a camera that stands still: seconds since the bag's first message
+At = Literal["first", "last"] | float | None
 
 
 def is_bag(path: Path) -> bool:
@@ -61,6 +82,7 @@ def read_bag(
     intrinsics: Float | None = None,
     depth_topic: str | None = None,
     world_frame: str | None = None,
+    at: At = None,
 ) -> LayoutViews:
     """Find the depth images of a bag, the intrinsics of their camera and its poses.
 
@@ -70,15 +92,19 @@ def read_bag(
         depth_topic: where the depth images are, if there are several such topics.
         world_frame: the frame that is the world, z up; by default the root of the tree that the
             camera hangs in.
+        at: which image is used of a camera that stands still, as its frames cannot be told apart
+            from frames of a scene that changes: the first, the last, or the first one from a
+            moment on, seconds since the bag's first message. The first by default.
 
     Raises:
         DatasetError: the bag is damaged, or lacks depth images, camera_info or transforms.
+        UsageError: ``at`` is given, and the camera moves.
         MissingExtraError: rosbags is not installed.
     """
     bag = Bag(path)
     topic = _depth_topic(bag, depth_topic)
     images = _sample(bag, topic)
-    first = images[0]
+    first = next((each for each in images if not each.damage), images[0])
     tree = _transforms(bag)
     camera = first.frame
     if camera not in tree.frames:
@@ -98,11 +124,16 @@ def read_bag(
         )
 
     notes = [f"depth of {topic.topic}", f"poses of {camera} in {world} by tf"]
-    if topic.msgcount > len(images):
+    if topic.msgcount > len(images) and tree.moves(camera, world):
         notes.append(f"{len(images)} of {topic.msgcount} images, evenly spread")
     if not tree.moves(camera, world):
-        notes.append("tf does not move the camera: one image is used")
-        images = images[:1]
+        images = [_image_at(bag, topic, images, at)]
+        notes.append(_which_image(images[0], topic, at))
+    elif at is not None:
+        raise UsageError(
+            f"{path}: tf moves its camera, so all images are used; --at is for one that stands"
+            " still"
+        )
     if intrinsics is None:
         intrinsics, source = _intrinsics(bag, topic.topic, first)
         notes.append(f"intrinsics of {source}")
@@ -113,7 +144,7 @@ def read_bag(
         notes,
         z_is_up=world_frame is not None or tree.moves(camera, world),
     )
-    lost = _add_frames(views, images, tree, world, intrinsics)
+    lost = _add_frames(views, images, tree, world, intrinsics, first.size)
     if lost:
         notes.append(f"{lost} images have no pose in tf and are left out")
     if not views.frames and not views.unreadable:
@@ -147,17 +178,26 @@ class Bag:
             from rosbags.typesys import Stores, get_typestore
         self.path = path
         self._types = get_typestore(Stores.ROS2_JAZZY)
+        _bound_chunks()
         with _damage_named(path):
-            self._reader = Reader(_opened(path))
+            self._reader = Reader(_BoundedPath(_opened(path)))
+            _check_metadata(path)
             self._reader.open()
+            self.connections = _connections(self._reader)
+            self.start = int(self._reader.start_time)
+            self.end = int(self._reader.end_time)
+            # what rosbags would decompress whole, whatever its size, is decompressed here
+            self._packed = self._reader.compression_mode == "message"
+            storage: Any = self._reader.storage
+            if self._packed:
+                storage.metadata = storage.metadata._replace(compression_mode=None)
         # rows that are still being read: the file cannot be closed before they are
         self._unread: set[Generator[Any, None, None]] = set()
         weakref.finalize(self, _close, self._reader, self._unread)
-        self.connections = [
-            each for each in self._reader.connections if each.msgcount > 0
-        ]
-        self.start = self._reader.start_time
-        self.end = self._reader.end_time
+
+    def first(self, connection: "Connection") -> Any:
+        """The first message of a topic; None if there is none, whatever the bag announces."""
+        return next((message for _, _, message in self.messages([connection])), None)
 
     def of_type(self, *kinds: str) -> list["Connection"]:
         """What was recorded of some types of messages, sorted by topic."""
@@ -189,6 +229,8 @@ class Bag:
                     if given is None:
                         return
                     connection, time, data = given
+                    if self._packed:
+                        data = _bounded_zstd(data)
                     message = self._types.deserialize_cdr(data, connection.msgtype)
                 yield connection, time, message
         finally:
@@ -207,7 +249,8 @@ class RecordedImage:
         stamp: seconds, of its header.
         frame: the tf frame that it is in.
         encoding: one of ``messages.ENCODINGS``, if it holds depth.
-        size: width and height, pixels.
+        size: width and height, pixels; 0 where it is damaged.
+        damage: what is wrong with it; "" if nothing is known to be.
     """
 
     bag: Bag
@@ -217,6 +260,7 @@ class RecordedImage:
     frame: str
     encoding: str
     size: tuple[int, int]
+    damage: str = ""
 
     def read(self) -> NDArray[np.uint16] | Float32:
         """Read the image, (H, W), uint16 or float32.
@@ -238,6 +282,95 @@ class RecordedImage:
 
     def __str__(self) -> str:
         return f"{self.bag.path}, {self.connection.topic} at {self.name} s"
+
+
+class _BoundedFile(io.BufferedReader):
+    """A file of which no more is asked for than it holds, whatever length a record claims."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read at most so many bytes."""
+        if size is not None and size > io.DEFAULT_BUFFER_SIZE:
+            left = os.fstat(self.fileno()).st_size - self.tell()
+            size = max(0, min(size, left))
+        return super().read(size)
+
+
+class _BoundedPath(type(Path())):  # type: ignore[misc]
+    """A path whose files are opened as ``_BoundedFile`` where bytes are read."""
+
+    def open(self, mode: str = "r", *how: Any, **named: Any) -> Any:
+        """Open the file."""
+        if mode == "rb":
+            return _BoundedFile(io.FileIO(self))
+        return super().open(mode, *how, **named)
+
+
+def _check_metadata(path: Path) -> None:
+    """See that metadata.yaml does not repeat itself beyond measure; rosbags reads it anew."""
+    file = path / METADATA
+    if path.is_dir() and file.exists():
+        regular_file(file, "what describes a bag", DatasetError, LARGEST_METADATA)
+        read_yaml(
+            file.read_text(),
+            f"{path}: the bag is damaged, or its recording was cut off: {METADATA}",
+        )
+
+
+def _connections(reader: "Reader") -> list["Connection"]:
+    """The topics of an open bag that have messages, as far as it says.
+
+    Raises:
+        TypeError: their names or numbers are none.
+    """
+    for each in reader.connections:
+        if not isinstance(each.topic, str) or not isinstance(each.msgtype, str):
+            raise TypeError(f"a topic is called {one_line(repr(each.topic))}")
+    return [each for each in reader.connections if each.msgcount > 0]
+
+
+@cache
+def _bound_chunks() -> None:
+    """Have rosbags decompress no more of a chunk than the chunk says it holds.
+
+    Of its own it decompresses all, and compares the size then: ten bytes on the disk can be
+    gigabytes.
+    """
+    with extras():
+        from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
+    DECOMPRESSORS["zstd"] = _bounded_zstd
+    DECOMPRESSORS["lz4"] = _bounded_lz4
+
+
+def _bounded_zstd(data: bytes, size: int = LARGEST_CHUNK) -> bytes:
+    """Decompress what says that it holds so many bytes, and no more of it.
+
+    Raises:
+        ValueError: it holds more, or claims more than ``LARGEST_CHUNK``.
+    """
+    with extras():
+        from rosbags.rosbag2.storage_mcap import zstd
+    _check_chunk(size, size)
+    found: bytes = zstd.ZstdDecompressor().decompress(data, size + 1)
+    _check_chunk(len(found), size)
+    return found
+
+
+def _bounded_lz4(data: bytes, size: int) -> bytes:
+    """The same of the other way to compress a chunk."""
+    with extras():
+        from lz4.frame import LZ4FrameDecompressor
+    _check_chunk(size, size)
+    found: bytes = LZ4FrameDecompressor().decompress(data, size + 1)
+    _check_chunk(len(found), size)
+    return found
+
+
+def _check_chunk(length: int, claimed: int) -> None:
+    """Refuse a chunk of some bytes; a ValueError."""
+    if claimed > LARGEST_CHUNK:
+        raise ValueError(f"a chunk of {claimed} bytes, {LARGEST_CHUNK} are most")
+    if length > claimed:
+        raise ValueError(f"a chunk of {claimed} bytes holds more")
 
 
 def _close(reader: "Reader", unread: set[Generator[Any, None, None]]) -> None:
@@ -315,6 +448,8 @@ def _depth_topic(bag: Bag, asked: str | None) -> "Connection":
             raise DatasetError(
                 f"{bag.path}: has no images on {asked}; there are {there}"
             )
+        if encodings[found[0].topic] == NOT_THERE:
+            raise DatasetError(f"{bag.path}: images on {asked} are {NOT_THERE}")
         if encodings[found[0].topic] not in ENCODINGS:
             raise DatasetError(
                 f"{bag.path}: {asked} holds no depth but {encodings[found[0].topic]!r}; depth is"
@@ -344,8 +479,10 @@ def _depth_topic(bag: Bag, asked: str | None) -> "Connection":
 
 
 def _encoding(bag: Bag, connection: "Connection") -> str:
-    """That of the first image of a topic."""
-    message = next(bag.messages([connection]))[2]
+    """That of the first image of a topic; in words where there is none."""
+    message = bag.first(connection)
+    if message is None:
+        return NOT_THERE
     return (
         compressed_encoding(message)
         if connection.msgtype == COMPRESSED
@@ -376,24 +513,97 @@ def _sample(bag: Bag, topic: "Connection") -> list[RecordedImage]:
             first = next(bag.messages([topic], start, stop), None)
             if first is not None:
                 found.append(_recorded(bag, topic, first[1], first[2]))
+    if not found:
+        raise DatasetError(
+            f"{bag.path}: announces {topic.msgcount} images on {topic.topic}, and none is there"
+        )
     return sorted(found, key=lambda image: image.stamp)
+
+
+def _image_at(
+    bag: Bag,
+    topic: "Connection",
+    images: list[RecordedImage],
+    at: At,
+) -> RecordedImage:
+    """The image of a topic at a moment, see ``read_bag``.
+
+    Args:
+        bag: an open one.
+        topic: of the images.
+        images: those that were sampled, in order.
+        at: the moment.
+
+    Raises:
+        DatasetError: there is none from that moment on.
+        UsageError: it is no moment.
+    """
+    if at is None or at == "first":
+        return images[0]
+    if at == "last":
+        return _last_image(bag, topic, images)
+    moment = number(at, "the moment of an image, in seconds,", least=0)
+    start = bag.start + round(moment / NANOSECONDS)
+    found = next(bag.messages([topic], start), None) if start < bag.end else None
+    if found is None:
+        last = _last_image(bag, topic, images).name
+        raise DatasetError(
+            f"{bag.path}: there is no image from {moment:g} s on; the last is at {last} s"
+        )
+    return _recorded(bag, topic, found[1], found[2])
+
+
+def _last_image(
+    bag: Bag,
+    topic: "Connection",
+    images: list[RecordedImage],
+) -> RecordedImage:
+    """The last image of a topic, of which some were sampled."""
+    if topic.msgcount <= MOST_FRAMES:
+        return images[-1]
+    reach = FIRST_REACH
+    while True:
+        start = max(bag.end - reach, bag.start)
+        last = None
+        for _, time, message in bag.messages([topic], start):
+            last = time, message
+        if last is not None:
+            return _recorded(bag, topic, *last)
+        if start == bag.start:
+            return images[-1]
+        reach *= 2
+
+
+def _which_image(image: RecordedImage, topic: "Connection", at: At) -> str:
+    """A note of which image is used of a camera that stands still."""
+    said = f"tf does not move the camera: its image at {image.name} s is used"
+    if topic.msgcount == 1 or at is not None:
+        return said
+    return f"{said}, the first of {topic.msgcount} (others: --at last, --at SECONDS)"
 
 
 def _recorded(bag: Bag, topic: "Connection", time: int, message: Any) -> RecordedImage:
     """What is kept of an image until it is read."""
-    compressed = topic.msgtype == COMPRESSED
-    if compressed:
-        height, width = _pixels(message, topic.msgtype).shape
-    else:
-        height, width = int(message.height), int(message.width)
+    damage = ""
+    size = 0, 0
+    try:
+        if topic.msgtype == COMPRESSED:
+            encoding = compressed_encoding(message)
+            size = compressed_size(message)
+        else:
+            encoding = message.encoding
+            size = int(message.width), int(message.height)
+    except ObservationError as error:
+        damage = str(error)
     return RecordedImage(
         bag,
         topic,
         time,
         seconds(message.header.stamp),
         message.header.frame_id.lstrip("/"),
-        compressed_encoding(message) if compressed else message.encoding,
-        (width, height),
+        encoding,
+        size,
+        damage,
     )
 
 
@@ -437,15 +647,15 @@ def _intrinsics(bag: Bag, topic: str, image: RecordedImage) -> tuple[Float, str]
     places = {f"{_base(topic)}/camera_info", f"{_base(_base(topic))}/camera_info"}
     found = [each for each in infos if each.topic in places]
     if not found:
-        found = [each for each in infos if _fits(next(bag.messages([each]))[2], image)]
-    if len(found) != 1:
+        found = [each for each in infos if _fits(bag.first(each), image)]
+    info = bag.first(found[0]) if len(found) == 1 else None
+    if info is None:
         there = _listed([each.topic for each in infos]) if infos else "none"
         raise DatasetError(
             f"{bag.path}: the camera_info of {topic} is missing (there is {there}): give"
             " --intrinsics FX FY CX CY, or a file with them"
         )
 
-    info = next(bag.messages(found))[2]
     if (info.width, info.height) != image.size:
         raise DatasetError(
             f"{bag.path}: {found[0].topic} is of images of {info.width} x {info.height} pixels, and"
@@ -463,6 +673,8 @@ def _intrinsics(bag: Bag, topic: str, image: RecordedImage) -> tuple[Float, str]
 
 def _fits(info: Any, image: RecordedImage) -> bool:
     """Whether a camera_info is of the frame and the size of an image."""
+    if info is None:
+        return False
     same = info.header.frame_id.lstrip("/") == image.frame
     return same and (info.width, info.height) == image.size
 
@@ -473,13 +685,21 @@ def _add_frames(
     tree: TransformTree,
     world: str,
     k: Float,
+    size: tuple[int, int],
 ) -> int:
-    """Add frames with the poses of some images; returns how many have none."""
+    """Add frames with the poses of images of one size; returns how many have none."""
     lost = 0
     for image in images:
         try:
             if image.encoding not in ENCODING_STEPS:
                 raise ObservationError(f"{image}: its encoding is {image.encoding!r}")
+            if image.damage:
+                raise ObservationError(f"{image}: {image.damage}")
+            if image.size != size:
+                raise ObservationError(
+                    f"{image}: has {image.size[0]} x {image.size[1]} pixels, and others"
+                    f" {size[0]} x {size[1]}"
+                )
             pose = tree.pose(image.frame, world, image.stamp)
         except NoTransformError:
             lost += 1

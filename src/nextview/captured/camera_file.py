@@ -1,10 +1,11 @@
 """Intrinsics of a depth camera in the files that cameras and their tools write.
 
 ``camera_info`` of ROS (``ros2 topic echo --once``, or of its calibration), the intrinsics of
-librealsense, of Open3D's recorder and of BOP's ``camera.json``; JSON or YAML.
+librealsense, of Open3D (its recorder's, and ``PinholeCameraParameters``), of BOP's ``camera.json``,
+of Zivid and of OpenCV; JSON or YAML. A text file (.txt) holds the pinhole matrix alone.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,21 +13,27 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from nextview.captured.frames import MILLIMETRES
+from nextview.captured.frames import MILLIMETRES, DepthImage, read_table
+from nextview.captured.yaml_fields import read_yaml
+from nextview.checks import one_line
 from nextview.errors import DatasetError
 from nextview.files import regular_file
 from nextview.geometry.pinhole import pinhole_matrix
 from nextview.types import Float
 
 LARGEST_FILE = 2**20  # bytes
-MATRICES = ("k", "K", "cam_K", "camera_matrix", "intrinsic_matrix")
+MOST_MATRIX_NUMBERS = 100  # in a list of a camera: nine, or up to 14 coefficients
+# names of fields, compared without regard to capitals
+MATRICES = ("k", "cam_k", "camera_matrix", "cameramatrix", "intrinsic_matrix")
 PRINCIPAL_POINTS = (("cx", "cy"), ("ppx", "ppy"))
-DISTORTIONS = ("d", "D", "coeffs", "distortion_coefficients")
+DISTORTIONS = ("d", "coeffs", "distortion_coefficients", "distcoeffs", "distortion")
 WIDTHS = ("width", "image_width")
 HEIGHTS = ("height", "image_height")
 SCALES = ("depth_scale", "depth_units")
-# where a file holds several cameras, or one with other things
-INSIDE = ("depth", "depth_intrinsics", "intrinsics", "camera_info")
+# where a file holds several cameras, or one with other things; the depth camera's before those of
+# the file itself, which may be the colour camera's
+INSIDE_FIRST = ("depth", "depth_intrinsics")
+INSIDE = ("intrinsics", "intrinsic", "camera_info", "cameraintrinsics")
 # What a depth scale is counted in: the tools do not agree, their values lie far apart.
 METRES_BELOW = 0.02  # librealsense: metres that a step stands for, 0.001
 STEPS_FROM = 50.0  # Open3D: steps a metre, 1000; between them BOP's millimetres that a step is, 0.1
@@ -51,34 +58,33 @@ def read_camera_file(path: Path) -> CameraFile:
     """Read the intrinsics, and whatever else a file says of a depth camera.
 
     Args:
-        path: JSON or YAML.
+        path: JSON or YAML, or the pinhole matrix in a text file.
 
     Raises:
         DatasetError: it cannot be read, holds no intrinsics, or those of images that are distorted.
     """
+    if path.suffix.lower() == ".txt":
+        return CameraFile(read_table(path, "the pinhole matrix", 3), None, None)
     content = _content(path)
-    inside = [
-        content[name] for name in INSIDE if isinstance(content.get(name), Mapping)
-    ]
-    cameras = [each for each in (content, *inside) if _has_intrinsics(each)]
-    if not cameras:
+    camera = _depth_camera(content)
+    if camera is None:
         raise DatasetError(
             f"{path}: holds no intrinsics; known are fx, fy with cx, cy or ppx, ppy, and matrices"
             f" called {', '.join(MATRICES)}"
         )
-    camera = cameras[0]
     try:
         intrinsics = _intrinsics(camera)
-        distortion = np.asarray(_numbers(_first(camera, DISTORTIONS)), np.float64)
-        scale = _scale(_first(content, SCALES) or _first(camera, SCALES))
-        width = _first(camera, WIDTHS)
-        height = _first(camera, HEIGHTS)
-        size = None if not width or not height else (int(width), int(height))
+        distortion = _coefficients(_first(camera, DISTORTIONS))
+        scale = _scale(_first(camera | content, SCALES))
+        offset, size = _part_of_sensor(camera)
     except (TypeError, ValueError, OverflowError) as error:
         raise DatasetError(
-            f"{path}: not the intrinsics of a camera ({error})"
+            f"{path}: not the intrinsics of a camera ({one_line(str(error), 200)})"
         ) from None
 
+    if not np.isfinite(intrinsics).all():
+        raise DatasetError(f"{path}: its intrinsics are not all finite numbers")
+    intrinsics[:2, 2] -= offset
     if np.any(distortion):
         raise DatasetError(
             f"{path}: the camera distorts (coefficients {distortion.tolist()}): undistort its"
@@ -87,57 +93,141 @@ def read_camera_file(path: Path) -> CameraFile:
     return CameraFile(intrinsics, size, scale)
 
 
-def _content(path: Path) -> Mapping[str, Any]:
+def check_size(camera: CameraFile, depth: DepthImage, where: str) -> None:
+    """Refuse intrinsics of images of another size.
+
+    Args:
+        camera: what a file says.
+        depth: an image that is taken for one of that camera.
+        where: beginning of the sentence of the error.
+
+    Raises:
+        DatasetError: the file is of images of another size.
+    """
+    if camera.size is not None and camera.size != depth.size:
+        wanted = "{} x {}".format(*camera.size)
+        there = "{} x {}".format(*depth.size)
+        raise DatasetError(
+            f"{where}: the intrinsics are of images of {wanted} pixels, and {depth} has {there}:"
+            " are they those of the colour camera, or of another resolution?"
+        )
+
+
+def _content(path: Path) -> dict[str, Any]:
     """The fields of a JSON or YAML file; of the first document, where it has several."""
-    regular_file(path, "the intrinsics of a camera", DatasetError, LARGEST_FILE)
+    what = "the intrinsics of a camera"
+    regular_file(path, what, DatasetError, LARGEST_FILE)
     try:
         text = path.read_text()
         if path.suffix.lower() == ".json":
             content = msgspec.json.decode(text)
         else:
-            first = text.removeprefix("---").split("\n---")[0]
-            content = msgspec.yaml.decode(first)
+            content = read_yaml(text, f"{path}: not {what}")
     except (OSError, UnicodeDecodeError, msgspec.DecodeError, RecursionError) as error:
-        phrase = " ".join(str(error).split())
         raise DatasetError(
-            f"{path}: not the intrinsics of a camera ({phrase})"
+            f"{path}: not {what} ({one_line(str(error), 200)})"
         ) from None
 
     if not isinstance(content, Mapping):
         raise DatasetError(
             f"{path}: holds no fields, so not the intrinsics of a camera"
         )
+    return _fields(content)
 
-    return content
+
+def _fields(content: Mapping[Any, Any]) -> dict[str, Any]:
+    """Fields by their names in small letters."""
+    return {str(name).lower(): value for name, value in content.items()}
 
 
-def _has_intrinsics(camera: Mapping[str, Any]) -> bool:
+def _depth_camera(content: dict[str, Any]) -> dict[str, Any] | None:
+    """The fields of the depth camera, wherever a file has them; None if it has none."""
+
+    def inside(names: Sequence[str]) -> list[dict[str, Any]]:
+        return [
+            _fields(content[name])
+            for name in names
+            if isinstance(content.get(name), Mapping)
+        ]
+
+    cameras = [*inside(INSIDE_FIRST), content, *inside(INSIDE)]
+    return next((each for each in cameras if _has_intrinsics(each)), None)
+
+
+def _has_intrinsics(camera: dict[str, Any]) -> bool:
     """Whether fields hold the intrinsics of a camera."""
     focal = "fx" in camera and "fy" in camera
     points = any(cx in camera and cy in camera for cx, cy in PRINCIPAL_POINTS)
     return _first(camera, MATRICES) is not None or (focal and points)
 
 
-def _intrinsics(camera: Mapping[str, Any]) -> Float:
+def _intrinsics(camera: dict[str, Any]) -> Float:
     """The pinhole matrix of a camera, (3, 3)."""
     given = _first(camera, MATRICES)
+    if isinstance(given, Mapping) and _has_intrinsics(_fields(given)):
+        return _intrinsics(_fields(given))  # Zivid: FX, FY, CX, CY inside
     if given is not None:
-        matrix = np.asarray(_numbers(given), np.float64).reshape(3, 3)
+        matrix = _numbers(given).reshape(3, 3)
         # Open3D writes it column by column
         by_columns = not matrix[:2, 2].any() and matrix[2, :2].any()
-        return matrix.T if by_columns else matrix
+        return matrix.T.copy() if by_columns else matrix
     cx, cy = next(names for names in PRINCIPAL_POINTS if names[0] in camera)
     return pinhole_matrix(*(float(camera[name]) for name in ("fx", "fy", cx, cy)))
 
 
-def _numbers(values: Any) -> Any:
-    """The numbers of a list, of one in a field "data" as ROS calibrations have it, or none."""
+def _part_of_sensor(camera: dict[str, Any]) -> tuple[Float, tuple[int, int] | None]:
+    """Where the images begin on the sensor, (2,), pixels, and their size, if it is told.
+
+    A camera that is read out in part says where: fields x_offset and y_offset of its own, or in
+    ROS's ``roi``, whose width and height are then those of the images (0: all).
+
+    Raises:
+        ValueError: pixels are put together.
+    """
+    if any(float(camera.get(f"binning_{axis}") or 1) > 1 for axis in "xy"):
+        raise ValueError("it puts pixels together: give the intrinsics of its images")
+
+    roi = camera.get("roi")
+    part = camera if not isinstance(roi, Mapping) else _fields(roi)
+    offset = np.array([float(part.get(f"{axis}_offset") or 0) for axis in "xy"])
+    if not (np.isfinite(offset) & (offset >= 0)).all():
+        raise ValueError(f"its images begin at {offset.tolist()} of the sensor")
+    width, height = (
+        _first(part, names) or _first(camera, names) for names in (WIDTHS, HEIGHTS)
+    )
+    return offset, None if not width or not height else (int(width), int(height))
+
+
+def _coefficients(values: Any) -> Float:
+    """The coefficients of a distortion, (N,): a list, or fields as Zivid has them (K1, P1)."""
+    if values is None or isinstance(values, str):  # the name of its model
+        return np.zeros(0)
+    if isinstance(values, Mapping) and "data" not in _fields(values):
+        values = [each for each in values.values() if not isinstance(each, str)]
+    return _numbers(values)
+
+
+def _numbers(values: Any) -> Float:
+    """The numbers of a list as a row, (N,).
+
+    It may be a list of rows, or in a field "data", as ROS calibrations and OpenCV have it.
+
+    Raises:
+        ValueError: there are more than a camera has.
+        TypeError: they are no numbers.
+    """
     if isinstance(values, Mapping):
-        return values.get("data", [])
-    return [] if values is None else values
+        values = _fields(values).get("data", [])
+    rows = values if isinstance(values, list) else [values]
+    row = [
+        value for each in rows for value in (each if isinstance(each, list) else [each])
+    ]
+    if len(row) > MOST_MATRIX_NUMBERS:
+        raise ValueError(f"a list of {len(row)} numbers")
+    return np.array([float(value) for value in row])
 
 
-def _first(fields: Mapping[str, Any], names: tuple[str, ...]) -> Any:
+def _first(fields: Mapping[str, Any], names: Sequence[str]) -> Any:
     """The value of the first of some names that is there, or None."""
     return next((fields[name] for name in names if name in fields), None)
 

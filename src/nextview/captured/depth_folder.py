@@ -6,24 +6,26 @@
 order of the images), or ``trajectory.log`` (Open3D).
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
-from nextview.captured.camera_file import CameraFile, read_camera_file
+from nextview.captured.camera_file import CameraFile, check_size, read_camera_file
 from nextview.captured.frames import (
+    LARGEST_TEXT,
     CapturedFrame,
     DepthFile,
     LayoutViews,
     numbers_of,
+    opened_image,
     read_table,
     rigid,
 )
 from nextview.checks import did_you_mean
-from nextview.errors import DAMAGED, DatasetError
-from nextview.files import read_record
+from nextview.errors import DatasetError, ObservationError
+from nextview.files import read_record, regular_file
 from nextview.types import Float
 
 CAMERA_FILES = (
@@ -32,6 +34,7 @@ CAMERA_FILES = (
     "camera_info.json",
     "intrinsics.json",
     "intrinsics.yaml",
+    "intrinsics.yml",
     "intrinsic.json",
     "camera_intrinsics.json",
     "camera_intrinsic.json",
@@ -61,26 +64,26 @@ def is_depth_folder(folder: Path) -> bool:
 
 def read_depth_folder(
     folder: Path,
-    intrinsics: Float | None,
+    given: CameraFile | None,
     scale: float | None,
 ) -> LayoutViews:
     """Read the poses and the intrinsics of a folder of depth images.
 
     Args:
         folder: which ``is_depth_folder``.
-        intrinsics: pinhole matrix, (3, 3), pixels, if not that of the folder.
+        given: its camera, if not that of the folder.
         scale: metres that one step of the images stands for, if not that of the folder.
 
     Raises:
         DatasetError: intrinsics or depth scale are missing; there are no poses, and more than one
             image; or a file is damaged.
     """
-    camera, notes = _camera(folder, intrinsics)
+    camera, notes = _camera(folder, given)
+    if scale is None and camera.scale is not None:
+        notes.append(f"steps of {1000 * camera.scale:g} mm")
     scale = camera.scale if scale is None else scale
     if scale is None:
         raise DatasetError(f"{folder}: {ASK_FOR_SCALE}")
-    if camera.scale is not None:
-        notes.append(f"steps of {1000 * camera.scale:g} mm")
 
     images = sorted(folder.glob("depth/*.png"))
     poses, unreadable, of_poses = _poses(folder, [path.stem for path in images])
@@ -91,7 +94,7 @@ def read_depth_folder(
         depth = DepthFile(path)
         if path.stem not in poses:
             continue
-        _check_size(depth, camera, folder)
+        check_size(camera, depth, str(folder))
         mask = _beside(folder, MASKS, path.stem)
         colour = _beside(folder, COLOUR_FOLDERS, path.stem)
         if colour is not None and not _same_size(colour, depth):
@@ -113,54 +116,45 @@ def read_depth_folder(
 
 def read_depth_image(
     path: Path,
-    intrinsics: Float | None,
+    camera: CameraFile | None,
     scale: float | None,
-    camera_file: Any = None,
 ) -> LayoutViews:
     """A single depth image: its camera is the world.
 
     Args:
         path: grey PNG of 16 bits.
-        intrinsics: pinhole matrix, (3, 3), pixels.
-        scale: metres that one step stands for; None if ``camera_file`` says it.
-        camera_file: what the intrinsics were read from, if it was a file.
+        camera: that took it.
+        scale: metres that one step stands for; None if the camera's file says it.
 
     Raises:
         DatasetError: intrinsics or depth scale are missing.
     """
-    if intrinsics is None:
+    if camera is None:
         raise DatasetError(
             f"{path}: the intrinsics of its camera are missing: give --intrinsics FX FY CX CY, or a"
             " file with them"
         )
-
-    if (
-        scale is None
-        and isinstance(camera_file, str | Path)
-        and Path(camera_file).suffix != ".txt"
-    ):
-        scale = read_camera_file(Path(camera_file)).scale
-
+    scale = camera.scale if scale is None else scale
     if scale is None:
         raise DatasetError(f"{path}: {ASK_FOR_SCALE}")
-    frame = CapturedFrame(path.stem, DepthFile(path), scale, intrinsics, np.eye(4))
+    depth = DepthFile(path)
+    frame = CapturedFrame(path.stem, depth, scale, camera.intrinsics, np.eye(4))
     return LayoutViews([frame], ["one image: its camera is the world"], z_is_up=False)
 
 
-def _camera(folder: Path, intrinsics: Float | None) -> tuple[CameraFile, list[str]]:
-    """The camera of a folder, and a note of where it is described."""
+def _camera(folder: Path, given: CameraFile | None) -> tuple[CameraFile, list[str]]:
+    """The camera of a folder, and a note of where it is described, if it was not given."""
     described = [folder / name for name in CAMERA_FILES if (folder / name).exists()]
     tables = [folder / name for name in CAMERA_TABLES if (folder / name).exists()]
     if described:
         camera = read_camera_file(described[0])
-        if intrinsics is None:
+        if given is None:
             return camera, [f"intrinsics of {described[0].name}"]
-        return CameraFile(intrinsics, None, camera.scale), []
-    if intrinsics is not None:
-        return CameraFile(intrinsics, None, None), []
+        return replace(given, scale=given.scale or camera.scale), []
+    if given is not None:
+        return given, []
     if tables:
-        matrix = read_table(tables[0], "the pinhole matrix", 3)
-        return CameraFile(matrix, None, None), [f"intrinsics of {tables[0].name}"]
+        return read_camera_file(tables[0]), [f"intrinsics of {tables[0].name}"]
 
     others = [
         path.name
@@ -175,17 +169,6 @@ def _camera(folder: Path, intrinsics: Float | None) -> tuple[CameraFile, list[st
         f"{folder}: the intrinsics of the depth camera are missing: give --intrinsics FX FY CX CY"
         f" or a file, or put {CAMERA_FILES[0]} or {CAMERA_FILES[3]} into the folder{near}"
     )
-
-
-def _check_size(depth: DepthFile, camera: CameraFile, folder: Path) -> None:
-    """Refuse intrinsics of images of another size."""
-    if camera.size is not None and camera.size != depth.size:
-        wanted = "{} x {}".format(*camera.size)
-        there = "{} x {}".format(*depth.size)
-        raise DatasetError(
-            f"{folder}: the intrinsics are of images of {wanted} pixels, and {depth} has {there}:"
-            " are they those of the colour camera, or of another resolution?"
-        )
 
 
 def _poses(
@@ -256,6 +239,7 @@ def _matrix(rows: list[list[float]], path: Path) -> Float:
 
 def _log(path: Path) -> list[Any]:
     """The matrices of an Open3D log, in order."""
+    regular_file(path, "a log of poses", DatasetError, LARGEST_TEXT)
     try:
         lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
     except (OSError, UnicodeDecodeError) as error:
@@ -301,9 +285,7 @@ def _beside(folder: Path, inside: tuple[str, ...], name: str) -> Path | None:
 
 def _same_size(picture: Path, depth: DepthFile) -> bool:
     try:
-        with Image.open(picture, formats=("PNG", "JPEG")) as image:
+        with opened_image(picture, ("PNG", "JPEG")) as image:
             return image.size == depth.size
-    except (*DAMAGED, Image.DecompressionBombError) as error:
-        raise DatasetError(
-            f"{picture}: the image is damaged or cannot be read ({error})"
-        ) from None
+    except ObservationError as error:
+        raise DatasetError(f"{picture}: {error}") from None

@@ -15,8 +15,8 @@ import numpy as np
 from msgspec import Meta, Struct
 from scipy.spatial.transform import Rotation
 
-from nextview.captured.bag import is_bag, read_bag
-from nextview.captured.camera_file import read_camera_file
+from nextview.captured.bag import At, is_bag, read_bag
+from nextview.captured.camera_file import CameraFile, check_size, read_camera_file
 from nextview.captured.depth_folder import (
     is_depth_folder,
     read_depth_folder,
@@ -69,6 +69,7 @@ class Reading:
         depth_topic: of a ROS 2 bag with several of depth.
         world_frame: of a ROS 2 bag: the frame of its tf that is the world, z up; the root of the
             tree, if not given.
+        at: of a ROS 2 bag of a camera that stands still: which image; see ``read_bag``.
     """
 
     intrinsics: Intrinsics = None
@@ -76,6 +77,7 @@ class Reading:
     depth_scale: float | None = None
     depth_topic: str | None = None
     world_frame: str | None = None
+    at: At = None
 
 
 def read_capture(
@@ -85,6 +87,7 @@ def read_capture(
     depth_scale: float | None = None,
     depth_topic: str | None = None,
     world_frame: str | None = None,
+    at: At = None,
 ) -> Capture:
     """Read the poses and intrinsics of captured frames, whatever layout they have.
 
@@ -98,6 +101,7 @@ def read_capture(
         depth_scale: metres.
         depth_topic: of a bag.
         world_frame: of a bag.
+        at: of a bag.
 
     Raises:
         DatasetError: what is missing or wrong, and in which file.
@@ -108,13 +112,15 @@ def read_capture(
     if depth_scale is not None:
         _check_scale(depth_scale)
     layout = _layout_of(path)
-    how = Reading(intrinsics, object_id, depth_scale, depth_topic, world_frame)
+    how = Reading(intrinsics, object_id, depth_scale, depth_topic, world_frame, at)
     _check_options(path, layout, how)
     if path.is_dir():
         _check_links(path)
 
-    k, said = _given_intrinsics(path, how.intrinsics)
-    views = FOLDER_LAYOUTS[layout](path, k, how)
+    camera, said = _given_camera(path, how.intrinsics)
+    views = FOLDER_LAYOUTS[layout](path, camera, how)
+    if camera is not None and camera.size is not None:
+        _check_sizes(camera, views, str(how.intrinsics))
     if not views.frames:
         raise DatasetError(
             next(iter(views.unreadable.values()), f"{path}: no image shows the object")
@@ -132,6 +138,18 @@ def read_capture(
         views.object_is_world,
         depth_scale is not None,
     )
+
+
+def _check_sizes(camera: CameraFile, views: LayoutViews, where: str) -> None:
+    """See that images have the size of their camera's; damaged ones become unreadable."""
+    for frame in list(views.frames):
+        try:
+            frame.size  # noqa: B018  # reads the header of a file
+        except DatasetError as error:
+            views.unreadable[frame.name] = str(error)
+            views.frames.remove(frame)
+        else:
+            check_size(camera, frame.depth, where)
 
 
 def is_capture(path: Path) -> bool:
@@ -202,8 +220,11 @@ def _check_options(path: Path, layout: str, how: Reading) -> None:
         raise UsageError(
             f"objects have numbers in BOP's layout only, and {path} has the layout of {layout}"
         )
-    if (how.depth_topic or how.world_frame) and layout != BAG:
-        raise UsageError(f"topics and tf frames are of ROS 2 bags, and {path} is none")
+    of_bags = (how.depth_topic, how.world_frame, how.at)
+    if layout != BAG and any(each is not None for each in of_bags):
+        raise UsageError(
+            f"topics, tf frames and moments are of ROS 2 bags, and {path} is none"
+        )
 
 
 def _check_links(folder: Path) -> None:
@@ -219,16 +240,20 @@ def _check_links(folder: Path) -> None:
             )
 
 
-def _given_intrinsics(path: Path, given: Intrinsics) -> tuple[Float | None, list[str]]:
-    """The pinhole matrix that was given or lies in the folder, if any, and a note of it."""
+def _given_camera(path: Path, given: Intrinsics) -> tuple[CameraFile | None, list[str]]:
+    """The camera that was given or lies in the folder, if any, and a note of it."""
     if isinstance(given, tuple):
-        return pinhole_matrix(*given), ["intrinsics as given"]
+        camera = CameraFile(pinhole_matrix(*given), None, None)
+        return camera, ["intrinsics as given"]
     file = path / INTRINSICS if given is None else Path(given)
     if given is None and not (path.is_dir() and file.exists()):
         return None, []
-    if file.suffix.lower() == ".txt":
-        return read_table(file, "the pinhole matrix", 3), [f"intrinsics of {file.name}"]
-    return read_camera_file(file).intrinsics, [f"intrinsics of {file.name}"]
+    return read_camera_file(file), [f"intrinsics of {file.name}"]
+
+
+def _matrix(camera: CameraFile | None) -> Float | None:
+    """The pinhole matrix of a camera, (3, 3), if there is one."""
+    return None if camera is None else camera.intrinsics
 
 
 def _no_capture(folder: Path) -> str:
@@ -291,12 +316,13 @@ def _bop_mask(folder: Path, name: str, here: list[int]) -> Path | None:
     return masks[0] if len(masks) == 1 else None
 
 
-def _read_bop(folder: Path, intrinsics: Float | None, how: Reading) -> LayoutViews:
+def _read_bop(folder: Path, camera: CameraFile | None, how: Reading) -> LayoutViews:
     """Views of scene_camera.json.
 
     Without camera poses, the world is the object's model, by scene_gt.json.
     """
     object_id = how.object_id
+    intrinsics = _matrix(camera)
     path = folder / "scene_camera.json"
     truth = folder / "scene_gt.json"
     cameras = read_record(
@@ -328,14 +354,14 @@ def _read_bop(folder: Path, intrinsics: Float | None, how: Reading) -> LayoutVie
 
     views = LayoutViews([], notes)
     from_model = False
-    for index, camera in sorted(cameras.items()):
+    for index, taken in sorted(cameras.items()):
         objects = all_objects.get(index, [])
         name = f"{index:06d}"
         here = [i for i, one in enumerate(objects) if one.obj_id == single]
         if single is not None and numbers and not here:
             continue  # it does not show the object
-        rotation = camera.cam_R_w2c
-        translation = camera.cam_t_w2c
+        rotation = taken.cam_R_w2c
+        translation = taken.cam_t_w2c
         where = f"image {index} of {path}"
         if rotation is None and here:
             thing = objects[here[0]]
@@ -350,7 +376,7 @@ def _read_bop(folder: Path, intrinsics: Float | None, how: Reading) -> LayoutVie
         except DatasetError as error:
             views.unreadable[name] = str(error)
             continue
-        k = np.reshape(camera.cam_K, (3, 3)) if intrinsics is None else intrinsics
+        k = np.reshape(taken.cam_K, (3, 3)) if intrinsics is None else intrinsics
         mask = _bop_mask(folder, name, here) if len(here) == 1 or not numbers else None
         files = (f"rgb/{name}.png", f"rgb/{name}.jpg", f"gray/{name}.png")
         image = next(
@@ -358,7 +384,7 @@ def _read_bop(folder: Path, intrinsics: Float | None, how: Reading) -> LayoutVie
             None,
         )
         depth = DepthFile(folder / f"depth/{name}.png")
-        step = camera.depth_scale * MILLIMETRES
+        step = taken.depth_scale * MILLIMETRES
         views.frames.append(CapturedFrame(name, depth, step, k, pose, mask, image))
     if from_model:
         notes.append(
@@ -382,8 +408,9 @@ def _from_world_to_camera(
     return rigid(pose, where)
 
 
-def _read_tum(folder: Path, intrinsics: Float | None, _: Reading) -> LayoutViews:
+def _read_tum(folder: Path, camera: CameraFile | None, _: Reading) -> LayoutViews:
     """Read views by depth.txt and groundtruth.txt, with images and masks if there are any."""
+    intrinsics = _matrix(camera)
     if intrinsics is None:
         raise DatasetError(
             f"{folder}: the intrinsics are missing, which this layout does not hold; put the"
@@ -441,7 +468,7 @@ def _read_tum(folder: Path, intrinsics: Float | None, _: Reading) -> LayoutViews
 
 def _read_seven_scenes(
     folder: Path,
-    intrinsics: Float | None,
+    camera: CameraFile | None,
     _: Reading,
 ) -> LayoutViews:
     """Views by frame-*.depth.png and .pose.txt, and masks in .mask.png.
@@ -449,6 +476,7 @@ def _read_seven_scenes(
     The colour images are not registered.
     """
     notes = []
+    intrinsics = _matrix(camera)
     if intrinsics is None:
         intrinsics = pinhole_matrix(*KINECT)
         notes.append(
@@ -525,17 +553,27 @@ def _trajectory(path: Path) -> tuple[Float, Float, int]:
     return values[:, 0], poses, int((~good).sum())
 
 
-FOLDER_LAYOUTS: dict[str, Callable[[Path, Float | None, Reading], LayoutViews]] = {
+FOLDER_LAYOUTS: dict[
+    str,
+    Callable[[Path, CameraFile | None, Reading], LayoutViews],
+] = {
     "BOP": _read_bop,
     "TUM RGB-D": _read_tum,
     "7-Scenes": _read_seven_scenes,
-    DEPTH_FOLDER: lambda path, k, how: read_depth_folder(path, k, how.depth_scale),
-    ONE_IMAGE: lambda path, k, how: read_depth_image(
+    DEPTH_FOLDER: lambda path, camera, how: read_depth_folder(
         path,
-        k,
+        camera,
         how.depth_scale,
-        how.intrinsics,
     ),
-    BAG: lambda path, k, how: read_bag(path, k, how.depth_topic, how.world_frame),
+    ONE_IMAGE: lambda path, camera, how: read_depth_image(
+        path, camera, how.depth_scale
+    ),
+    BAG: lambda path, camera, how: read_bag(
+        path,
+        _matrix(camera),
+        how.depth_topic,
+        how.world_frame,
+        how.at,
+    ),
 }
 """What reads the views of each layout."""

@@ -1,15 +1,19 @@
 """Captured frames as they lie on the disk, and what all layouts of them are read with."""
 
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import BinaryIO, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from nextview.errors import DAMAGED, DatasetError, ObservationError
+from nextview.checks import one_line
+from nextview.errors import DAMAGED, DatasetError, NextviewError, ObservationError
 from nextview.files import regular_file
 from nextview.sensing.frame import LARGEST_MEDIAN, NEAREST_MEDIAN, Frame, check_pose
 from nextview.types import Float, Float32
@@ -17,7 +21,10 @@ from nextview.types import Float, Float32
 NO_DEPTH = np.iinfo(np.uint16).max  # what some sensors give for "nothing" besides 0
 DEEP = ("I;16", "I;16B", "I")  # Pillow's names of grey images of 16 bits
 GREY_MODES = ("1", "L", "LA", "La")  # its names of grey images of 8 bits or fewer
-LARGEST_TEXT = 2**28  # bytes of a list of images or poses
+LARGEST_TEXT = 2**26  # bytes of a list of images or poses
+# of a depth image or a picture beside it: 4096 x 4096. A PNG of some hundred kilobytes can claim,
+# and hold, a thousand times as much
+MOST_PIXELS = 2**24
 MILLIMETRES = 0.001
 
 
@@ -52,7 +59,11 @@ class DepthFile:
     @cached_property
     def size(self) -> tuple[int, int]:
         """Width and height, pixels, from the file's header alone."""
-        return _open(self.path, ("PNG",), load=False).size
+        regular_file(self.path, "an image", DatasetError)
+        try:
+            return png_size(self.path)
+        except ObservationError as error:
+            raise DatasetError(f"{self.path}: {error}") from None
 
     def read(self) -> NDArray[np.uint16]:
         """Read the steps of the image, (H, W).
@@ -60,12 +71,11 @@ class DepthFile:
         Raises:
             DatasetError: it is damaged, or has 8 bits.
         """
-        deep = _open(self.path, ("PNG",))
-        if deep.mode not in DEEP:
-            raise DatasetError(
-                f"{self.path}: depth is a grey PNG of 16 bits, this one has 8 (mode {deep.mode})"
-            )
-        return np.asarray(deep).astype(np.uint16)
+        regular_file(self.path, "an image", DatasetError)
+        try:
+            return steps_of(self.path)
+        except ObservationError as error:
+            raise DatasetError(f"{self.path}: {error}") from None
 
     def __str__(self) -> str:
         return str(self.path)
@@ -290,27 +300,82 @@ def _picture(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
 
 def _opened_as(path: Path, shape: tuple[int, ...]) -> Image.Image:
     """An image of 8 bits and of the depth image's shape; else a DatasetError."""
-    image = _open(path, ("PNG", "JPEG"))
-    if (image.height, image.width) != shape:
-        raise DatasetError(
-            f"{path}: is {image.width} x {image.height} pixels, the depth image {shape[1]} x"
-            f" {shape[0]}"
-        )
-    if image.mode in DEEP:
-        raise DatasetError(
-            f"{path}: has 16 bits where 8 are expected; is it a depth image?"
-        )
-    return image
-
-
-def _open(path: Path, formats: tuple[str, ...], load: bool = True) -> Image.Image:
     regular_file(path, "an image", DatasetError)
     try:
-        with Image.open(path, formats=formats) as image:
-            if load:
-                image.load()
+        with opened_image(path, ("PNG", "JPEG")) as image:
+            if (image.height, image.width) != shape:
+                raise ObservationError(
+                    f"is {image.width} x {image.height} pixels, the depth image {shape[1]} x"
+                    f" {shape[0]}"
+                )
+            if image.mode in DEEP:
+                raise ObservationError(
+                    "has 16 bits where 8 are expected; is it a depth image?"
+                )
+            image.load()
             return image  # its file is closed, its pixels stay
+    except ObservationError as error:
+        raise DatasetError(f"{path}: {error}") from None
+
+
+def png_size(file: Path | BinaryIO) -> tuple[int, int]:
+    """Width and height of a PNG, pixels, from its header alone.
+
+    Args:
+        file: or its path.
+
+    Raises:
+        ObservationError: it is damaged, or larger than ``MOST_PIXELS``.
+    """
+    with opened_image(file, ("PNG",)) as image:
+        return image.size
+
+
+def steps_of(file: Path | BinaryIO) -> NDArray[np.uint16]:
+    """The steps of a grey PNG of 16 bits, (H, W).
+
+    Args:
+        file: or its path.
+
+    Raises:
+        ObservationError: it is damaged, has 8 bits, or is larger than ``MOST_PIXELS``.
+    """
+    with opened_image(file, ("PNG",)) as image:
+        if image.mode not in DEEP:
+            raise ObservationError(
+                f"depth is a grey PNG of 16 bits, this one has 8 (mode {image.mode})"
+            )
+        return np.asarray(image).astype(np.uint16)
+
+
+@contextmanager
+def opened_image(
+    file: Path | BinaryIO,
+    formats: tuple[str, ...],
+) -> Iterator[Image.Image]:
+    """Open an image whose pixels fit into memory, as yet unread.
+
+    Args:
+        file: or its path.
+        formats: as Pillow names them.
+
+    Raises:
+        ObservationError: it is damaged, or larger than ``MOST_PIXELS``.
+    """
+    try:
+        with warnings.catch_warnings():
+            # of Pillow's own limit, which lies higher
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            image = Image.open(file, formats=formats)
+        with image:
+            if image.width * image.height > MOST_PIXELS:
+                raise ObservationError(
+                    f"has {image.width} x {image.height} pixels, more than any depth camera"
+                )
+            yield image
+    except NextviewError:
+        raise
     except (*DAMAGED, Image.DecompressionBombError) as error:
-        raise DatasetError(
-            f"{path}: the image is damaged or cannot be read ({error})"
+        raise ObservationError(
+            f"the image is damaged or cannot be read ({one_line(str(error), 200)})"
         ) from None

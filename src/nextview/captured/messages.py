@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from nextview.captured.frames import DEEP, MILLIMETRES
-from nextview.errors import DAMAGED, ObservationError
+from nextview.captured.frames import MILLIMETRES, png_size, steps_of
+from nextview.errors import ObservationError
 from nextview.types import Float
 
 ENCODINGS: dict[str, np.dtype[Any]] = {
@@ -43,6 +42,8 @@ def depth_of(image: Any) -> NDArray[Any]:
     check_encoding(image.encoding)
     kind = ENCODINGS[image.encoding].newbyteorder(">" if image.is_bigendian else "<")
     height, width = int(image.height), int(image.width)
+    if min(height, width) < 1:
+        raise ObservationError(f"an image of {width} x {height} pixels shows nothing")
     step = int(image.step)
     data = np.frombuffer(bytes(image.data), np.uint8)
     if step < width * kind.itemsize or len(data) < step * height:
@@ -84,24 +85,8 @@ def depth_of_compressed(message: Any) -> NDArray[Any]:
     """
     encoding = compressed_encoding(message)
     check_encoding(encoding)
-    data = bytes(message.data)
-    start = data.find(PNG, 0, DEPTH_HEADER.size + len(PNG))
-    if start < 0:
-        raise ObservationError(
-            f"a compressed depth image is a PNG, not {message.format!r}: record the raw images"
-        )
-    try:
-        with Image.open(io.BytesIO(data[start:]), formats=("PNG",)) as png:
-            mode = png.mode
-            steps = np.asarray(png).astype(np.uint16)
-    except (*DAMAGED, Image.DecompressionBombError) as error:
-        raise ObservationError(
-            f"the compressed depth image is damaged ({error})"
-        ) from None
-    if mode not in DEEP:
-        raise ObservationError(
-            f"a compressed depth image has 16 bits, this one has mode {mode}"
-        )
+    start, png = _png_in(message)
+    steps = steps_of(png)
     if ENCODINGS[encoding] == np.uint16:
         return steps
 
@@ -109,12 +94,38 @@ def depth_of_compressed(message: Any) -> NDArray[Any]:
         raise ObservationError(
             "a compressed image of floats has a header, this one has none"
         )
-    _, scale, offset = DEPTH_HEADER.unpack_from(data)
+    _, scale, offset = DEPTH_HEADER.unpack_from(
+        bytes(message.data[: DEPTH_HEADER.size])
+    )
     inverse = steps.astype(np.float32) - np.float32(offset)
     near = (steps > 0) & (inverse > 0)
     return np.where(near, np.float32(scale) / np.where(near, inverse, 1), 0).astype(
         np.float32
     )
+
+
+def compressed_size(message: Any) -> tuple[int, int]:
+    """Width and height of a compressed depth image, pixels, from the header of its PNG alone.
+
+    Args:
+        message: see ``depth_of_compressed``.
+
+    Raises:
+        ObservationError: it is no depth image, is compressed otherwise, or is damaged.
+    """
+    check_encoding(compressed_encoding(message))
+    return png_size(_png_in(message)[1])
+
+
+def _png_in(message: Any) -> tuple[int, io.BytesIO]:
+    """Where the PNG of a compressed depth image begins, bytes, and the PNG."""
+    data = bytes(message.data)
+    start = data.find(PNG, 0, DEPTH_HEADER.size + len(PNG))
+    if start < 0:
+        raise ObservationError(
+            f"a compressed depth image is a PNG, not {message.format!r}: record the raw images"
+        )
+    return start, io.BytesIO(data[start:])
 
 
 def intrinsics_of(info: Any, rectified: bool = False) -> Float:

@@ -14,6 +14,9 @@ from nextview.types import Float
 
 # seconds between two transforms from which a pose between them is interpolated
 LONGEST_GAP = 0.5
+# frames between one and the root that it hangs on; a robot with two arms and hands has some forty
+LONGEST_CHAIN = 200
+NAMED_IN_CIRCLE = 8  # frames that a sentence names of a circle
 BEYOND = 0.02  # seconds before the first or after the last transform that it still counts for
 
 
@@ -130,7 +133,7 @@ class TransformTree:
         """Put what was taken in into the order of time, once all of it was.
 
         Raises:
-            TransformError: frames hang on each other in a circle.
+            TransformError: frames hang on each other in a circle, or in too long a chain.
         """
         self._links = {child: link.sorted() for child, link in self._links.items()}
         for child in self._links:
@@ -190,13 +193,20 @@ class TransformTree:
     def _above(self, frame: str) -> list[str]:
         """A frame and those that it hangs on, up to the root."""
         chain = [frame]
+        met = {frame}
         while chain[-1] in self._links:
             parent = self._links[chain[-1]].parent
-            if parent in chain:
+            if parent in met:
+                circle = [*chain[chain.index(parent) :], parent]
+                named = " in ".join(circle[:NAMED_IN_CIRCLE])
+                more = " in ..." if len(circle) > NAMED_IN_CIRCLE else ""
+                raise TransformError(f"tf goes round in a circle: {named}{more}")
+            if len(chain) > LONGEST_CHAIN:
                 raise TransformError(
-                    f"tf goes round in a circle: {' in '.join([*chain, parent])}"
+                    f"tf hangs {frame!r} on a chain of more than {LONGEST_CHAIN} frames"
                 )
             chain.append(parent)
+            met.add(parent)
         return chain
 
     def _between(self, frame: str, world: str) -> set[str]:

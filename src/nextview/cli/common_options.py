@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
+from nextview.captured.bag import At
 from nextview.cli.progress import console
 from nextview.errors import UsageError
 from nextview.files import check_new
@@ -91,6 +92,8 @@ class ObjectOptions:
             millimetres; by default as their files say.
         depth_topic: for ROS 2 bags with several topics of depth images: the topic.
         world_frame: for ROS 2 bags: tf frame of the world, z up; by default the root of the tree.
+        at: for ROS 2 bags of a camera that stands still: which image to use: first (the default),
+            last, or the first one from so many seconds after the bag's first message.
         raw: for captured frames: use the depth without denoising.
         by_shape: for captured frames: ignore the size of the object, as for toys and models.
     """
@@ -107,6 +110,7 @@ class ObjectOptions:
     depth_scale: float | None = None
     depth_topic: str | None = None
     world_frame: str | None = None
+    at: At = None
     raw: bool = False
     by_shape: bool = False
 
@@ -157,6 +161,7 @@ class ObjectOptions:
             self.depth_scale,
             self.depth_topic,
             self.world_frame,
+            self.at,
         )
         console.print(f"{capture!r}")
         return camera_of(

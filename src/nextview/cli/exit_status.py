@@ -12,6 +12,7 @@ from typing import NoReturn, TextIO
 
 from nextview.checks import EXTRAS, missing_extra, needs_package
 from nextview.errors import NextviewError
+from nextview.errors import printable as on_one_line
 
 
 def printable(text: str) -> str:
@@ -20,10 +21,7 @@ def printable(text: str) -> str:
     >>> print(printable("a\x1b[31mb"))
     a\x1b[31mb
     """
-    return "".join(
-        c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode()
-        for c in text
-    )
+    return "\n".join(map(on_one_line, text.split("\n")))
 
 
 @contextmanager

@@ -21,7 +21,7 @@ def print_results(found: Results) -> None:
     """Print the leaderboard; then what failed is an error."""
     print_leaderboard(found)
     if found.settings["failures"]:
-        raise EntryError("\n".join(found.settings["failures"].values()))
+        raise EntryError("; ".join(found.settings["failures"].values()))
 
 
 def print_leaderboard(results: Results) -> None:

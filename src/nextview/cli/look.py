@@ -11,6 +11,7 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
+from nextview.captured.bag import At
 from nextview.captured.camera import UP
 from nextview.captured.check import check_capture
 from nextview.captured.folders import Capture, read_capture
@@ -39,6 +40,8 @@ class LookOptions:
             as their files say.
         depth_topic: for ROS 2 bags with several topics of depth images: the topic.
         world_frame: for ROS 2 bags: tf frame of the world, z up; by default the root of the tree.
+        at: for ROS 2 bags of a camera that stands still: which image to use: first (the default),
+            last, or the first one from so many seconds after the bag's first message.
         up: axis of the world that points up, or a direction; by default that of the layout, or the
             normal of the support plane.
         region: upright box to which the search is limited: its low and its high corner, metres
@@ -53,6 +56,7 @@ class LookOptions:
     depth_scale: float | None = None
     depth_topic: str | None = None
     world_frame: str | None = None
+    at: At = None
     up: str | Three | None = None
     region: tuple[float, float, float, float, float, float] | None = None
     frames: int = 6
@@ -108,6 +112,7 @@ def look(
         depth_scale=looking.depth_scale,
         depth_topic=looking.depth_topic,
         world_frame=looking.world_frame,
+        at=looking.at,
     )
     capture, left_out = check_capture(read, masked=False)
     console.print(f"{capture!r}")
