@@ -128,11 +128,16 @@ def tf_message(*transforms):
     return message(TF, transforms=list(transforms))
 
 
-def write_bag(path, messages, mcap=True, close=True):
-    """Write messages, each a topic, seconds at which it was recorded, and the message itself."""
+def write_bag(path, messages, mcap=True, empty=()):
+    """Write messages, each a topic, seconds at which it was recorded, and the message itself.
+
+    ``empty`` are the types of topics without any, by name.
+    """
     plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
     with Writer(path, version=9, storage_plugin=plugin) as bag:
         connections = {}
+        for topic, kind in dict(empty).items():
+            bag.add_connection(topic, kind, typestore=STORE)
         for topic, time, given in messages:
             kind = given.__msgtype__
             if topic not in connections:
