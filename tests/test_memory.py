@@ -118,6 +118,9 @@ OF_ONE = {
     ("faces", "beyond the last"): lambda values: with_value(values, len(values)),
     ("faces", "signed"): lambda values: values.astype(np.int32),
     ("places", "of floats"): lambda values: values.astype(np.float32),
+    ("places", "all in one corner"): lambda values: values * 0 + np.uint16(65535),
+    ("places", "in half of the box"): lambda values: values // 2,
+    ("faces", "all of one vertex"): lambda values: values * 0,
     ("counts", "negative"): lambda values: values * (-1, 1),
     ("counts", "of other things"): lambda values: values[::-1],
     ("counts", "without faces"): lambda values: values * (1, 0),
@@ -481,6 +484,21 @@ def test_a_memory_holds_the_surface_of_each_thing_in_the_frame_of_its_file(
 
 def test_things_of_unknown_size_hold_no_geometry(taught):
     assert TaughtThings.of(open_recogniser(taught / "memory.json")) is None
+
+
+def test_a_size_that_is_no_number_is_damage_and_not_an_unknown_size(taught, tmp_path):
+    """Also of things without geometry, whose unit of length nobody said."""
+    models = shutil.copytree(taught, tmp_path / "mine")
+    _, memory = open_memory(models / "memory.json")
+    assert np.isnan(memory.radii).all()
+    rewrite(models, lambda arrays: None)
+    assert np.isnan(open_memory(models / "memory.json")[1].radii).all()
+    rewrite(
+        models,
+        lambda arrays: arrays.update(radii=with_value(arrays["radii"], np.nan)),
+    )
+    with pytest.raises(ModelError, match="its radii are not all numbers"):
+        open_memory(models / "memory.json")
 
 
 def test_weights_and_residuals_are_those_on_the_card(models):

@@ -404,3 +404,13 @@ def test_a_card_is_written_as_it_was_read_and_a_broken_one_is_named(tmp_path):
             make_policy(str(tmp_path / f"{k}.json"), SPHERE)
     with pytest.raises(PolicyError, match="other classes"):
         make_policy("fixed-ring", SPHERE, classes=("cup", "mug"))
+
+
+@pytest.mark.parametrize("value", [1e300, -1e300])
+def test_a_card_of_numbers_that_no_fit_gives_is_refused(value, tmp_path):
+    """Sums of such values overflow, and the policy would choose a view by NaN."""
+    about = json.loads(bundled_policies()["class-table"].read_text())
+    about["table"]["values"][0][0][0] = value
+    (tmp_path / "mine.json").write_text(json.dumps(about))
+    with pytest.raises(PolicyError, match=r"mine\.json: its table.values holds -?1e"):
+        make_policy(str(tmp_path / "mine.json"), SPHERE)

@@ -13,6 +13,7 @@ from nextview.geometry.viewsphere import Viewpoints, ViewSphere
 from nextview.policies.base import Policy, Scope
 from nextview.policies.gain import GainTable, read_gain
 from nextview.policies.learned_tables import ClassTable, FixedRing, FixedSequence
+from nextview.recognition.model_card import check_numbers
 
 BUNDLED_POLICIES = Path(__file__).parent / "bundled"
 OptionalHash = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")]
@@ -128,6 +129,7 @@ def write_policy_card(path: Path, card: PolicyCard, overwrite: bool = False) -> 
 def read_policy_card(path: Path) -> PolicyCard:
     """Read a card."""
     card = read_record(path, PolicyCard, "a policy card", PolicyError)
+    check_numbers(path, card, PolicyError)
     if len(set(card.classes)) < len(card.classes):
         raise PolicyError(f"{path}: not a policy card (two classes have the same name)")
     return card

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec.structs import replace
 
-from nextview.errors import ModelError
+from nextview.errors import ModelError, NextviewError
 from nextview.files import (
     LARGEST_RECORD,
     HashText,
@@ -334,7 +334,7 @@ def read_card(path: Path) -> ModelCard:
     """
     path = Path(path)
     card = read_record(path, ModelCard, "a model card")
-    _check_numbers(path, card)
+    check_numbers(path, card, ModelError)
     weights = (
         path.with_suffix(".onnx")
         if card.memory is None
@@ -345,8 +345,14 @@ def read_card(path: Path) -> ModelCard:
     return replace(card, path=weights)
 
 
-def _check_numbers(path: Path, card: ModelCard) -> None:
-    """See that no number of a card is beyond what any fit gives: sums of such ones overflow."""
+def check_numbers(path: Path, card: Any, error: type[NextviewError]) -> None:
+    """See that no number of a card is beyond what any fit gives: sums of such ones overflow.
+
+    Args:
+        path: of the card, for the sentence.
+        card: a record of a model or of a policy.
+        error: kind of error that is raised.
+    """
     left: list[tuple[str, Any]] = [("", msgspec.to_builtins(card))]
     while left:
         name, value = left.pop()
@@ -355,7 +361,7 @@ def _check_numbers(path: Path, card: ModelCard) -> None:
         elif isinstance(value, list | tuple):
             left += [(name, item) for item in value]
         elif isinstance(value, int | float) and abs(value) > LARGEST_CARD_NUMBER:
-            raise ModelError(
+            raise error(
                 f"{path}: its {name} holds {value:g}, and {LARGEST_CARD_NUMBER:g} is most"
             )
 

@@ -26,6 +26,8 @@ AZIMUTHS = 16  # remembered views on a ring: the azimuth bins of a memory
 THING_PICTURE = 64  # side of the picture of a thing, pixels
 # of a thing, metres; nothing as large is looked at from around
 LARGEST_THING_RADIUS = 1e4
+# in the file of a memory, of a thing whose unit of length is not known: NaN would be damage
+NO_RADIUS = 0.0
 LARGEST_LOGIT = 700.0  # that a head can say: the exponential of more is no number
 
 
@@ -165,6 +167,11 @@ class Memory:
         arrays |= {
             name: arrays[name].astype(np.float16) for name in ("views", "held_out")
         }
+        arrays["radii"] = np.where(
+            np.isnan(self.radii),
+            self.radii.dtype.type(NO_RADIUS),
+            self.radii,
+        )
         content = save(arrays)
         with new_file(path, overwrite) as part:
             part.write_bytes(content)
@@ -203,9 +210,24 @@ def read_memory(path: Path, sha256: str) -> Memory:
         raise ModelError(f"{where} (it holds no {missing[0]})")
 
     try:
+        arrays["radii"] = _radii_of(arrays["radii"])
         return Memory(**arrays, surfaces=StoredSurfaces(**stored))
     except ModelError as error:
         raise ModelError(f"{where} ({error})") from None
+
+
+def _radii_of(stored: Floats) -> Floats:
+    """The radii of a file, (T,); NaN where they are not known.
+
+    Raises:
+        ModelError: they are no numbers.
+    """
+    check_array("its radii", stored, np.floating, (None,), finite=False)
+    if np.isnan(stored).any():
+        raise ModelError(
+            "its radii are not all numbers: teach it again with nextview learn"
+        )
+    return np.where(stored == NO_RADIUS, stored.dtype.type(np.nan), stored)
 
 
 def open_memory(model: str | Path) -> tuple[ModelCard, Memory]:

@@ -57,6 +57,26 @@ class StoredSurfaces:
         limits = np.repeat(self.counts[:, 0], self.counts[:, 1])
         if (self.faces >= limits[:, None]).any():
             raise ModelError("its faces name vertices that are not there")
+        for thing in np.flatnonzero(self.counts[:, 0]):
+            self._check_surface(thing)
+
+    def _check_surface(self, thing: int) -> None:
+        """See that a surface fills its box and has an area: else nothing can be aligned with it."""
+        places, faces = self._of(thing)
+        extents = self.boxes[thing, 1]
+        steps = np.where(extents > 0, BOX_STEPS, 0)
+        if (places.min(0) != 0).any() or (places.max(0) != steps).any():
+            raise ModelError("its places do not fill the boxes of their things")
+        corners = (places * extents)[faces]
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        if not across.any():
+            raise ModelError("its faces have no area")
+
+    def _of(self, thing: int) -> tuple[NDArray[np.uint16], NDArray[np.unsignedinteger]]:
+        """The places and the faces of a thing."""
+        vertices, faces = self.counts[thing].tolist()
+        vertex, face = self.counts[:thing].sum(0).tolist()
+        return self.places[vertex : vertex + vertices], self.faces[face : face + faces]
 
     @classmethod
     def of(cls, surfaces: Sequence[Surface | None]) -> "StoredSurfaces":
@@ -110,17 +130,15 @@ class StoredSurfaces:
         Returns:
             Its surface; None if its geometry is not known.
         """
-        vertices, faces = self.counts[thing].tolist()
-        if not vertices:
+        places, faces = self._of(thing)
+        if not len(places):
             return None
 
-        vertex, face = self.counts[:thing].sum(0).tolist()
         low, extents = self.boxes[thing]
-        shares = self.places[vertex : vertex + vertices] / BOX_STEPS
         return Surface(
             name,
-            (low + shares * extents).astype(np.float32),
-            self.faces[face : face + faces].astype(np.int32),
+            (low + places / BOX_STEPS * extents).astype(np.float32),
+            faces.astype(np.int32),
         )
 
 
