@@ -288,6 +288,12 @@ def test_a_file_is_no_folder_of_things(tmp_path):
         match=r"cup\.ply: is a file, .* the folder .*: \S+$",
     ):
         find_things(mesh)
+    with pytest.raises(DatasetError, match=r"jar\.ply: there is no such file$"):
+        find_things(tmp_path / "jar.ply")
+    with pytest.raises(DatasetError, match=r"jars: there is no such folder$"):
+        find_things(tmp_path / "jars")
+    with pytest.raises(DatasetError, match=r"cup\.ply: is a file, and a folder"):
+        list_dataset(mesh)
 
 
 def test_a_dataset_without_meshes_is_refused_and_says_what_it_holds(tmp_path, caplog):

@@ -597,6 +597,81 @@ OF_TOOLS = {
         ),
         0.001,
     ),
+    "depth_in_colour.json": (
+        json.dumps(
+            {
+                "fx": 910.0,
+                "fy": 910.0,
+                "ppx": 640.0,
+                "ppy": 360.0,
+                "width": 1280,
+                "height": 720,
+                "depth": {"K": MATRIX, "width": 640, "height": 480},
+                "depth_scale": 0.001,
+            }
+        ),
+        0.001,
+    ),
+    "colour_with_a_scale.json": (
+        json.dumps(
+            {
+                "k": MATRIX,
+                "width": 640,
+                "height": 480,
+                "depth": {"scale": 7},
+                "depth_scale": 0.001,
+            }
+        ),
+        0.001,
+    ),
+    "open3d_parameters.json": (
+        json.dumps(
+            {
+                "class_name": "PinholeCameraParameters",
+                "extrinsic": np.eye(4).ravel().tolist(),
+                "intrinsic": {
+                    "width": 640,
+                    "height": 480,
+                    "intrinsic_matrix": BY_COLUMNS,
+                },
+                "version_major": 1,
+            }
+        ),
+        None,
+    ),
+    "part_of_the_sensor.json": (
+        json.dumps(
+            {
+                "fx": 615.5,
+                "fy": 616.5,
+                "cx": 419.25,
+                "cy": 288.75,
+                "x_offset": 100,
+                "y_offset": 50,
+                "width": 640,
+                "height": 480,
+            }
+        ),
+        None,
+    ),
+    "roi.yaml": (
+        "height: 600\nwidth: 800\nbinning_x: 0\nk: [615.5, 0, 419.25, 0, 616.5, 288.75, 0, 0, 1]\n"
+        "roi: {x_offset: 100, y_offset: 50, height: 480, width: 640, do_rectify: false}\n",
+        None,
+    ),
+    "whole_roi.yaml": (
+        f"height: 480\nwidth: 640\nk: {MATRIX}\n"
+        "roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}\n",
+        None,
+    ),
+    "opencv.yaml": (
+        "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\n"
+        "camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+        "   data: [ 6.155e+02, 0., 3.1925e+02, 0., 6.165e+02,\n       2.3875e+02, 0., 0., 1. ]\n"
+        "distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n"
+        "   data: [ 0., 0., 0., 0., 0. ]\n",
+        None,
+    ),
     "echo.yaml": (
         "header:\n  stamp: {sec: 1, nanosec: 5}\n  frame_id: optical\nheight: 480\nwidth: 640\n"
         "distortion_model: plumb_bob\nd:\n- 0.0\n- 0.0\nk:\n"
@@ -621,6 +696,36 @@ def test_intrinsics_are_read_as_tools_write_them(name, tmp_path):
     np.testing.assert_allclose(camera.intrinsics, np.reshape(MATRIX, (3, 3)))
     assert camera.size == (640, 480)
     assert camera.scale == (None if scale is None else pytest.approx(scale))
+
+
+ZIVID = """__version__: 5
+CameraIntrinsics:
+  CameraMatrix:
+    CX: 951.5
+    CY: 594.25
+    FX: 1780.5
+    FY: 1781.5
+  Distortion:
+    K1: {k1}
+    K2: 0
+    K3: 0
+    P1: 0
+    P2: 0
+"""
+
+
+def test_intrinsics_of_zivid_are_read_and_its_distortion_is_noticed(tmp_path):
+    (tmp_path / "camera.yml").write_text(ZIVID.format(k1=0))
+    camera = read_camera_file(tmp_path / "camera.yml")
+    np.testing.assert_array_equal(
+        camera.intrinsics,
+        [[1780.5, 0, 951.5], [0, 1781.5, 594.25], [0, 0, 1]],
+    )
+    assert camera.size is None
+    assert camera.scale is None
+    (tmp_path / "camera.yml").write_text(ZIVID.format(k1=-0.27))
+    with pytest.raises(DatasetError, match=r"camera.yml: the camera distorts .*-0.27"):
+        read_camera_file(tmp_path / "camera.yml")
 
 
 @pytest.mark.parametrize(
@@ -718,6 +823,41 @@ def test_what_a_folder_lacks_is_said(what, views, tmp_path):
     spoil(folder)
     with pytest.raises(DatasetError, match=match):
         read_capture(folder)
+
+
+FULL = {"fx": 600, "fy": 600, "cx": 319, "cy": 239, "width": 640, "height": 480}
+
+
+def test_intrinsics_from_a_file_are_of_images_of_that_size(views, tmp_path, capsys):
+    """Through all doors: a folder, one image and a bag, and as an option of both commands."""
+    (tmp_path / "wide.json").write_text(json.dumps(FULL | {"depth_scale": 0.001}))
+    folder = written(tmp_path / "folder", views[:2])
+    bag = recorded(tmp_path / "bag", views[:2])
+    match = r"wide\.json: the intrinsics are of images of 640 x 480 .* has 320 x 240"
+    for path in (folder, folder / "depth/0000.png", bag):
+        with pytest.raises(DatasetError, match=match):
+            read_capture(path, tmp_path / "wide.json")
+        option = ("--intrinsics", str(tmp_path / "wide.json"))
+        for command in ("recognise", "look"):
+            said = refused(capsys, command, str(path), *option)
+            assert "the intrinsics are of images of 640 x 480 pixels" in said
+    half = FULL | {"fx": 300, "fy": 300, "cx": 159.5, "cy": 119.5}
+    half |= {"width": 320, "height": 240}
+    (tmp_path / "half.json").write_text(json.dumps(half))
+    for path in (folder, bag):
+        (frame, _) = read_capture(path, tmp_path / "half.json").frames
+        np.testing.assert_allclose(frame.intrinsics, CAMERA)
+
+
+def test_the_scale_of_a_given_file_counts_before_that_of_the_folder(views, tmp_path):
+    given = {"fx": 300, "fy": 300, "cx": 159.5, "cy": 119.5, "depth_scale": 0.0005}
+    (tmp_path / "mine.json").write_text(json.dumps(given))
+    folder = written(tmp_path / "folder", views[:1])
+    for path in (folder, folder / "depth/0000.png"):
+        (frame,) = read_capture(path, tmp_path / "mine.json").frames
+        assert frame.scale == 0.0005
+        (frame,) = read_capture(path, tmp_path / "mine.json", depth_scale=0.002).frames
+        assert frame.scale == 0.002
 
 
 def test_one_image_with_intrinsics_is_a_capture(views, tmp_path, capsys):

@@ -47,11 +47,13 @@ class CameraFile:
         intrinsics: pinhole matrix, (3, 3) float64, pixels, first pixel's centre at 0.
         size: width and height of its images, pixels, if the file has them.
         scale: metres that one step of its depth images stands for, if the file has it.
+        file: its path; "" of what was given by hand.
     """
 
     intrinsics: Float
     size: tuple[int, int] | None
     scale: float | None
+    file: str = ""
 
 
 def read_camera_file(path: Path) -> CameraFile:
@@ -64,7 +66,8 @@ def read_camera_file(path: Path) -> CameraFile:
         DatasetError: it cannot be read, holds no intrinsics, or those of images that are distorted.
     """
     if path.suffix.lower() == ".txt":
-        return CameraFile(read_table(path, "the pinhole matrix", 3), None, None)
+        matrix = read_table(path, "the pinhole matrix", 3)
+        return CameraFile(matrix, None, None, str(path))
     content = _content(path)
     camera = _depth_camera(content)
     if camera is None:
@@ -90,16 +93,15 @@ def read_camera_file(path: Path) -> CameraFile:
             f"{path}: the camera distorts (coefficients {distortion.tolist()}): undistort its"
             " images first, and give the intrinsics of those"
         )
-    return CameraFile(intrinsics, size, scale)
+    return CameraFile(intrinsics, size, scale, str(path))
 
 
-def check_size(camera: CameraFile, depth: DepthImage, where: str) -> None:
+def check_size(camera: CameraFile, depth: DepthImage) -> None:
     """Refuse intrinsics of images of another size.
 
     Args:
         camera: what a file says.
         depth: an image that is taken for one of that camera.
-        where: beginning of the sentence of the error.
 
     Raises:
         DatasetError: the file is of images of another size.
@@ -108,7 +110,7 @@ def check_size(camera: CameraFile, depth: DepthImage, where: str) -> None:
         wanted = "{} x {}".format(*camera.size)
         there = "{} x {}".format(*depth.size)
         raise DatasetError(
-            f"{where}: the intrinsics are of images of {wanted} pixels, and {depth} has {there}:"
+            f"{camera.file}: the intrinsics are of images of {wanted} pixels, and {depth} has {there}:"
             " are they those of the colour camera, or of another resolution?"
         )
 

@@ -94,7 +94,7 @@ def read_depth_folder(
         depth = DepthFile(path)
         if path.stem not in poses:
             continue
-        check_size(camera, depth, str(folder))
+        check_size(camera, depth)
         mask = _beside(folder, MASKS, path.stem)
         colour = _beside(folder, COLOUR_FOLDERS, path.stem)
         if colour is not None and not _same_size(colour, depth):

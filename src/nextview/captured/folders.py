@@ -120,7 +120,7 @@ def read_capture(
     camera, said = _given_camera(path, how.intrinsics)
     views = FOLDER_LAYOUTS[layout](path, camera, how)
     if camera is not None and camera.size is not None:
-        _check_sizes(camera, views, str(how.intrinsics))
+        _check_sizes(camera, views)
     if not views.frames:
         raise DatasetError(
             next(iter(views.unreadable.values()), f"{path}: no image shows the object")
@@ -140,7 +140,7 @@ def read_capture(
     )
 
 
-def _check_sizes(camera: CameraFile, views: LayoutViews, where: str) -> None:
+def _check_sizes(camera: CameraFile, views: LayoutViews) -> None:
     """See that images have the size of their camera's; damaged ones become unreadable."""
     for frame in list(views.frames):
         try:
@@ -149,7 +149,7 @@ def _check_sizes(camera: CameraFile, views: LayoutViews, where: str) -> None:
             views.unreadable[frame.name] = str(error)
             views.frames.remove(frame)
         else:
-            check_size(camera, frame.depth, where)
+            check_size(camera, frame.depth)
 
 
 def is_capture(path: Path) -> bool:

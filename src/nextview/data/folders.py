@@ -235,7 +235,11 @@ def read_folder(
         DatasetError: there is no such folder, or two objects would have one name.
     """
     if not root.is_dir():
-        raise DatasetError(f"{root}: there is no such folder")
+        raise DatasetError(
+            f"{root}: is a file, and a folder of meshes is expected"
+            if root.is_file()
+            else f"{root}: there is no such folder"
+        )
     content = _walk(root, suffixes, skip)
     models, left_out = _best_files(content.files)
     left_out = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -309,21 +310,20 @@ def _cast(
 
 
 class _Triangles:
-    """Vertices and faces as a key. Two are equal if they are the same arrays."""
+    """Vertices and faces as a key. Two are equal if their numbers are."""
 
     def __init__(self, vertices: Float32, faces: NDArray[np.int32]) -> None:
         self.vertices = vertices
         self.faces = faces
+        content = hashlib.blake2b(np.ascontiguousarray(vertices).tobytes())
+        content.update(np.ascontiguousarray(faces).tobytes())
+        self.content = content.digest()
 
     def __hash__(self) -> int:
-        return hash((id(self.vertices), id(self.faces)))
+        return hash(self.content)
 
     def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, _Triangles)
-            and self.vertices is other.vertices
-            and self.faces is other.faces
-        )
+        return isinstance(other, _Triangles) and self.content == other.content
 
 
 @lru_cache(maxsize=256)

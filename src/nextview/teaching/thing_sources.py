@@ -4,7 +4,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from nextview.captured.bag import is_bag
+from nextview.captured.bag import ENDINGS, is_bag
 from nextview.captured.folders import is_capture
 from nextview.captured.turntable import is_turntable
 from nextview.checks import one_line
@@ -75,7 +75,11 @@ def find_things(
             f" {folder.absolute().parent}"
         )
     if not folder.is_dir():
-        raise DatasetError(f"{folder}: there is no such folder")
+        raise DatasetError(
+            f"{folder}: there is no such file"
+            if folder.suffix.lower() in (*FORMATS, *ENDINGS)
+            else f"{folder}: there is no such folder"
+        )
     if not str(folder).isprintable():
         raise DatasetError(
             f"{one_line(str(folder), 200)}: its name cannot be printed; rename it"
