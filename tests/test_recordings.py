@@ -788,6 +788,27 @@ def test_a_wrong_depth_scale_of_a_bag_is_noticed(views, tmp_path):
     assert not left_out
 
 
+@pytest.mark.parametrize(("quarters", "way"), [(1, "left"), (3, "right")])
+def test_depth_images_turned_by_a_quarter_turn_are_named(
+    quarters, way, views, tmp_path
+):
+    """With the intrinsics of the turned images, and with those of the camera as it is."""
+    turned = [(np.rot90(depth, quarters).copy(), pose) for depth, pose in views]
+    own = {"fx": 300, "fy": 300, "cx": 119.5, "cy": 159.5, "width": 240, "height": 320}
+    folder = written(tmp_path / "own", turned, own)
+    match = f"without this mistake.* turned to the {way} by a quarter turn"
+    with pytest.raises(DatasetError, match=match):
+        check_capture(read_capture(folder))
+    first = read_capture(folder).frames[0].read()
+    with pytest.raises(nextview.ObservationError, match=f"turned to the {way}"):
+        nextview.sensing.ObservedObject().add(first)
+
+    whole = own | {"cx": 159.5, "cy": 119.5}
+    folder = written(tmp_path / "whole", turned[:1], whole)
+    with pytest.raises(nextview.ObservationError, match="turned by a quarter turn"):
+        read_capture(folder).frames[0].read()
+
+
 def of_another_size(folder):
     fields = json.loads((folder / "intrinsics.json").read_text()) | {"width": 1280}
     (folder / "intrinsics.json").write_text(json.dumps(fields))

@@ -110,8 +110,8 @@ def check_size(camera: CameraFile, depth: DepthImage) -> None:
         wanted = "{} x {}".format(*camera.size)
         there = "{} x {}".format(*depth.size)
         raise DatasetError(
-            f"{camera.file}: the intrinsics are of images of {wanted} pixels, and {depth} has {there}:"
-            " are they those of the colour camera, or of another resolution?"
+            f"{camera.file}: the intrinsics are of images of {wanted} pixels, and {depth} has"
+            f" {there}: are they those of the colour camera, or of another resolution?"
         )
 
 

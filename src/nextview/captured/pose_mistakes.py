@@ -13,6 +13,7 @@ from nextview.captured.shifted_poses import (
 )
 from nextview.sensing.agreement import Agreement, SurfaceView, compare
 from nextview.sensing.frame import CAMERA_AXES
+from nextview.sensing.planes import QUARTER
 from nextview.types import Float, Index
 
 # points that two frames or more have to share before anything is said
@@ -36,6 +37,8 @@ DEPTH_SCALES = (1000, 100, 10, 5, 4, 2.5, 2, 0.5, 0.4, 0.25, 0.2, 0.1, 0.01, 0.0
 """By which the depth may be too large: the steps of cameras are 1, 0.5, 0.25, 0.2, 0.125 and 0.1
 mm.
 """
+# of a picture that was turned so
+QUARTER_TURNS = {"left": QUARTER, "right": QUARTER.T}
 # that are tried together with another mistake
 COMMON_SCALES = (1000, 0.001, 10, 0.1, 5, 0.2, 4, 0.25)
 
@@ -45,7 +48,7 @@ class PoseMistake:
     """One mistake that captured poses may have.
 
     Attributes:
-        kind: "inverse", "quaternion", "axes", "scale" or "mixed".
+        kind: "inverse", "quaternion", "axes", "turned", "scale" or "mixed".
         sentence: what it looks like, the end of a sentence; empty for a scale, which may be that
             of the translations or of the depth.
         corrected: makes the right poses of the wrong ones, both camera-to-world, (N, 4, 4).
@@ -197,6 +200,10 @@ def _single_mistakes(to_world: bool, unit: float) -> list[PoseMistake]:
         sentence += "y down, z forward)"
         found.append(PoseMistake("axes", sentence, _turned_by(axes)))
 
+    for way, axes in QUARTER_TURNS.items():
+        sentence = f"the depth images are turned to the {way} by a quarter turn"
+        found.append(PoseMistake("turned", sentence, _turned_by(axes)))
+
     for steps, wrong, right in (
         (1, "w, x, y, z", "x, y, z, w"),
         (-1, "x, y, z, w", "w, x, y, z"),
@@ -214,7 +221,11 @@ def _single_mistakes(to_world: bool, unit: float) -> list[PoseMistake]:
 
 def _pairs(single: Sequence[PoseMistake]) -> list[PoseMistake]:
     """Two mistakes at once, of two kinds; of the scales only the commonest."""
-    single = [m for m in single if m.scale == 1 or m.scale in COMMON_SCALES]
+    single = [
+        m
+        for m in single
+        if m.kind != "turned" and (m.scale == 1 or m.scale in COMMON_SCALES)
+    ]
     found = []
     for i, first in enumerate(single):
         for second in single[i + 1 :]:

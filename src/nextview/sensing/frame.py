@@ -345,6 +345,13 @@ def _check_intrinsics(intrinsics: ArrayLike, shape: tuple[int, ...]) -> Float:
         raise ObservationError(
             f"{point} the middle of an image of {sizes}: intrinsics of another resolution"
         )
+    upright = min(abs(height / width / aspect - 1) for aspect in ASPECTS) < 0.01
+    turned = max(abs(2 * k[0, 2] / height - 1), abs(2 * k[1, 2] / width - 1))
+    if upright and turned < 0.08 and abs(across - 1) > 0.2:
+        raise ObservationError(
+            f"{point} the middle of an image of {height} x {width}, and the depth is {width} x"
+            f" {height}: is it turned by a quarter turn?"
+        )
     return k
 
 

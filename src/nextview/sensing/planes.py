@@ -19,6 +19,8 @@ TILT = np.cos(np.radians(12.0))
 STEEPEST_SUPPORT = np.cos(np.radians(15.0))
 # a quarter turn of a camera about its optical axis
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+# radians by which a plane may be less level by one mistake than by another that explains it as well
+AS_LEVEL = np.radians(3.0)
 # share of what is seen that lies on a support plane, at least; more if gravity is not known
 LEAST_SUPPORT = 0.04
 LEAST_ALONE = 0.15
@@ -381,22 +383,25 @@ def mistake_in_pose(plane: Plane, pose: Float, up: Float) -> str | None:
         up: direction against gravity, (3,).
 
     Returns:
-        The mistake, in words; None if there is none.
+        The mistake, in words, or all that explain the plane as well; None if there is none.
     """
     if plane.normal @ up > TILT or abs(plane.normal @ up) < np.sqrt(1 - TILT**2):
         return None
 
     rotation = pose[:3, :3]
     mistakes = {
-        "the camera's axes are OpenGL's?": rotation @ CAMERA_AXES["opengl"],
-        "the camera's axes are those of a ROS body?": rotation @ CAMERA_AXES["ros"],
-        "the pose is inverse, world-to-camera?": rotation.T,
-        "the picture is turned to the left?": rotation @ QUARTER,
-        "the picture is turned to the right?": rotation @ QUARTER.T,
-        "the picture stands on its head?": rotation @ QUARTER @ QUARTER,
+        "the camera's axes are OpenGL's": rotation @ CAMERA_AXES["opengl"],
+        "the camera's axes are those of a ROS body": rotation @ CAMERA_AXES["ros"],
+        "the pose is inverse, world-to-camera": rotation.T,
+        "the picture is turned to the left": rotation @ QUARTER,
+        "the picture is turned to the right": rotation @ QUARTER.T,
+        "the picture stands on its head": rotation @ QUARTER @ QUARTER,
     }
     seen = rotation.T @ plane.normal
     rises = {mistake: float(right @ seen @ up) for mistake, right in mistakes.items()}
-    likeliest = max(rises, key=lambda mistake: rises[mistake])
-
-    return likeliest if rises[likeliest] > TILT else None
+    most = max(rises.values())
+    if most <= TILT:
+        return None
+    # one frame may be explained by several: which of them it is, a level plane does not tell
+    least = np.cos(np.arccos(min(most, 1.0)) + AS_LEVEL)
+    return ", or ".join(name for name, rise in rises.items() if rise >= least) + "?"

@@ -57,7 +57,7 @@ class StoredSurfaces:
         limits = np.repeat(self.counts[:, 0], self.counts[:, 1])
         if (self.faces >= limits[:, None]).any():
             raise ModelError("its faces name vertices that are not there")
-        for thing in np.flatnonzero(self.counts[:, 0]):
+        for thing in np.flatnonzero(self.counts[:, 0]).tolist():
             self._check_surface(thing)
 
     def _check_surface(self, thing: int) -> None:
