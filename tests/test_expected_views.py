@@ -504,6 +504,17 @@ def test_a_turn_that_nothing_can_tell_is_no_error_of_the_surface():
     assert surface_errors(box, np.eye(3), turned) > 0.003
 
 
+@pytest.mark.parametrize("left", [0.0, -1e-22])
+def test_what_is_known_exactly_has_an_error_and_a_logarithm(left):
+    """A covariance without a direction, which rounding may make negative there."""
+    flat = np.diag([0, 0, 0, left, left, left])
+    error = surface_errors(ball(), np.eye(3), flat)
+    assert 0 < error < 1e-5
+    assert np.isfinite(
+        np.log(surface_errors(ball(), np.eye(3), np.stack([flat] * 2)))
+    ).all()
+
+
 def test_the_pose_becomes_sharper_from_where_more_is_told():
     loose = np.diag([1e-4, 1e-4, 1e-2, 1e-6, 1e-6, 1e-6])  # the azimuth is hardly known
     surfaces = surfaces_of(box_mesh(BODY, HANDLE))

@@ -18,6 +18,8 @@ from nextview.things.registration import (
 from nextview.things.surface import Surface
 from nextview.types import Float, Float32, Mask
 
+LEAST_SURFACE_ERROR = 1e-6  # metres: nearer no camera knows where a surface is
+
 
 @lru_cache(maxsize=256)
 def _normal_displacements(surface: Surface) -> Float:
@@ -44,7 +46,9 @@ def surface_errors(surface: Surface, rotation: Float, covariances: Float) -> Flo
     """
     turned = np.kron(np.eye(2), rotation)
     displaced = turned @ _normal_displacements(surface) @ turned.T
-    return np.sqrt(np.einsum("ij,...ji->...", displaced, covariances))
+    variances = np.einsum("ij,...ji->...", displaced, covariances)
+    # rounding makes the variance of what is known exactly negative, and a zero has no logarithm
+    return np.sqrt(np.maximum(variances, LEAST_SURFACE_ERROR**2))
 
 
 def sharper_poses(
