@@ -63,7 +63,7 @@ NOT_THERE = "announced, and none is there"
 LARGEST_METADATA = 2**24  # bytes of metadata.yaml
 # bytes of a chunk of a file, or of one message, once they are decompressed: recorders fill chunks
 # of a few megabytes, and one image or cloud of a message takes less than a hundred
-LARGEST_CHUNK = 2**28
+LARGEST_BAG_CHUNK = 2**28
 # nanoseconds before a moment in which its last image is looked for; then twice as many
 FIRST_REACH = 1_000_000_000
 # which image of a camera that stands still: seconds since the bag's first message
@@ -341,11 +341,11 @@ def _bound_chunks() -> None:
     DECOMPRESSORS["lz4"] = _bounded_lz4
 
 
-def _bounded_zstd(data: bytes, size: int = LARGEST_CHUNK) -> bytes:
+def _bounded_zstd(data: bytes, size: int = LARGEST_BAG_CHUNK) -> bytes:
     """Decompress what says that it holds so many bytes, and no more of it.
 
     Raises:
-        ValueError: it holds more, or claims more than ``LARGEST_CHUNK``.
+        ValueError: it holds more, or claims more than ``LARGEST_BAG_CHUNK``.
     """
     with extras():
         from rosbags.rosbag2.storage_mcap import zstd
@@ -367,8 +367,8 @@ def _bounded_lz4(data: bytes, size: int) -> bytes:
 
 def _check_chunk(length: int, claimed: int) -> None:
     """Refuse a chunk of some bytes; a ValueError."""
-    if claimed > LARGEST_CHUNK:
-        raise ValueError(f"a chunk of {claimed} bytes, {LARGEST_CHUNK} are most")
+    if claimed > LARGEST_BAG_CHUNK:
+        raise ValueError(f"a chunk of {claimed} bytes, {LARGEST_BAG_CHUNK} are most")
     if length > claimed:
         raise ValueError(f"a chunk of {claimed} bytes holds more")
 
