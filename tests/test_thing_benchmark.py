@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from nextview.benchmark import thing_benchmark as stage
 from nextview.benchmark.confusable import Alikeness, how_alike
@@ -25,8 +26,9 @@ from nextview.benchmark.thing_replay import EpisodeRuns, ThingRun
 from nextview.benchmark.thing_results import latex, markdown
 from nextview.benchmark.thing_tables import Compared, summarise_things
 from nextview.cli.main import main
-from nextview.errors import NextviewError, ResultsError, UsageError
-from nextview.geometry.mesh import load_mesh
+from nextview.errors import DatasetError, NextviewError, ResultsError, UsageError
+from nextview.files import read_record
+from nextview.geometry.mesh import UNITS, load_mesh
 from nextview.policies.base import EpisodeState
 from nextview.recognition.evidence import Evidence
 from nextview.simulation.sensed_camera import SensedCamera
@@ -166,6 +168,72 @@ def test_a_view_is_sensed_once_and_another_policy_uses_what_is_there(
         "policy == @own and measure == 'travel, rad' and views == 2"
     )
     assert travel["value"].iloc[0] == pytest.approx(away.mean(), abs=away.std() + 1e-9)
+
+
+def scaled(scans, unit, folder):
+    """The same things saved in another unit."""
+    folder.mkdir()
+    for scan in scans.glob("*.ply"):
+        mesh = trimesh.load(scan, process=False)
+        mesh.apply_scale(1 / UNITS[unit])
+        mesh.export(folder / scan.name)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def in_metres(knobs, settings, shared):
+    """Runs of a policy that knows the truth: the pose counts in its choice, and is measured."""
+    known = replace(settings, policies=("random", "ceiling"), sensor="none")
+    folder = shared(
+        "knobs_in_metres",
+        lambda f: benchmark_things(knobs, f / "out", known, workers=0),
+    )
+    return known, folder / "out"
+
+
+@pytest.mark.parametrize("unit", ["mm", "cm", "inch"])
+def test_scans_in_another_unit_are_named_and_found_as_those_in_metres(
+    knobs,
+    in_metres,
+    unit,
+    tmp_path,
+):
+    settings, expected = in_metres
+    scans = scaled(knobs, unit, tmp_path / unit)
+    out = tmp_path / "out"
+    benchmark_things(scans, out, replace(settings, unit=unit), workers=0)
+    files = sorted((expected / "runs").iterdir())
+    assert len(files) == 3
+    for file in files:
+        there, here = (
+            read_record(one, EpisodeRuns, "runs", ResultsError).runs
+            for one in (file, out / "runs" / file.name)
+        )
+        for policy in settings.policies:
+            then, now = there[policy][0], here[policy][0]
+            assert now.views == then.views
+            assert now.right == then.right
+            assert now.confidence == pytest.approx(then.confidence, abs=1e-3)
+            assert now.pose_error == pytest.approx(then.pose_error, abs=0.5)
+            # By 500 points that lie some millimetres apart, it is found where it stands.
+            assert max(error for error in now.pose_error if error is not None) < 6
+
+
+def test_a_scan_that_is_not_what_was_taught_is_refused_with_the_cure(
+    knobs,
+    settings,
+    tmp_path,
+):
+    scans = scaled(knobs, "cm", tmp_path / "cm")
+    with pytest.raises(DatasetError, match=r"is not in m, .* give --unit cm"):
+        benchmark_things(scans, tmp_path / "out", settings, workers=0)
+
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    for scan in knobs.glob("*.ply"):
+        trimesh.load(scan).apply_translation((0, 0.1, 0)).export(moved / scan.name)
+    with pytest.raises(DatasetError, match="was taught from: it lies elsewhere"):
+        benchmark_things(moved, tmp_path / "out2", settings, workers=0)
 
 
 def test_what_is_kept_is_what_the_recogniser_says_of_the_same_views(
