@@ -63,9 +63,7 @@ def test_a_box_rests_on_its_faces_and_keeps_its_size():
         turned = rotated(brick, rotation)
         assert turned.unit == "cm"
         assert turned.metres == turned.radius
-        assert turned.metres == pytest.approx(
-            np.sqrt(14) / 2 * UNITS["cm"]
-        )
+        assert turned.metres == pytest.approx(np.sqrt(14) / 2 * UNITS["cm"])
 
 
 @pytest.mark.parametrize(
