@@ -83,7 +83,7 @@ SCANS = {
         False,
         "3 parts",
     ),
-    "a plate": ((thing(), disc(0.2)), False, "2 parts"),
+    "a plate": ((thing(), disc(0.22)), False, "2 parts"),
     "a large plate": (
         (thing(), disc(0.4, 0.02), thing(0.001).apply_translation((0.3, 0, 0))),
         False,
