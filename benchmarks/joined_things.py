@@ -4,11 +4,12 @@
 
 Each argument is the folder of a run. Its name is that of the set in the table. Every test of every
 run, of all things and of the confusable half, counts in Holm's correction. A p-value in the table
-is the corrected one; ceilings are not tested. "Fewer" is by how much fewer views than random a
-policy takes until it is confident: of all views, and of those after the first, where all begin
-alike.
+is the corrected one; ceilings are not tested. "Fewer" is by how much fewer views than the reference
+(random by default) a policy takes until it is confident: of all views, and of those after the
+first, where all begin alike.
 """
 
+import json
 from pathlib import Path
 
 from nextview.cli.exit_status import orderly_end, require
@@ -20,6 +21,7 @@ import pandas as pd
 import tyro
 
 from nextview.benchmark.statistics import holm
+from nextview.benchmark.thing_results import RECORD
 from nextview.benchmark.thing_tables import ALL, FAR_POSE, POSE_AFTER
 from nextview.errors import UsageError
 
@@ -45,11 +47,16 @@ def read_runs(runs: list[Path]) -> tuple[pd.DataFrame, pd.DataFrame]:
         runs: folders of results.
 
     Raises:
-        UsageError: a folder holds no tables.
+        UsageError: a folder holds no tables, or they are compared with different policies.
     """
     for run in runs:
         if not (run / "tests.csv").is_file():
             raise UsageError(f"{run}: holds no results of nextview benchmark-things")
+        if reference_of(run) != reference_of(runs[0]):
+            raise UsageError(
+                f"{run}: is compared with {reference_of(run)}, and {runs[0]} with"
+                f" {reference_of(runs[0])}; run one again with --reference"
+            )
     measures = [pd.read_csv(run / "measures.csv").assign(set=run.name) for run in runs]
     tests = pd.concat(
         [pd.read_csv(run / "tests.csv").assign(set=run.name) for run in runs]
@@ -58,8 +65,13 @@ def read_runs(runs: list[Path]) -> tuple[pd.DataFrame, pd.DataFrame]:
     return pd.concat(measures), tests
 
 
+def reference_of(run: Path) -> str:
+    """The policy that those of a run are compared with."""
+    return str(json.loads((run / RECORD).read_text()).get("reference", "random"))
+
+
 def tested(row: pd.Series, times: float, unit: str) -> str:
-    """A difference to random with its interval and corrected p, in words."""
+    """A difference to the reference with its interval and corrected p, in words."""
     low, high = (times * row[end] for end in ("low", "high"))
     return f"{times * row['difference']:+.1f}{unit} ({low:+.1f} to {high:+.1f}){corrected(row)}"
 
@@ -74,8 +86,8 @@ def row_of(values: pd.DataFrame, tests: pd.DataFrame, reference: float) -> list[
 
     Args:
         values: its measures.
-        tests: its differences to random.
-        reference: views until random is confident.
+        tests: its differences to the reference.
+        reference: views until the reference is confident.
     """
     found = values.set_index(["measure", "views"])["value"]
     right = [found.get(("accuracy", k), np.nan) for k in (1, 2, 3, 5)]
@@ -110,9 +122,9 @@ def main(runs: tyro.conf.Positional[list[Path]], things: str = ALL) -> None:
     for run in runs:
         own = measures[(measures["set"] == run.name) & (measures["things"] == things)]
         apart = tests[(tests["set"] == run.name) & (tests["things"] == things)]
-        reference = own[(own["policy"] == "random") & (own["measure"] == SURE)][
-            "value"
-        ].item()
+        reference = own[
+            (own["policy"] == reference_of(run)) & (own["measure"] == SURE)
+        ]["value"].item()
         for policy in own["policy"].unique():
             cells = row_of(
                 own[own["policy"] == policy],

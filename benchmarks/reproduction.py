@@ -134,7 +134,7 @@ def page(predictions: Path, samples: int = 2000) -> str:
         (
             f"{len(table)} objects, {len(table.classes)} classes, 10 first views each, at most 5"
             " views; the same first views for every policy and threshold. In brackets: 95 %"
-            " bootstrap intervals over objects. p-values are of the paired bootstrap, after one"
+            " bootstrap intervals over objects. p-values are by sign flips over objects, after one"
             " Holm correction over all that is compared with the same policy: every other one,"
             " published, learned or oracle, at every threshold, as in `nextview benchmark`."
             " Differences of accuracy are in percentage points."

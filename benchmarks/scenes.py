@@ -36,7 +36,7 @@ from matplotlib.ticker import PercentFormatter
 
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.replay import Grid, make_specs, run_grid
-from nextview.benchmark.statistics import bootstrap_p, holm, interval, resample
+from nextview.benchmark.statistics import holm, interval, resample, sign_flip_p
 from nextview.benchmark.summary import grid_mean, levels_of
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
@@ -238,11 +238,7 @@ def compared(
             against = (of[name].right - of[other].right)[:, np.array(COUNTS) - 1]
             mean = against.mean(0)
             drawn = weights @ against
-            p = (
-                bootstrap_p(mean, drawn)
-                if name == ours
-                else np.full(len(COUNTS), np.nan)
-            )
+            p = sign_flip_p(against) if name == ours else np.full(len(COUNTS), np.nan)
             rows += [
                 (level, name, other, *row)
                 for row in zip(COUNTS, mean, *interval(drawn), p, strict=True)

@@ -42,6 +42,7 @@ from rich.progress import track
 from scipy.spatial import cKDTree
 
 import nextview
+from nextview.benchmark.statistics import sign_flip_p
 from nextview.errors import ObservationError, UsageError
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.resting import resting_poses
@@ -65,7 +66,6 @@ STRANGER_RADII = (0.04, 0.10)  # metres
 STRANGER = "stranger"
 POINTS = 1000  # of a scan, for ADD-S
 CLOSE = 0.1  # of the diameter
-FLIPS = 20_000  # of the signs of differences
 
 
 @dataclass
@@ -333,9 +333,7 @@ def _differences(values: dict[tuple[By, int], int], what: str) -> list[str]:
         if not both:
             continue
         difference = np.array([values["target", k] - values[other, k] for k in both])
-        signs = np.random.default_rng(0).choice([-1, 1], (FLIPS, len(both)))
-        as_much = np.abs((signs * difference).sum(1)) >= abs(int(difference.sum()))
-        p_value = (1 + as_much.sum()) / (1 + FLIPS)
+        p_value = sign_flip_p(difference[:, None])[0]
         said.append(
             f"target less {other}: {difference.mean():+.2f} {what}, {len(both)} tables,"
             f" p = {p_value:.4f}"

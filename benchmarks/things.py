@@ -12,7 +12,7 @@ The second store shows the same views with other errors of the sensor.
 
 Each predictions file is a draw of the sensor's noise: all are judged. Writes things.md (the table)
 and things.csv (every number) into the folder. The bootstrap is over things, whose runs and draws
-belong together; p is McNemar's test over things, with one Holm correction. ``foresight`` sees what
+belong together; p is by sign flips over things, with one Holm correction. ``foresight`` sees what
 each view will say, its noise too. The fair ceiling knows the thing and its azimuth, but of the
 noise only other draws: it goes where these believe in the truth most.
 """
@@ -29,7 +29,7 @@ import tyro
 from numpy.typing import NDArray
 
 from nextview.benchmark.replay import Trajectories, make_specs, replay, replay_policy
-from nextview.benchmark.statistics import holm, interval, mcnemar, resample
+from nextview.benchmark.statistics import holm, interval, resample, sign_flip_p
 from nextview.checks import extras
 from nextview.cli.exit_status import orderly_end
 from nextview.data.metrics import ratio
@@ -235,7 +235,7 @@ def measured(
                 "travel": ends.mean(),
                 "lead_low": low[1],
                 "lead_high": high[1],
-                "p": mcnemar(hits, random) if tested else np.nan,
+                "p": sign_flip_p(each[:, 1:])[0] if tested else np.nan,
                 "of_ceiling": lead / gap if gap > 0 and k > 1 else np.nan,
             }
         )

@@ -90,7 +90,7 @@ def front(
     """Accuracy against travel, a panel for each number of views; what takes the truth is only named
     above it.
 
-    A line joins the travel weights of one policy. Dots are filled where McNemar's p against random,
+    A line joins the travel weights of one policy. Dots are filled where p against random,
     corrected, is under 0.05.
     """
     found = by_key(table)
@@ -175,7 +175,7 @@ def front(
             )
         panels[0].set_ylabel("accuracy")
         filled = (
-            "filled: differs from random by McNemar's test, corrected for all comparisons (p <"
+            "filled: differs from random by sign flips, corrected for all comparisons (p <"
             " 0.05)"
         )
         figure.supxlabel(filled, fontsize=8, x=0.99, ha="right")

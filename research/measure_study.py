@@ -17,9 +17,9 @@ accuracy and travel of the policy that climbs its true map in the local window, 
 of views. That policy sees what no robot can, and so is an oracle by name; what it does not see is
 the class: it goes to the valley for those that it believes in at that moment and for which the
 valley gained on the validation objects. Other policies can stand beside, under the names that
-nextview benchmark has for them. Intervals are 95 % bootstrap intervals over objects; p is McNemar's
-test against random choice in the window, over objects, corrected by Holm's method for all measures,
-policies and numbers of views together.
+nextview benchmark has for them. Intervals are 95 % bootstrap intervals over objects; p is by
+sign flips against random choice in the window, over objects, corrected by Holm's method for all
+measures, policies and numbers of views together.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from scipy.stats import rankdata
 
 from nextview.benchmark.page import write_figures
 from nextview.benchmark.replay import make_specs, replay
-from nextview.benchmark.statistics import holm, interval, mcnemar, resample
+from nextview.benchmark.statistics import holm, interval, resample, sign_flip_p
 from nextview.benchmark.true_maps import true_map, true_measure
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import console, follow, track
@@ -217,8 +217,9 @@ def study(
                 },
             )
             if name != RANDOM:
-                note(name, {f"over_random_{k}": accuracy - right[RANDOM, k].mean(0)})
-                rows[-1] = (*rows[-1][:-1], mcnemar(right[name, k], right[RANDOM, k]))
+                over = accuracy - right[RANDOM, k].mean(0)
+                note(name, {f"over_random_{k}": over})
+                rows[-1] = (*rows[-1][:-1], float(sign_flip_p(over[:, None])[0]))
         yield done
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from pipeline import refused, write_off
 from scipy.special import logsumexp
 
@@ -25,7 +26,9 @@ from nextview.recognition.belief import Calibration, Stopping, log_evidence_of, 
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
+from nextview.simulation.sensor import SENSORS
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
 from nextview.teaching.learn import learn
 from nextview.things.approximate import NearestViews
 from nextview.things.memory import AZIMUTHS, RINGS, by_ring, open_memory, similarities
@@ -131,7 +134,8 @@ def test_adding_leaves_what_is_known_as_it_was_and_removing_takes_it_away(
         open_memory(card.card_path)[1].held_out,
         before.held_out,
     )
-    assert "is all it knows" in learn(models, models, remove=THINGS[1:]).notes[0]
+    alone = learn(models, models, remove=THINGS[1:]).notes[0]
+    assert f"whatever is shown is {THINGS[0]} or unknown" in alone
     with pytest.raises(UsageError, match="knows nothing called 'mug'"):
         learn(models, models, remove=("mug",))
     with pytest.raises(UsageError, match=r"chair is known already"):
@@ -215,6 +219,32 @@ def test_what_is_wrong_with_a_folder_is_one_sentence_and_nothing_is_lost(
     assert any("chair and seat look the same" in note for note in found.notes)
     assert [phrase for phrase in found.left_out if "broken.off" in phrase]
     assert "broken" in str(found)
+
+
+def test_what_lies_too_flat_for_depth_is_told_when_it_is_taught(tmp_path):
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    sizes = {"card": (85.6, 54, 0.8), "tile": (60, 60, 20)}
+    for name, sides in sizes.items():
+        trimesh.creation.box(sides).export(scans / f"{name}.ply")
+    found = learn(scans, tmp_path / "mine", unit="mm", workers=0)
+    told = [note for note in found.notes if "where it lies flat" in note]
+    assert len(told) == 1
+    assert told[0].startswith("card: it is 0.8 mm high where it lies flat")
+    assert told[0] in str(found)
+
+    # What the note says is what a table shows: nothing stands there.
+    system = nextview.load(tmp_path / "mine", threads=1)
+    lies = np.eye(3)[None]
+    for name, count in (("card", 0), ("tile", 1)):
+        mesh = load_mesh(scans / f"{name}.ply", unit="mm")
+        rng = np.random.default_rng(1)
+        table = SimulatedTable.draw([mesh], rng, resting=lambda mesh: lies)
+        camera = TableCamera(table, SENSORS["wrist"], rng)
+        pose = poses_around(np.zeros(1), np.radians(50), 0.5, np.zeros(3))[0]
+        scene = nextview.Scene(system)
+        scene.update(camera.frame(pose))
+        assert len(scene.objects) == count
 
 
 def test_classes_of_several_things_and_one_alone(tmp_path, scans):

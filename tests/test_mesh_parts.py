@@ -16,7 +16,7 @@ from nextview.data.rendering import RenderOptions, render
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, MeshError, UsageError
 from nextview.geometry.mesh import load_mesh, make_mesh, mesh_warnings
-from nextview.geometry.mesh_parts import mesh_doubts
+from nextview.geometry.mesh_parts import mesh_doubts, thickness
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.teaching import thing_views
 
@@ -83,7 +83,7 @@ SCANS = {
         False,
         "3 parts",
     ),
-    "a plate": ((thing(), disc(0.2)), False, "2 parts"),
+    "a plate": ((thing(), disc(0.22)), False, "2 parts"),
     "a large plate": (
         (thing(), disc(0.4, 0.02), thing(0.001).apply_translation((0.3, 0, 0))),
         False,
@@ -119,6 +119,30 @@ def test_what_does_not_belong_to_an_object_is_asked_about(tmp_path, name, kind, 
             r"the largest of its \d parts was taken, \d+% of the surface",
             *mesh_warnings(mesh),
         )
+
+
+def test_a_base_plate_is_asked_about_however_the_scan_is_turned():
+    body = trimesh.creation.cylinder(0.03, 0.12, sections=48)
+    body.apply_translation((0, 0, 0.06))
+    for side, asked in ((0.16, False), (0.32, True)):
+        plate = trimesh.creation.box((side, side, 0.008))
+        plate.apply_translation((0, 0, -0.004))
+        shape = joined(body, plate, connected=True)
+        doubts = []
+        for turn in Rotation.random(30, random_state=0).as_matrix():
+            faces = NOISE.permutation(np.asarray(shape.faces))
+            doubts.append(mesh_doubts(shape.vertices @ turn.T, faces))
+        assert {len(one) for one in doubts} == {int(asked)}
+        assert len(set(doubts)) == 1  # also how many times as large it is
+
+
+@pytest.mark.parametrize("points", [4, 40])
+def test_the_thickness_of_points_is_that_of_the_thinnest_slab(points):
+    cloud = np.random.default_rng(points).normal(size=(points, 2)) * (3, 1)
+    angles = np.linspace(0, np.pi, 20_000)
+    slabs = np.ptp(cloud @ np.stack([np.cos(angles), np.sin(angles)]), axis=0)
+    assert thickness(cloud) == pytest.approx(slabs.min(), rel=1e-3)
+    assert thickness(np.stack([cloud[:, 0], cloud[:, 0]], 1)) == pytest.approx(0)
 
 
 @pytest.mark.parametrize(

@@ -56,14 +56,10 @@ def test_what_a_workflow_runs_is_there(workflow):
         assert set(names.split(",")) <= set(extras), names
 
 
-def test_ci_tries_every_python_that_is_promised():
+def test_ci_tries_the_oldest_python_that_is_promised():
     promised = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
         "requires-python"
     ]
     ci = (ROOT / ".github/workflows/ci.yml").read_text(encoding="utf-8")
-    pythons = re.search(r"python: \[(.*?)\]", ci)
-    assert pythons
-    tried = re.findall(r"\d+\.\d+", pythons[1])
-    assert f">={tried[0]}" == promised
-    assert len(tried) >= 4
-    assert all(system in ci for system in ("ubuntu", "macos", "windows"))
+    tried = set(re.findall(r'python-version: "(\d+\.\d+)"', ci))
+    assert {f">={version}" for version in tried} == {promised}

@@ -60,9 +60,10 @@ def test_a_box_rests_on_its_faces_and_keeps_its_size():
     )
     for rotation in found:
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
-        assert rotated(brick, rotation).metres == pytest.approx(
-            np.sqrt(14) / 2 * UNITS["cm"]
-        )
+        turned = rotated(brick, rotation)
+        assert turned.unit == "cm"
+        assert turned.metres == turned.radius
+        assert turned.metres == pytest.approx(np.sqrt(14) / 2 * UNITS["cm"])
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,6 @@ from nextview.benchmark import statistics
 from nextview.benchmark.entries import default_entries
 from nextview.benchmark.published import ACCURACY, read_table
 from nextview.benchmark.replay import make_specs, replay
-from nextview.benchmark.summary import target_weights
 from nextview.data.predictions import Predictions
 from nextview.data.scene_views import SceneSight, scene_intrinsics, scene_views
 from nextview.data.store import ViewStore
@@ -322,14 +321,19 @@ def test_scenes_without_their_store_are_not_taken_for_single_objects(
 
 def test_scenes_around_one_target_are_drawn_together():
     names = ("a@light-0", "b@light-0", "a@heavy-0", "c@heavy-0", "a@heavy-1")
-    weights = target_weights(names, 200, np.random.default_rng(0))
+    families = statistics.target_families(names)
+    weights = statistics.resample_families(families, 200, np.random.default_rng(0))
     for same in (2, 4):
         np.testing.assert_array_equal(weights[:, 0], weights[:, same])
     # as many targets as there are
     np.testing.assert_array_equal(weights[:, [0, 1, 3]].sum(1), 3)
     plain = statistics.resample(5, 200, np.random.default_rng(0))
     np.testing.assert_array_equal(
-        target_weights(tuple("abcde"), 200, np.random.default_rng(0)),
+        statistics.resample_families(
+            statistics.target_families(tuple("abcde")),
+            200,
+            np.random.default_rng(0),
+        ),
         plain,
     )
 

@@ -1,13 +1,17 @@
 """The benchmark of next views of taught things: scans to tables, replays, statistics."""
 
+import json
 import re
 import runpy
 import shutil
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from msgspec.structs import replace as replace_record
 
 from nextview.benchmark import thing_benchmark as stage
 from nextview.benchmark.confusable import Alikeness, how_alike
@@ -25,8 +29,9 @@ from nextview.benchmark.thing_replay import EpisodeRuns, ThingRun
 from nextview.benchmark.thing_results import latex, markdown
 from nextview.benchmark.thing_tables import Compared, summarise_things
 from nextview.cli.main import main
-from nextview.errors import NextviewError, ResultsError, UsageError
-from nextview.geometry.mesh import load_mesh
+from nextview.errors import DatasetError, NextviewError, ResultsError, UsageError
+from nextview.files import read_record
+from nextview.geometry.mesh import UNITS, load_mesh
 from nextview.policies.base import EpisodeState
 from nextview.recognition.evidence import Evidence
 from nextview.simulation.sensed_camera import SensedCamera
@@ -166,6 +171,72 @@ def test_a_view_is_sensed_once_and_another_policy_uses_what_is_there(
         "policy == @own and measure == 'travel, rad' and views == 2"
     )
     assert travel["value"].iloc[0] == pytest.approx(away.mean(), abs=away.std() + 1e-9)
+
+
+def scaled(scans, unit, folder):
+    """The same things saved in another unit."""
+    folder.mkdir()
+    for scan in scans.glob("*.ply"):
+        mesh = trimesh.load(scan, process=False)
+        mesh.apply_scale(1 / UNITS[unit])
+        mesh.export(folder / scan.name)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def in_metres(knobs, settings, shared):
+    """Runs of a policy that knows the truth: the pose counts in its choice, and is measured."""
+    known = replace(settings, policies=("random", "ceiling"), sensor="none")
+    folder = shared(
+        "knobs_in_metres",
+        lambda f: benchmark_things(knobs, f / "out", known, workers=0),
+    )
+    return known, folder / "out"
+
+
+@pytest.mark.parametrize("unit", ["mm", "cm", "inch"])
+def test_scans_in_another_unit_are_named_and_found_as_those_in_metres(
+    knobs,
+    in_metres,
+    unit,
+    tmp_path,
+):
+    settings, expected = in_metres
+    scans = scaled(knobs, unit, tmp_path / unit)
+    out = tmp_path / "out"
+    benchmark_things(scans, out, replace(settings, unit=unit), workers=0)
+    files = sorted((expected / "runs").iterdir())
+    assert len(files) == 3
+    for file in files:
+        there, here = (
+            read_record(one, EpisodeRuns, "runs", ResultsError).runs
+            for one in (file, out / "runs" / file.name)
+        )
+        for policy in settings.policies:
+            then, now = there[policy][0], here[policy][0]
+            assert now.views == then.views
+            assert now.right == then.right
+            assert now.confidence == pytest.approx(then.confidence, abs=1e-3)
+            assert now.pose_error == pytest.approx(then.pose_error, abs=0.5)
+            # By 500 points that lie some millimetres apart, it is found where it stands.
+            assert max(error for error in now.pose_error if error is not None) < 6
+
+
+def test_a_scan_that_is_not_what_was_taught_is_refused_with_the_cure(
+    knobs,
+    settings,
+    tmp_path,
+):
+    scans = scaled(knobs, "cm", tmp_path / "cm")
+    with pytest.raises(DatasetError, match=r"is not in m, .* give --unit cm"):
+        benchmark_things(scans, tmp_path / "out", settings, workers=0)
+
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    for scan in knobs.glob("*.ply"):
+        trimesh.load(scan).apply_translation((0, 0.1, 0)).export(moved / scan.name)
+    with pytest.raises(DatasetError, match="was taught from: it lies elsewhere"):
+        benchmark_things(moved, tmp_path / "out2", settings, workers=0)
 
 
 def test_what_is_kept_is_what_the_recogniser_says_of_the_same_views(
@@ -395,6 +466,105 @@ def test_measures_are_those_of_a_hand_count():
     assert (rows["confusable half", "random"]["accuracy", 2]) == 0
 
 
+def paired(names, pose):
+    """An episode of each name; the policies are equally right, and find it with these errors."""
+    episodes = []
+    for name, (by_random, by_spread) in zip(names, pose, strict=True):
+        runs = {}
+        for policy, error in (("random", by_random), ("spread", by_spread)):
+            (run,) = runs_of(name, [True, True], [0.5, 0.6], [0, 1]).runs["random"]
+            runs[policy] = [replace_record(run, pose_error=[1.0, error])]
+        episodes.append(EpisodeRuns(name, 0, runs))
+    return episodes
+
+
+def test_p_values_of_families_are_those_of_a_brute_force():
+    rng = np.random.default_rng(4)
+    names = tuple(f"{letter}_{k}" for letter in "abcdefgh" for k in range(2))
+    alike = Alikeness(names, names, np.arange(16.0))
+    how = Compared(("random", "spread"), (1, 2), 0.97, True, 100)
+    right = rng.random((16, 2)) < (0.3, 0.9)
+    episodes = [
+        both(
+            name,
+            ([False, bool(a)], [0.5, 0.6], [0, 1]),
+            ([False, bool(b)], [0.5, 0.6], [0, 1]),
+        )
+        for name, (a, b) in zip(names, right, strict=True)
+    ]
+    tests = summarise_things(episodes, alike, how).tests
+    row = tests.query("things == 'all' and measure == 'accuracy'").iloc[0]
+    lead = (right[:, 1].astype(float) - right[:, 0]).reshape(8, 2).sum(1)
+    sums = [abs(np.dot(signs, lead)) for signs in product((1, -1), repeat=8)]
+    assert row["p"] == pytest.approx(np.mean(np.array(sums) >= abs(lead.sum())))
+    assert row["families"] == 8
+
+    pose = rng.gamma(2, 2, (16, 2)) * (2, 1)
+    tests = summarise_things(paired(names, pose), alike, how).tests
+    row = tests.query("things == 'all' and measure == 'pose error, 95 %'").iloc[0]
+
+    def far(errors):
+        ordered = np.sort(errors)
+        return ordered[int(np.ceil(0.95 * len(ordered) - 1e-9)) - 1]
+
+    assert row["difference"] == pytest.approx(far(pose[:, 1]) - far(pose[:, 0]))
+    count = 0
+    for signs in product((0, 1), repeat=8):
+        swapped = np.where(np.repeat(signs, 2)[:, None] == 1, pose[:, ::-1], pose)
+        apart = abs(far(swapped[:, 1]) - far(swapped[:, 0]))
+        count += apart >= abs(row["difference"]) - 1e-9
+    assert row["p"] == pytest.approx(count / 2**8)
+
+
+def test_so_few_things_that_nothing_can_be_significant_are_warned_of(tmp_path):
+    def of(count):
+        names = tuple(f"t{k:02d}" for k in range(count))
+        alike = Alikeness(names, names, np.arange(float(count)))
+        lost = ([False, False], [0.5, 0.6], [0, 1])
+        won = ([False, True], [0.5, 0.99], [0, 1])
+        how = Compared(("random", "spread"), (1, 2), 0.97, False, 100)
+        return summarise_things([both(name, lost, won) for name in names], alike, how)
+
+    few = of(6)
+    accuracy = few.tests.query("things == 'all' and measure == 'accuracy'").iloc[0]
+    # All six are better, and 2 of 64 choices of signs are as clear.
+    assert accuracy["p"] == pytest.approx(2 / 64)
+    assert accuracy["p_holm"] > 0.05
+    said = markdown(few)
+    assert "all: Too few to tell: no p-value of 6 is below 0.031, and " in said
+    assert "confusable half: Too few to tell: no p-value of 3 is below 0.25" in said
+
+    many = of(24)
+    assert (many.tests["p_holm"].dropna() < 0.05).any()
+    assert "Too few" not in markdown(many)
+
+
+def test_the_policies_are_compared_with_the_one_that_was_asked_for(
+    knobs,
+    results,
+    settings,
+    capsys,
+):
+    line = ["benchmark-things", knobs, results, "--models", settings.models]
+    line += ["--views", 1, 2, "--policies", "random", "--reference", "geometry"]
+    main([str(word) for word in [*line, "--repeats", 1, "--workers", 0]])
+    assert "* differs from geometry" in capsys.readouterr().out
+    text = (results / "tables.md").read_text()
+    assert "### Differences to geometry" in text
+    tests = text[text.index("### Differences") :]
+    assert "| all | random | accuracy after 2 |" in tests
+    assert "| all | geometry |" not in tests
+    with pytest.raises(UsageError, match="no policy is called gemoetry"):
+        benchmark_things(
+            knobs, results, replace(settings, reference="gemoetry"), workers=0
+        )
+    # What has not been run is: the others are nothing without it.
+    spread = replace(settings, policies=("random",), reference="spread")
+    tables = benchmark_things(knobs, results, spread, workers=0)
+    assert set(tables.measures["policy"]) == {"random", "geometry", "spread"}
+    assert set(tables.tests["policy"]) == {"random", "geometry"}
+
+
 def test_no_difference_is_no_discovery_and_a_sure_one_is():
     rng = np.random.default_rng(1)
     names = tuple(f"t{k}" for k in range(60))
@@ -458,5 +628,9 @@ def test_one_correction_joins_the_tests_of_several_runs(results, tmp_path, capsy
     JOINED["main"]([results, again])
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(" | ")[1] for line in lines[2:]] == ["random", "geometry"] * 2
+    record = json.loads((again / "benchmark.json").read_text())
+    (again / "benchmark.json").write_text(json.dumps(record | {"reference": "spread"}))
+    with pytest.raises(UsageError, match="is compared with spread"):
+        JOINED["read_runs"]([results, again])
     with pytest.raises(UsageError, match="holds no results"):
         JOINED["main"]([tmp_path / "nothing"])

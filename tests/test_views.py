@@ -57,7 +57,7 @@ def test_the_numbers_are_those_of_a_benchmark_with_so_many_views(made, n_views):
             ("value", "difference"),
             ("low", "low"),
             ("high", "high"),
-            ("p", "mcnemar"),
+            ("p", "p"),
         ):
             assert found.loc[name, n_views, "to_random"][ours] == pytest.approx(
                 tests.loc[name, theirs],

@@ -253,7 +253,7 @@ def comparison(stage: Path) -> Iterator[str]:
         f"{settings['runs']} first views per object, the same for every policy. The threshold is"
         f" {THRESHOLD} at the first view and decreases with every view (decay {decay:g}); at most"
         f" {settings['max_views']} views. Travel is the mean over all episodes, including those"
-        f" that never moved. p: bootstrap test of the accuracy against `{settings['reference']}`,"
+        f" that never moved. p: sign-flip test of the accuracy against `{settings['reference']}`,"
         " with Holm's correction over all policies and thresholds. `summary.csv`, `tests.csv`.",
         WIDTH,
     )

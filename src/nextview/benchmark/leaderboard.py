@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from nextview.benchmark.entries import is_oracle
+from nextview.benchmark.statistics import EXACT_FAMILIES
 from nextview.benchmark.summary import Tables
 from nextview.checks import extras
 
@@ -142,6 +143,28 @@ def too_few(tables: Tables, threshold: float, objects: int) -> str | None:
         " from this"
     )
     return f"{what}; it wants at least {FEW_OBJECTS} objects and ±{100 * WIDE_INTERVAL:g} points."
+
+
+def too_few_families(families: int, tests: int) -> str | None:
+    """Return a warning if no difference, however clear, could be significant.
+
+    Args:
+        families: number of families.
+        tests: how many tests are corrected together.
+
+    Returns:
+        The sentence; None if there are enough families.
+    """
+    wanted = families
+    while wanted < EXACT_FAMILIES and tests * 2.0 ** (1 - wanted) >= SIGNIFICANT:
+        wanted += 1
+    if wanted == families:
+        return None
+    return (
+        f"Too few to tell: no p-value of {families} is below {2.0 ** (1 - families):.2g}, and"
+        f" {tests} tests are corrected together, so that no difference can be significant; it"
+        f" takes {wanted} or more."
+    )
 
 
 def _tests(tables: Tables, threshold: float) -> pd.DataFrame:

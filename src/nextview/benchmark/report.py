@@ -387,10 +387,10 @@ def _made(results: Results, store: ViewStore | None, why_not: str) -> dict[str, 
         "first views": (
             f"{s['runs']} of each object, the same for every policy and threshold; seed {s['seed']}"
         ),
-        "bootstrap": f"{s['samples']} samples of objects; p-values from its standard error",
+        "bootstrap": f"{s['samples']} samples of objects",
         "tests": (
-            "McNemar's for clustered pairs; Holm's correction is over all policies and thresholds"
-            " of a measure"
+            "signs of the differences of objects flipped; Holm's correction is over all policies"
+            " and thresholds of a measure"
         ),
         "pictures": store.path.name if store is not None else why_not,
     }

@@ -3,13 +3,19 @@
 What is drawn anew is the object: the views and runs of one object are not independent.
 """
 
+from collections.abc import Callable, Iterator, Sequence
+
 import numpy as np
-from scipy.stats import chi2, norm
 
 from nextview.data import metrics
-from nextview.types import Float, Index, Mask
+from nextview.simulation.scene_layout import clutter_level
+from nextview.types import Float, Index
 
-NO_SPREAD = 1e-9  # standard deviation of samples that differ by rounding alone
+NO_SPREAD = 1e-9  # differences that are smaller are those of rounding
+EXACT_FAMILIES = 16  # of which all choices of signs are counted
+RANDOM_FLIPS = 99_999  # choices of signs that are drawn where there are more
+FLIPS_AT_ONCE = 4096
+FLIP_SEED = 0
 
 
 def resample(n: int, samples: int, rng: np.random.Generator) -> Float:
@@ -24,6 +30,49 @@ def resample(n: int, samples: int, rng: np.random.Generator) -> Float:
         How often each object is drawn in each sample, (samples, n) float64; each row sums to n.
     """
     return rng.multinomial(n, np.full(n, 1 / n), size=samples).astype(np.float64)
+
+
+def resample_families(
+    families: Index,
+    samples: int,
+    rng: np.random.Generator,
+) -> Float:
+    """Draw bootstrap weights of objects whose families are drawn together.
+
+    Args:
+        families: number of each object's family, (N,) int64.
+        samples: number of samples.
+        rng: source of all random numbers.
+
+    Returns:
+        How often each object is drawn in each sample, (samples, N) float64.
+    """
+    return resample(int(families.max()) + 1, samples, rng)[:, families]
+
+
+def target_families(names: Sequence[str]) -> Index:
+    """Number the families of objects: scenes around one target are one, (N,) int64.
+
+    Args:
+        names: of the N objects.
+    """
+    targets = [
+        name.rpartition("@")[0] if clutter_level(name) else name for name in names
+    ]
+    place = {target: i for i, target in enumerate(dict.fromkeys(targets))}
+    return np.array([place[target] for target in targets])
+
+
+def by_family(values: Float, families: Index) -> Float:
+    """Sum values of objects, (N, M), in each family, (F, M).
+
+    Args:
+        values: of the objects.
+        families: number of each object's family, (N,) int64.
+    """
+    sums = np.zeros((int(families.max()) + 1, values.shape[1]))
+    np.add.at(sums, families, values)
+    return sums
 
 
 def interval(samples: Float) -> tuple[Float, Float]:
@@ -61,33 +110,75 @@ def estimate(
     )
 
 
-def bootstrap_p(difference: Float, samples: Float) -> Float:
-    """Return two-sided p-values of "no difference".
+def sign_flip_p(differences: Float) -> Float:
+    """Return two-sided p-values of "no difference" between two policies.
+
+    If there were none, the difference in each family could as well be the opposite one. p is the
+    share of all choices of signs that make the sum as large: exact where few families differ, else
+    of signs that are drawn.
 
     Args:
-        difference: observed differences, (M,).
-        samples: paired bootstrap samples of the differences, (S, M).
+        differences: of two policies in each family, (F, M): what is drawn together, such as an
+            object with all its runs.
 
     Returns:
         p-values, (M,).
     """
-    error = samples.std(0)
-    return 2 * norm.sf(np.abs(difference) / np.where(error > NO_SPREAD, error, np.inf))
+    differs = np.abs(differences) > NO_SPREAD
+    few = differs.sum(0) <= EXACT_FAMILIES
+    found = np.ones(differences.shape[1])
+    for column in np.flatnonzero(few):
+        own = differences[differs[:, column], column]
+        found[column] = exchange_p(len(own), _sums(own[:, None]))[0]
+    if not few.all():
+        found[~few] = exchange_p(len(differences), _sums(differences[:, ~few]))
+    return found
 
 
-def mcnemar(right: Mask, reference: Mask) -> float:
-    """Return the two-sided p-value of McNemar's test, clustered by object.
+def _sums(differences: Float) -> Callable[[Float], Float]:
+    return lambda signs: signs @ differences
+
+
+def exchange_p(families: int, difference: Callable[[Float], Float]) -> Float:
+    """Return p-values of "no difference" by exchanging two policies in some of the families.
 
     Args:
-        right: whether the answers of a policy are right, (runs, N) bool.
-        reference: the same of the reference policy, (runs, N) bool.
+        families: number F of families.
+        difference: of the two policies, (S, M), for signs of the families, (S, F) float64: where
+            a sign is -1, the policies are exchanged.
 
     Returns:
-        The p-value.
+        p-values, (M,): the share of differences at least as far from 0 as the true one; NaN where
+        that is not known.
     """
-    difference = (right.astype(np.float64) - reference).mean(0)
-    spread = (difference**2).sum()
-    return float(chi2.sf(difference.sum() ** 2 / spread, 1)) if spread > 0 else 1.0
+    observed = np.abs(difference(np.ones((1, families)))[0])
+    count = np.zeros(len(observed))
+    total = 0
+    for signs in _flips(families):
+        # One that is not known counts against the policy.
+        count += (~(np.abs(difference(signs)) < observed - NO_SPREAD)).sum(0)
+        total += len(signs)
+    if families > EXACT_FAMILIES:  # the true one is one of those that could be drawn
+        count += 1
+        total += 1
+    return np.where(np.isnan(observed), np.nan, count / total)
+
+
+def _flips(families: int) -> Iterator[Float]:
+    """All choices of signs for few families, else some that are drawn, (S, F) each."""
+    if families <= EXACT_FAMILIES:
+        codes = np.arange(2**families)[:, None]
+        bits = (codes >> np.arange(families) & 1).astype(np.float64)
+        yield from (
+            1.0 - 2.0 * bits[first : first + FLIPS_AT_ONCE]
+            for first in range(0, len(bits), FLIPS_AT_ONCE)
+        )
+        return
+    rng = np.random.default_rng(FLIP_SEED)
+    for first in range(0, RANDOM_FLIPS, FLIPS_AT_ONCE):
+        count = min(FLIPS_AT_ONCE, RANDOM_FLIPS - first)
+        drawn = rng.integers(2, size=(count, families), dtype=np.int8)
+        yield 1.0 - 2.0 * drawn.astype(np.float64)
 
 
 def holm(p: Float) -> Float:

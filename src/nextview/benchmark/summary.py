@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +54,8 @@ class Tables:
             ``confident_accuracy``, of these; ``calibration_error``; with ``class_`` before it the
             mean over classes.
         per_class: the same of classes (accuracy, travel_moved).
-        tests: differences to the reference, p (paired bootstrap), for accuracy mcnemar, and both
-            after Holm's correction over all rows of a measure.
+        tests: differences to the reference, p (see ``statistics.sign_flip_p``; scenes around one
+            target are one family), and p_holm, after Holm's correction over all rows of a measure.
         sweep: the points of the curves of accuracy against views and travel.
         reliability: confidence and accuracy by bin.
         risks: error rates promised, and those measured among the episodes that reached their
@@ -98,13 +97,14 @@ def summarise(
     Returns:
         The tables.
     """
-    weights = target_weights(grid.specs.predictions.names, samples, rng)
+    families = st.target_families(grid.specs.predictions.names)
+    weights = st.resample_families(families, samples, rng)
     cells = list(grid.cells())
     summary, drawn = _summary(grid, cells, weights)
     return Tables(
         summary,
         _per_class(grid, cells, weights),
-        _tests(grid, cells, summary, drawn, reference),
+        _tests(grid, cells, drawn, reference, families),
         _sweep(grid),
         _reliability(grid, cells),
         _risks(summary, promised or {}),
@@ -238,44 +238,42 @@ def _per_class(grid: Grid, cells: list[Cell], weights: Float) -> pd.DataFrame:
 def _tests(
     grid: Grid,
     cells: list[Cell],
-    summary: pd.DataFrame,
     drawn: Drawn,
     reference: str,
+    families: Index,
 ) -> pd.DataFrame:
-    value = summary.set_index(["policy", "threshold", "measure"])["value"].to_dict()
-    right = {
-        (policy, threshold): grid.right(ends.answer)
-        for policy, threshold, ends in cells
-    }
-    rows = []
-    for (policy, threshold), measure in product(right, TESTED):
-        if policy == reference or (reference, threshold) not in right:
-            continue
-
-        ours = (policy, threshold, measure)
-        theirs = (reference, threshold, measure)
-        difference = np.array([value[ours] - value[theirs]])
-        samples = (drawn[ours] - drawn[theirs])[:, None]
-        found = np.stack(
-            [difference, *st.interval(samples), st.bootstrap_p(difference, samples)]
-        )[:, 0]
-
-        tested = measure == "accuracy"
-        paired = (
-            st.mcnemar(right[policy, threshold], right[reference, threshold])
-            if tested
-            else np.nan
+    keys, top, bottom = _columns(grid, cells, TESTED)
+    place = {key: i for i, key in enumerate(keys)}
+    pairs = [
+        (ours, place[reference, ours[1], ours[2]])
+        for ours in keys
+        if ours[0] != reference and (reference, ours[1], ours[2]) in place
+    ]
+    own = [place[ours] for ours, _ in pairs]
+    theirs = [column for _, column in pairs]
+    # Both have the same denominators: a sum of differences is theirs but for a factor.
+    differences = top[:, own] - top[:, theirs]
+    p = st.sign_flip_p(st.by_family(differences, families))
+    once = np.ones((1, len(top)))
+    shares = metrics.ratio(differences, bottom[:, own], once)[0]
+    samples = [drawn[ours] - drawn[keys[column]] for ours, column in pairs]
+    rows = [
+        (*ours, share, *(float(end[0]) for end in st.interval(sample[:, None])), value)
+        for (ours, _), share, sample, value in zip(
+            pairs,
+            shares,
+            samples,
+            p,
+            strict=True,
         )
-        rows.append((*ours, *found, paired))
-
+    ]
     table = _frame(
         rows,
-        ["policy", "threshold", "measure", "difference", "low", "high", "p", "mcnemar"],
+        ["policy", "threshold", "measure", "difference", "low", "high", "p"],
     )
-    for column in ("p", "mcnemar"):
-        table[f"{column}_holm"] = table.groupby("measure")[column].transform(
-            lambda p: st.holm(p.to_numpy())
-        )
+    table["p_holm"] = table.groupby("measure")["p"].transform(
+        lambda p: st.holm(p.to_numpy())
+    )
     return table
 
 
@@ -354,31 +352,6 @@ def levels_of(names: Sequence[str]) -> NDArray[np.str_]:
     return np.array([clutter_level(name) for name in names])
 
 
-def target_weights(
-    names: Sequence[str],
-    samples: int,
-    rng: np.random.Generator,
-) -> Float:
-    """Draw bootstrap weights of objects; scenes around one target are drawn together.
-
-    Args:
-        names: of the N objects.
-        samples: number of samples.
-        rng: source of all random numbers.
-
-    Returns:
-        Weights, (samples, N) float64.
-    """
-    targets = [
-        name.rpartition("@")[0] if clutter_level(name) else name for name in names
-    ]
-    place = {target: i for i, target in enumerate(dict.fromkeys(targets))}
-    return st.resample(len(place), samples, rng)[
-        :,
-        [place[target] for target in targets],
-    ]
-
-
 def by_level(
     grid: Grid,
     reference: str,
@@ -407,7 +380,8 @@ def by_level(
     known = [level for level in order if level in level_of]
     for level in [*known, *sorted({*level_of} - {*known, ""})]:
         mine = np.flatnonzero(level_of == level)
-        weights = target_weights([names[i] for i in mine], samples, rng)
+        families = st.target_families([names[i] for i in mine])
+        weights = st.resample_families(families, samples, rng)
         weights /= weights.sum(1, keepdims=True)
         right = {}
         for name, path in paths.items():
@@ -429,7 +403,7 @@ def by_level(
                     [
                         against.mean(0),
                         *st.interval(drawn),
-                        st.bootstrap_p(against.mean(0), drawn),
+                        st.sign_flip_p(st.by_family(against, families)),
                     ]
                 )
                 # there the policies have chosen nothing

@@ -53,12 +53,13 @@ class ThingSettings:
         views: numbers of views after which the policies are compared; episodes have the largest.
         policies: names, or MODULE:CLASS for your own; all by default. Only missing results are
             computed; your own policies always run again.
+        reference: policy that the others are compared with; it always takes part.
         threshold: belief from which an answer counts as confident, unless the thing is explained
             worse than nine in ten known ones: then a session goes on, too.
         repeats: runs of the policy random in each episode.
         unit: unit of length of the scan files.
-        families: things whose names are equal up to the first _, such as variants of one scan, are
-            resampled together in the bootstrap.
+        families: things whose names are equal up to the first _, such as variants of one scan,
+            count as one in intervals and p-values.
         samples: number of bootstrap samples.
         seed: seed of rotations, boxes, first views, noise and random policies.
     """
@@ -69,6 +70,7 @@ class ThingSettings:
     draws: int = 1
     views: tuple[int, ...] = (1, 2, 3, 5)
     policies: tuple[str, ...] = THING_POLICIES
+    reference: str = "random"
     threshold: float = 0.97
     repeats: int = 2
     unit: str = "m"
@@ -139,6 +141,8 @@ def benchmark_things(
         ResultsError: OUT holds the results of other settings.
     """
     settings.check()
+    named = dict.fromkeys([settings.reference, *settings.policies])
+    settings = replace(settings, policies=tuple(named))
     scans = Path(scans)
     out = Path(out)
     _check_place(out)
@@ -171,6 +175,7 @@ def benchmark_things(
             settings.threshold,
             settings.families,
             settings.samples,
+            settings.reference,
         )
         tables = summarise_things(runs, alike, how)
         made = asdict(settings) | {"command": command(), "scans": str(scans)}

@@ -17,10 +17,10 @@ from nextview.benchmark.thing_episodes import (
     Setting,
     ThingEpisode,
 )
-from nextview.benchmark.thing_jobs import opened
-from nextview.checks import extras, whole
+from nextview.benchmark.thing_jobs import opened, scan_of
+from nextview.checks import extras, one_of, whole
 from nextview.errors import DatasetError, SessionError
-from nextview.geometry.mesh import load_mesh
+from nextview.geometry.mesh import UNITS
 from nextview.policies.learned_tables import cells_from
 from nextview.teaching.thing_sources import find_things
 from nextview.things.leading import MOST_LEADING
@@ -62,17 +62,19 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
         occlusion: Occlusion = "none",
         draws: int = 4,
         seed: int = 0,
+        unit: str = "m",
         **rules: Any,
     ) -> None:
         """Open a memory, and find the scans of what it knows.
 
         Args:
-            scans: folder of the scans, in metres.
+            scans: folder of the scans.
             models: name or folder of the memory.
             sensor: what the views are taken with.
             occlusion: "none", or boxes that leave "half" or, if "heavy", a third visible.
             draws: how many episodes of each thing there are to be drawn from.
             seed: of these, see ``thing_episodes.Setting``.
+            unit: unit of length of the scan files.
             rules: objective, max_views, threshold and prices, see ``environments.Rules``.
 
         Raises:
@@ -90,11 +92,18 @@ class RecogniseThingsEnv(gymnasium.Env[Any, Any]):
                 f"{scans}: holds no scan of {missing[0]}, which {models} knows"
             )
 
+        one_of(unit, tuple(UNITS), "the unit")
         setting = Setting(sensor, occlusion, seed)
         self._begin = lru_cache(KEPT_EPISODES)(
             lambda thing, draw: ThingEpisode(
                 self.things,
-                partial(load_mesh, files[self.things.names[thing]], unit="m"),
+                partial(
+                    scan_of,
+                    self.things,
+                    thing,
+                    files[self.things.names[thing]],
+                    unit,
+                ),
                 thing,
                 draw,
                 setting,

@@ -88,7 +88,8 @@ class ThingEpisode:
 
         Args:
             things: that may be believed.
-            mesh: the mesh of the thing, which is asked for when a view has to be sensed.
+            mesh: the mesh of the thing, of known unit, which is asked for when a view has to be
+                sensed.
             thing: its number among them.
             draw: number of the draw.
             setting: how it is shown.
@@ -306,7 +307,7 @@ class _Stage:
         """Turn a thing, draw its sensor and what stands around it.
 
         Args:
-            mesh: the thing, metres.
+            mesh: the thing, of known unit, so that its lengths are metres.
             setting: sensor, distance and occlusion.
             seed: of all draws of the episode.
             kept: where the boxes are kept: they are searched for.

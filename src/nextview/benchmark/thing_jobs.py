@@ -14,13 +14,16 @@ import numpy as np
 from nextview.benchmark.thing_episodes import Setting, ThingEpisode
 from nextview.benchmark.thing_policies import policies_of
 from nextview.benchmark.thing_replay import EpisodeRuns, ThingRun, run
-from nextview.errors import ResultsError, UsageError
+from nextview.errors import DatasetError, ResultsError, UsageError
 from nextview.files import read_record, write_record
-from nextview.geometry.mesh import Mesh, load_mesh
+from nextview.geometry.mesh import UNITS, Mesh, load_mesh
 from nextview.policies.base import Policy
 from nextview.recognition.model_card import find_models
 from nextview.things.memory import TaughtRecogniser
+from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
+
+SCAN_APART = 0.2  # radii that a scan and what was taught of it may lie apart
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,7 @@ def work(job: ThingJob) -> None:
     folder = job.out / "episodes" / job.name
     episode = ThingEpisode(
         things,
-        partial(_mesh, job.scan, job.unit),
+        partial(scan_of, things, job.thing, job.scan, job.unit),
         job.thing,
         job.draw,
         job.setting,
@@ -108,8 +111,41 @@ def work(job: ThingJob) -> None:
     write_record(job.runs_file, done, overwrite=True)
 
 
-def _mesh(scan: Path, unit: str) -> Mesh:
-    return load_mesh(scan, unit=unit)
+def scan_of(things: TaughtThings, thing: int, file: Path, unit: str) -> Mesh:
+    """The scan of a taught thing.
+
+    Args:
+        things: that are known.
+        thing: its number among them.
+        file: the scan.
+        unit: of its lengths.
+
+    Raises:
+        DatasetError: it lies elsewhere than the surface that was taught, so that its size or its
+            pose would be those of another thing.
+    """
+    mesh = load_mesh(file, unit=unit)
+    surface = things.verifier.caster.surfaces[thing]
+    if _apart(mesh, surface) <= SCAN_APART:
+        return mesh
+
+    for other in UNITS:
+        if _apart(load_mesh(file, unit=other), surface) <= SCAN_APART:
+            raise DatasetError(
+                f"{file}: is not in {unit}, by what was taught of it; give --unit {other}"
+                f" (unit={other!r})"
+            )
+    raise DatasetError(
+        f"{file}: is not the scan that {surface.name} was taught from: it lies elsewhere, or is of"
+        f" another size; its radius is {mesh.radius:.3g} m, and {surface.radius:.3g} m was taught"
+    )
+
+
+def _apart(mesh: Mesh, surface: Surface) -> float:
+    """How far the corners of two bounding boxes are apart, radii of the surface."""
+    ours = mesh.vertices * mesh.radius + mesh.centre
+    boxes = [np.stack([one.min(0), one.max(0)]) for one in (ours, surface.vertices)]
+    return float(np.abs(boxes[0] - boxes[1]).max() / surface.radius)
 
 
 def replayed(

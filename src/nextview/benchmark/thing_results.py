@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from nextview.benchmark.figures import OWN
-from nextview.benchmark.leaderboard import SIGNIFICANT
+from nextview.benchmark.leaderboard import SIGNIFICANT, too_few_families
 from nextview.benchmark.thing_policies import CEILINGS
-from nextview.benchmark.thing_tables import ALL, CONFUSABLE, REFERENCE, ThingTables
+from nextview.benchmark.thing_tables import ALL, CONFUSABLE, ThingTables
 from nextview.files import new_folder
 from nextview.session.style import (
     ACCENT,
@@ -109,8 +109,21 @@ def markdown(tables: ThingTables) -> str:
             "",
         ]
 
-    parts += ["### Differences to random", "", *_tests(tables), ""]
+    parts += [f"### Differences to {tables.reference}", "", *_tests(tables), ""]
+    parts += [f"{sentence}\n" for sentence in too_few_things(tables)]
     return "\n".join(parts)
+
+
+def too_few_things(tables: ThingTables) -> list[str]:
+    """A warning for each group of things in which no difference could be significant."""
+    tested = tables.tests[tables.tests["p"].notna()]
+    warnings = []
+    for things in tested["things"].unique():
+        families = int(tested[tested["things"] == things]["families"].iloc[0])
+        sentence = too_few_families(families, len(tested))
+        if sentence is not None:
+            warnings.append(f"{things}: {sentence}")
+    return warnings
 
 
 def _table(tables: ThingTables, things: str) -> list[str]:
@@ -167,7 +180,7 @@ def _tests(tables: ThingTables) -> list[str]:
         "things",
         "policy",
         "measure",
-        "difference to random",
+        f"difference to {tables.reference}",
         "95 % interval",
         "p (Holm)",
     ]
@@ -266,12 +279,14 @@ def accuracy_figure(tables: ThingTables) -> Figure:
 
 
 def difference_figure(tables: ThingTables) -> Figure:
-    """Differences to random after two views; filled where the corrected p is below 0.05."""
+    """Differences to the reference after two views; filled where the corrected p is below 0.05."""
     views = [k for k in views_of(tables) if k > 1]
     at = views[0] if views else 0
     tests = tables.tests
     rows = tests[(tests["measure"] == "accuracy") & (tests["views"] == at)]
-    policies = [name for name in policies_of_tables(tables) if name != REFERENCE][::-1]
+    policies = [
+        name for name in policies_of_tables(tables) if name != tables.reference
+    ][::-1]
     figure, axes = new_figure(4.6, 0.8 + 0.3 * max(3, len(policies)))
 
     for things, shift, marker in ((ALL, 0.14, "o"), (CONFUSABLE, -0.14, "s")):
@@ -300,7 +315,7 @@ def difference_figure(tables: ThingTables) -> Figure:
     axes.grid(axis="y", visible=False)
     axes.tick_params(axis="y", length=0)
     axes.set_xlabel(
-        f"named right after {at} views, percentage points: difference to random"
+        f"named right after {at} views, percentage points: difference to {tables.reference}"
     )
     legend(axes)
 

@@ -6,7 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from nextview.benchmark.confusable import Alikeness
-from nextview.benchmark.statistics import bootstrap_p, holm, interval, resample
+from nextview.benchmark.statistics import (
+    by_family,
+    exchange_p,
+    holm,
+    interval,
+    resample_families,
+    sign_flip_p,
+)
 from nextview.benchmark.thing_episodes import EPISODE_SPHERE
 from nextview.benchmark.thing_policies import CEILINGS
 from nextview.benchmark.thing_replay import EpisodeRuns, ThingRun
@@ -19,7 +26,6 @@ with extras():
     import pandas as pd
 
 
-REFERENCE = "random"  # the policy that all others are compared with
 ALL = "all"
 CONFUSABLE = "confusable half"
 FAR_END = 0.95  # quantile of the error of the pose
@@ -37,6 +43,7 @@ class Compared:
         threshold: belief from which a thing is surely recognised.
         families: whether things whose names begin alike, up to the first _, are drawn together.
         samples: of the bootstrap.
+        reference: the policy that the others are compared with.
     """
 
     policies: tuple[str, ...]
@@ -44,6 +51,7 @@ class Compared:
     threshold: float
     families: bool
     samples: int
+    reference: str = "random"
 
 
 @dataclass(frozen=True)
@@ -53,16 +61,19 @@ class ThingTables:
     Attributes:
         measures: "things" (all, or the confusable half), "policy", "measure", "views" (0 for a
             measure of whole episodes), "value", and its 95 % interval, "low" and "high".
-        tests: of the differences to the policy random: the same columns with "difference", "low",
-            "high", "p" and "p_holm", corrected over all rows.
+        tests: of the differences to the reference: the same columns with "difference", "low",
+            "high", "p" (see ``statistics.exchange_p``), "families", by which p was found, and
+            "p_holm", corrected over all rows.
         alike: the things: "thing", "most_alike", "distance" (radii), "confusable".
         episodes: how many there are of all things.
+        reference: the policy that the others are compared with.
     """
 
     measures: "pd.DataFrame"
     tests: "pd.DataFrame"
     alike: "pd.DataFrame"
     episodes: int
+    reference: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +148,16 @@ class _Runs:
         """
         weights = drawn[:, self.things] * self.weight
         return np.asarray(weights @ values / weights.sum(1), np.float64)
+
+    def in_families(self, values: Float, family: Index) -> Float:
+        """Sum in each family of the means of its things, (F,).
+
+        Args:
+            values: of each run, (R,).
+            family: number of each thing's family, (T,).
+        """
+        weighted = (values * self.weight)[:, None]
+        return by_family(weighted, family[self.things])[:, 0]
 
     def quantile(self, values: Float, drawn: Float, share: float) -> Float:
         """Quantile of the known values of runs, in each sample of things, (S,).
@@ -214,15 +235,18 @@ def summarise_things(
         some = [each for each in runs if chosen[number[each.thing]]]
         if not some:
             continue
-        drawn = _drawn(chosen, alike.names, how, rng)
+        family = _families(chosen, alike.names, how)
+        drawn = _drawn(chosen, family, how, rng)
         sampled: dict[str, Sampled] = {}
+        together: dict[str, _Runs] = {}
         for policy in how.policies:
             own = [(number[e.thing], run) for e in some for run in e.runs[policy]]
-            together = _Runs.of(own, how.threshold)
-            sampled[policy] = _sampled(together, how.views, drawn)
+            together[policy] = _Runs.of(own, how.threshold)
+            sampled[policy] = _sampled(together[policy], how.views, drawn)
             rows += [(things, policy, *row) for row in _rows(sampled[policy])]
-            rows += [(things, policy, *row) for row in _times(together)]
-        tests += [(things, *row) for row in _differences(sampled)]
+            rows += [(things, policy, *row) for row in _times(together[policy])]
+        p_values = _p_values(together, family, how)
+        tests += [(things, *row) for row in _differences(sampled, p_values, how)]
 
     return ThingTables(
         pd.DataFrame(
@@ -232,20 +256,27 @@ def summarise_things(
         _corrected(tests),
         _as_table(alike),
         len(runs),
+        how.reference,
     )
+
+
+def _families(chosen: Mask, names: Sequence[str], how: Compared) -> Index:
+    """The number of the family of each thing, (T,) int64; -1 for those that are not chosen."""
+    bodies = [name.partition("_")[0] if how.families else name for name in names]
+    family = np.full(len(names), -1)
+    family[chosen] = np.unique(np.array(bodies)[chosen], return_inverse=True)[1]
+    return family
 
 
 def _drawn(
     chosen: Mask,
-    names: Sequence[str],
+    family: Index,
     how: Compared,
     rng: np.random.Generator,
 ) -> Float:
     """How often each thing is drawn in each sample, (1 + S, T); in the first each once."""
-    bodies = [name.partition("_")[0] if how.families else name for name in names]
-    family = np.unique(np.array(bodies)[chosen], return_inverse=True)[1]
-    drawn = np.zeros((how.samples, len(names)))
-    drawn[:, chosen] = resample(int(family.max()) + 1, how.samples, rng)[:, family]
+    drawn = np.zeros((how.samples, len(family)))
+    drawn[:, chosen] = resample_families(family[chosen], how.samples, rng)
     return np.concatenate([chosen[None].astype(np.float64), drawn])
 
 
@@ -274,50 +305,104 @@ def _times(runs: _Runs) -> list[tuple]:
     ]
 
 
-def _differences(sampled: dict[str, Sampled]) -> list[tuple]:
-    """Differences to random: policy, measure, views, difference, interval and p-value."""
-    if REFERENCE not in sampled:
+def _differences(
+    sampled: dict[str, Sampled],
+    p_values: dict[tuple[str, str, int], tuple[float, int]],
+    how: Compared,
+) -> list[tuple]:
+    """Differences to the reference: policy, measure, views, difference, interval, p, families."""
+    if how.reference not in sampled:
         return []
 
     found = []
     for policy, own in sampled.items():
-        if policy == REFERENCE:
+        if policy == how.reference:
             continue
         for (measure, views), values in own.items():
             if not _is_tested(measure, views):
                 continue
-            apart = values - sampled[REFERENCE][measure, views]
+            apart = values - sampled[how.reference][measure, views]
             low, high = interval(apart[1:, None])
-            p = np.nan if policy in CEILINGS else _p_value(apart, measure)
-            row = (float(apart[0]), float(low[0]), float(high[0]), p)
-            found.append((policy, measure, views, *row))
+            ends = (float(apart[0]), float(low[0]), float(high[0]))
+            found.append(
+                (policy, measure, views, *ends, *p_values[policy, measure, views])
+            )
     return found
 
 
 def _is_tested(measure: str, views: int) -> bool:
-    """Whether a measure is compared with that of random views; the first view is the same."""
+    """Whether a measure is compared with the reference's; the first view is the same."""
     if measure == FAR_POSE:
         return views == POSE_AFTER
     return (measure == "accuracy" and views > 1) or measure == "views until confident"
 
 
-def _p_value(apart: Float, measure: str) -> float:
-    """Two-sided p-value of no difference: the difference itself, and its bootstrap samples.
+def _p_values(
+    runs: dict[str, _Runs],
+    family: Index,
+    how: Compared,
+) -> dict[tuple[str, str, int], tuple[float, int]]:
+    """p-values by policy, measure and views, and by how many families each was found.
 
-    A quantile jumps from run to run, so that its samples are counted; the others are means, whose
-    error is normal.
+    They are NaN where one of the two policies knows the truth: a bound is no rival.
+
+    Args:
+        runs: of all policies.
+        family: of each thing, see ``_families``.
+        how: what is compared.
     """
-    samples = apart[1:]
-    if measure != FAR_POSE:
-        return float(bootstrap_p(apart[:1], samples[:, None])[0])
-    beyond = min(np.count_nonzero(samples <= 0), np.count_nonzero(samples >= 0))
-    return min(1.0, 2 * (beyond + 1) / (len(samples) + 1))
+    reference = runs.get(how.reference)
+    if reference is None:
+        return {}
+
+    count = int(family.max()) + 1
+    found = {}
+    for policy, own in runs.items():
+        if policy == how.reference:
+            continue
+        known = policy in CEILINGS or how.reference in CEILINGS
+        means = [("views until confident", 0, own.until, reference.until)]
+        means += [
+            ("accuracy", k, own.right[:, k - 1], reference.right[:, k - 1])
+            for k in how.views
+        ]
+        for measure, k, ours, theirs in means:
+            sums = own.in_families(ours, family) - reference.in_families(theirs, family)
+            p = np.nan if known else float(sign_flip_p(sums[:, None])[0])
+            found[policy, measure, k] = (p, count)
+        if POSE_AFTER in how.views:
+            p = np.nan if known else _pose_p(own, reference, family)
+            found[policy, FAR_POSE, POSE_AFTER] = (p, count)
+    return found
+
+
+def _pose_p(own: _Runs, reference: _Runs, family: Index) -> float:
+    """The p-value of the difference of the far ends of the errors of the pose."""
+    errors = np.concatenate([one.pose[:, POSE_AFTER - 1] for one in (own, reference)])
+    weights = np.concatenate([own.weight, reference.weight])
+    order = np.argsort(errors)[: np.count_nonzero(~np.isnan(errors))]
+    whose = np.repeat([1.0, -1.0], [len(own.things), len(reference.things)])[order]
+    families = family[np.concatenate([own.things, reference.things])][order]
+
+    def far(ours: Float) -> Float:
+        """The far end of the errors of those runs that count as ours, (S,)."""
+        below = np.cumsum(ours * weights[order], axis=1)
+        first = (below >= FAR_END * below[:, -1:]).argmax(1)
+        return np.where(below[:, -1] > 0, errors[order][first], np.nan)
+
+    def difference(signs: Float) -> Float:
+        ours = signs[:, families] * whose > 0
+        return (far(ours) - far(~ours))[:, None]
+
+    if not len(order):
+        return np.nan
+    return float(exchange_p(int(family.max()) + 1, difference)[0])
 
 
 def _corrected(tests: list[tuple]) -> "pd.DataFrame":
     """The tests as a table, with one correction over all of them."""
     columns = ["things", "policy", "measure", "views", "difference", "low", "high", "p"]
-    table = pd.DataFrame(tests, columns=columns)
+    table = pd.DataFrame(tests, columns=[*columns, "families"])
     return table.assign(p_holm=holm(table["p"].to_numpy(np.float64)))
 
 

@@ -12,7 +12,14 @@ import numpy as np
 
 from nextview.benchmark.entries import knows_truth
 from nextview.benchmark.replay import Grid, Trajectories, truncate
-from nextview.benchmark.statistics import holm, interval, mcnemar, resample
+from nextview.benchmark.statistics import (
+    by_family,
+    holm,
+    interval,
+    resample_families,
+    sign_flip_p,
+    target_families,
+)
 from nextview.checks import extras
 from nextview.data.metrics import ratio
 from nextview.session.episode import Outcome
@@ -54,8 +61,9 @@ def measured(
     The measures are ``accuracy``; ``travel`` in grid cells; ``to_random`` and so on, differences of
     accuracy from references; and ``share_of_gap``, the share of the lead of ``oracle-gain`` over
     the first reference that a policy has. The bootstrap samples are those of the benchmark, the
-    same for all policies, which pairs the differences. p is McNemar's test over objects with one
-    Holm correction for every policy without the truth, reference and number of views.
+    same for all policies, which pairs the differences. p is that of ``statistics.sign_flip_p`` over
+    objects, scenes around one target as one, with one Holm correction for every policy without the
+    truth, reference and number of views.
 
     Args:
         grid: the episodes; the paths are as long, or end by themselves.
@@ -72,11 +80,9 @@ def measured(
         if not paths.fixed or paths.views.shape[1] >= max(n_views)
     ]
     references = [name for name in references if name in names]
-    weights = resample(
-        len(grid.specs.predictions),
-        samples,
-        np.random.default_rng([grid.seed, 1]),
-    )
+    families = target_families(grid.specs.predictions.names)
+    rng = np.random.default_rng([grid.seed, 1])
+    weights = resample_families(families, samples, rng)
     rows: list[tuple] = []
 
     for k in n_views:
@@ -95,15 +101,17 @@ def measured(
 
         top = np.stack(list(columns.values()), 1)
         low, high = interval(ratio(top, np.ones_like(top), weights))
+        tested = [
+            column
+            for column, (name, measure) in enumerate(columns)
+            if measure.startswith("to_") and measure != f"to_{name}"
+        ]
+        p_values = np.full(len(columns), np.nan)
+        p_values[tested] = sign_flip_p(by_family(top[:, tested], families))
         value = dict(zip(columns, top.mean(0), strict=True))
         for i, (name, measure) in enumerate(columns):
-            reference = measure.removeprefix("to_")
-            p = (
-                mcnemar(right[name], right[reference])
-                if reference in references and name != reference
-                else np.nan
-            )
-            rows.append((name, k, measure, value[name, measure], low[i], high[i], p))
+            numbers = (value[name, measure], low[i], high[i], p_values[i])
+            rows.append((name, k, measure, *numbers))
 
         gap = (
             value[CEILING, f"to_{references[0]}"]

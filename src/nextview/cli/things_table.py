@@ -9,10 +9,11 @@ from nextview.benchmark.leaderboard import SIGNIFICANT
 from nextview.benchmark.thing_results import (
     groups_of,
     policies_of_tables,
+    too_few_things,
     values_of,
     views_of,
 )
-from nextview.benchmark.thing_tables import REFERENCE, ThingTables
+from nextview.benchmark.thing_tables import ThingTables
 from nextview.cli.progress import Terminal
 
 
@@ -22,9 +23,11 @@ def print_things(found: ThingTables) -> None:
     for things in groups_of(found):
         console.print(_table(found, things))
     console.print(
-        f"* differs from {REFERENCE}: p after Holm's correction is below {SIGNIFICANT}; choice is"
-        " the median of its CPU"
+        f"* differs from {found.reference}: p after Holm's correction is below {SIGNIFICANT};"
+        " choice is the median of its CPU"
     )
+    for sentence in too_few_things(found):
+        console.print(sentence)
 
 
 def _table(found: ThingTables, things: str) -> Table:

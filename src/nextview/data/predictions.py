@@ -201,9 +201,12 @@ class Predictions:
                 raise PredictionsError(
                     f"these predictions name no splits, so no objects of {split!r}: take them all"
                 )
-            there = ", ".join(repr(str(name)) for name in np.unique(self.splits))
+            names = [str(name) for name in np.unique(self.splits)]
+            there = ", ".join(map(repr, names))
             raise PredictionsError(
-                f"these predictions hold no objects of the split {split!r}, only of {there}"
+                f"these predictions hold no objects of the split {split!r}, only of {there}: take"
+                f" split={names[-1]!r} (--split {names[-1]}), or predict the others with nextview"
+                f" predict STORE OUT --split {split}"
             )
         return self.of_objects(np.flatnonzero(kept))
 

@@ -36,7 +36,6 @@ from nextview.geometry.mesh import (
     UNITS,
     Mesh,
     load_mesh,
-    make_mesh,
     mesh_warnings,
 )
 from nextview.geometry.observation import Camera
@@ -95,13 +94,7 @@ class Deform:
     def __call__(self, mesh: Mesh, seed: int, name: str) -> Mesh:
         """The new object, normalised again."""
         factors, angle = self.draw(seed, name)
-        stretched = mesh.vertices * mesh.radius * factors
-        return make_mesh(
-            stretched @ rotation_z(angle).T,
-            mesh.faces,
-            mesh.name,
-            mesh.unit,
-        )
+        return mesh.reshaped(mesh.vertices * factors @ rotation_z(angle).T)
 
 
 def render_object(
@@ -451,24 +444,23 @@ def _rendered(
     rng = np.random.default_rng([seed, SENSING, *entry.name.encode()])
     camera: Camera
     if options.meshes is None:
-        # a sensor looks at a mesh of known unit in its true size
-        unit = None if sensor is None else options.unit
         read = load_mesh(
             entry.path,
-            unit=unit,
+            unit=options.unit,
             max_faces=options.max_faces,
             largest_part=options.largest_part,
         )
-        doubts = mesh_warnings(replace(read, unit=options.unit))
+        doubts = mesh_warnings(read)
         mesh = deformed(store, read, entry.name)
         camera = (
             SimulatedCamera(mesh, size, sphere.distance)
             if sensor is None
             else SensedCamera(mesh, sensor, rng)
         )
-        return render_object(camera, sphere, size) | {
-            "radius": np.array(mesh.radius)
-        }, doubts
+        # A store keeps lengths of the files: their unit may be told later.
+        metres = 1.0 if options.unit is None else UNITS[options.unit]
+        radius = np.array(mesh.radius / metres)
+        return render_object(camera, sphere, size) | {"radius": radius}, doubts
 
     scene = build_scene(
         SceneLayout.load(entry.path),

@@ -52,11 +52,11 @@ class Mesh:
     Attributes:
         vertices: (V, 3) float64, object radii.
         faces: (F, 3) int32, indices into the vertices.
-        centre: bounding-box centre in the file's frame, (3,) float64, the file's units.
-        radius: object radius in the file's units; ``vertices * radius + centre`` are the file's
-            positions.
+        centre: bounding-box centre in the file's frame, (3,) float64: metres, or lengths of the
+            file if its unit is not known.
+        radius: object radius, in the same; ``vertices * radius + centre`` are the file's positions.
         name: what to call it in messages.
-        unit: the file's unit, one of UNITS; None if it is not known.
+        unit: what the file's lengths were in, one of UNITS; None if it is not known.
         notes: what was left out of the file's mesh, a sentence each; usually nothing.
 
     Example:
@@ -75,7 +75,22 @@ class Mesh:
     @property
     def metres(self) -> float | None:
         """Object radius in metres; None if the unit is not known."""
-        return None if self.unit is None else self.radius * UNITS[self.unit]
+        return None if self.unit is None else self.radius
+
+    def reshaped(self, vertices: Float) -> "Mesh":
+        """The mesh with its vertices elsewhere, brought into the object frame anew.
+
+        Args:
+            vertices: (V, 3) float64, object radii of this mesh.
+
+        Returns:
+            The mesh, its lengths in the same unit.
+
+        Raises:
+            MeshError: see ``make_mesh``.
+        """
+        made = make_mesh(vertices * self.radius, self.faces, self.name)
+        return replace(made, unit=self.unit)
 
 
 def make_mesh(
@@ -96,7 +111,7 @@ def make_mesh(
         unit: of the vertices ("mm", "cm", "inch", "foot", "m"); None if it is not known.
 
     Returns:
-        The mesh in the object frame.
+        The mesh in the object frame; centre and radius are in metres if the unit is known.
 
     Raises:
         MeshError: the mesh has no faces, faces that are not triangles, an index out of range, a
@@ -152,13 +167,26 @@ def make_mesh(
         raise MeshError(
             f"{name}: the mesh has no area, all its faces are lines or points"
         )
-    return Mesh(
+    made = Mesh(
         normalised,
         faces.astype(np.int32),
         centre,
         float(radius * reach),
         name,
-        unit,
+    )
+    return _in_metres(made, unit)
+
+
+def _in_metres(mesh: Mesh, unit: str | None) -> Mesh:
+    """A mesh whose lengths are the file's, once its unit is known; itself if it is not."""
+    if unit is None:
+        return mesh
+    metres = UNITS[unit]
+    return replace(
+        mesh,
+        centre=mesh.centre * metres,
+        radius=mesh.radius * metres,
+        unit=unit,
     )
 
 
@@ -280,11 +308,11 @@ def load_mesh(
         ) from None
     if is_y_up(path, up):
         vertices = vertices[:, [0, 2, 1]] * (1, -1, 1)
-    mesh = make_mesh(vertices, faces, str(path), unit)
+    mesh = make_mesh(vertices, faces, str(path))
     refuse_lost_shape(vertices, mesh.radius, str(path))
     if largest_part:  # of what has just been checked
         kept, notes = keep_largest_part(mesh.vertices, mesh.faces)
         if notes:
             positions = mesh.vertices * mesh.radius + mesh.centre
-            mesh = replace(make_mesh(positions, kept, str(path), unit), notes=notes)
-    return mesh
+            mesh = replace(make_mesh(positions, kept, str(path)), notes=notes)
+    return _in_metres(mesh, unit)

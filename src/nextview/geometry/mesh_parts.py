@@ -26,7 +26,10 @@ MOST_WIDE_PLANE = 25.0  # more, and what is beside it is no object but a bump
 # how much more of what is not in the plane is on one side of it: 0 as much on both, 1 all
 ONE_SIDED = 0.8
 # of the mesh's size: what lies no farther from a plane belongs to it
-PLANE_THICKNESS = 0.05
+PLANE_THICKNESS = 0.07
+CELLS_FOLLOWED = 8  # of directions, in search of the one that most of a surface faces
+# share of the largest spread of points below which they do not spread at all
+LEAST_SPREAD = 1e-9
 PLANE_FACES = 100_000  # that are looked at in search of a plane
 PLANE_ANGLE = np.cos(np.radians(15))  # between its normal and those of its faces
 # object radii between two numbers of single precision, from where on a shape is lost
@@ -113,16 +116,62 @@ def _areas(vertices: Float, faces: NDArray[np.integer]) -> Float:
 
 
 def _size(points: Float) -> float:
-    """Half the diagonal of the bounding box."""
-    return float(np.linalg.norm(np.ptp(points, axis=0))) / 2 if len(points) else 0.0
+    """Half the largest distance between two points, however they are turned; 0 for none."""
+    if len(points) < 2:
+        return 0.0
+    corners = hull_corners(points)
+    farthest = max(
+        float(np.linalg.norm(corners[at:] - corners[at], axis=1).max())
+        for at in range(len(corners))
+    )
+    return farthest / 2
+
+
+def hull_corners(points: Float) -> Float:
+    """Those of some points, (N, D), between which all others lie, (C, D)."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    some = np.unique(points, axis=0)
+    try:
+        return some[ConvexHull(some).vertices]
+    except (QhullError, ValueError):
+        pass  # all in a plane, on a line or in a point
+    centred = some - some.mean(0)
+    _, spread, axes = np.linalg.svd(centred, full_matrices=False)
+    flat = axes[spread > LEAST_SPREAD * spread.max(initial=0)]
+    if len(flat) in (0, some.shape[1]):
+        return some
+    if len(flat) == 1:
+        along = centred @ flat[0]
+        return some[[along.argmin(), along.argmax()]]
+    try:
+        return some[ConvexHull(centred @ flat.T).vertices]
+    except QhullError:
+        return some
+
+
+def thickness(points: Float) -> float:
+    """The least distance of two parallel lines or planes with all points between them.
+
+    Args:
+        points: (N, 2) or (N, 3).
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        sides = ConvexHull(points).equations[:, :-1]
+    except (QhullError, ValueError):
+        return 0.0  # all in a plane, or on a line
+    corners = hull_corners(points)
+    return min(float(np.ptp(corners @ side)) for side in np.unique(sides, axis=0))
 
 
 def _is_flat(points: Float) -> bool:
     """Whether points lie in a plate that is much wider than thick both ways."""
     centred = points - points.mean(0)
-    axes = np.linalg.eigh(centred.T @ centred)[1]
-    _, width, thickness = np.sort(np.ptp(centred @ axes, axis=0))[::-1]
-    return bool(thickness < FLAT_PART * width)
+    normal, *within = np.linalg.eigh(centred.T @ centred)[1].T
+    width = thickness(centred @ np.stack(within, 1))
+    return bool(np.ptp(centred @ normal) < FLAT_PART * width)
 
 
 def keep_largest_part(
@@ -235,10 +284,7 @@ def _plane_times(vertices: Float, faces: NDArray[np.integer]) -> float:
     if not facing.any():
         return 1.0
     heights = ((a + b + c) / 3)[facing] @ normal
-    bins = np.floor((heights - heights.min()) / (PLANE_THICKNESS * size)).astype(int)
-    weights = np.bincount(bins, areas[facing])
-    fullest = bins == weights.argmax()
-    height = np.average(heights[fullest], weights=areas[facing][fullest])
+    height = _fullest_height(heights, areas[facing], PLANE_THICKNESS * size)
 
     used = vertices[np.unique(faces)]
     offsets = used @ normal - height
@@ -247,12 +293,26 @@ def _plane_times(vertices: Float, faces: NDArray[np.integer]) -> float:
     one_sided = 2 * abs((offsets[above] > 0).mean() - 0.5) if above.any() else 0
     if rest * MOST_WIDE_PLANE < size or one_sided < ONE_SIDED:
         return 1.0
-    plane = used[~above]
-    centred = plane - plane.mean(0)
-    width = (
-        np.sort(np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1], axis=0))[1] / 2
-    )
+    width = thickness(used[~above] @ _across(normal)) / 2
     return size / rest if width > rest else 1.0
+
+
+def _across(normal: Float) -> Float:
+    """Two directions across a third, (3, 2)."""
+    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(normal, first)], 1)
+
+
+def _fullest_height(heights: Float, areas: Float, most: float) -> float:
+    """The mean height of the most surface that lies within so much of each other."""
+    order = np.argsort(heights)
+    heights, areas = heights[order], areas[order]
+    before = np.concatenate([[0.0], np.cumsum(areas)])
+    ends = np.searchsorted(heights, heights + most, side="right")
+    first = int((before[ends] - before[: len(heights)]).argmax())
+    some = slice(first, ends[first])
+    return float(np.average(heights[some], weights=areas[some]))
 
 
 def _main_direction(normals: Float, areas: Float) -> Float:
@@ -260,13 +320,20 @@ def _main_direction(normals: Float, areas: Float) -> Float:
     upper = np.where(normals[:, 2:] < 0, -normals, normals)
     cells = np.round(upper * 4).astype(int) + 4  # directions some 15 degrees apart
     which = np.ravel_multi_index(tuple(cells.T), (9, 9, 9))
-    fullest = which == np.bincount(which, areas).argmax()
-    direction = _mean_direction(upper[fullest], areas[fullest])
-    for _ in range(2):  # the cell's edges cut off some of the faces around it
+    full = np.bincount(which, areas)
+    found = []
+    # A plane may be split by the borders of cells: each part leads to all of it.
+    for cell in np.argsort(-full, kind="stable")[:CELLS_FOLLOWED]:
+        if not full[cell]:
+            break
+        direction = _mean_direction(upper[which == cell], areas[which == cell])
+        for _ in range(3):  # the cell's edges cut off some of the faces around it
+            near = np.abs(normals @ direction) > PLANE_ANGLE
+            towards = normals[near] * np.sign(normals[near] @ direction)[:, None]
+            direction = _mean_direction(towards, areas[near])
         near = np.abs(normals @ direction) > PLANE_ANGLE
-        towards = normals[near] * np.sign(normals[near] @ direction)[:, None]
-        direction = _mean_direction(towards, areas[near])
-    return direction
+        found.append((float(areas[near].sum()), direction))
+    return max(found, key=lambda one: one[0])[1]
 
 
 def _mean_direction(normals: Float, areas: Float) -> Float:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.random import Generator
 from scipy.spatial import QhullError, cKDTree
 
-from nextview.geometry.mesh import Mesh, make_mesh
+from nextview.geometry.mesh import Mesh
 from nextview.geometry.viewsphere import Directions
 from nextview.types import Float
 
@@ -212,9 +212,4 @@ def rotated(mesh: Mesh, rotation: Float) -> Mesh:
     Returns:
         The mesh in its new pose, of the same size and unit.
     """
-    return make_mesh(
-        mesh.vertices @ rotation.T * mesh.radius,
-        mesh.faces,
-        mesh.name,
-        mesh.unit,
-    )
+    return mesh.reshaped(mesh.vertices @ rotation.T)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from nextview.errors import ObservationError, UsageError
-from nextview.geometry.mesh import UNITS, Mesh
+from nextview.geometry.mesh import Mesh
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster, Triangles
 from nextview.geometry.resting import resting_poses
@@ -95,7 +95,7 @@ class SimulatedTable:
         for mesh in meshes:
             if mesh.unit is None:
                 raise UsageError(f"{mesh.name}: the unit of length is not known")
-            metres = (mesh.vertices * mesh.radius + mesh.centre) * UNITS[mesh.unit]
+            metres = mesh.vertices * mesh.radius + mesh.centre
             poses = resting(mesh)
             turn = (
                 rotation_z(rng.uniform(0, 2 * np.pi)) @ poses[rng.integers(len(poses))]

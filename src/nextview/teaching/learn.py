@@ -844,8 +844,9 @@ def _notes(taught: Sequence[Pair]) -> tuple[str, ...]:
     notes = []
     if len(taught) == 1:
         notes.append(
-            f"{names[0]} is all it knows, so everything is that; teach what it may be mistaken"
-            " for, too"
+            f"{names[0]} is all it knows: whatever is shown is {names[0]} or unknown, and what is"
+            f" unknown is told from views of {names[0]} alone; teach what it may be mistaken for,"
+            " too"
         )
     first: dict[bytes, str] = {}
     for source, arrays in taught:

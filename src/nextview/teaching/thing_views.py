@@ -1,7 +1,7 @@
 """Render a thing from everywhere, clean and through a sensor, and compute its features."""
 
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -32,6 +32,7 @@ from nextview.geometry.viewsphere import (
 from nextview.recognition.inference import Features
 from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import unit
+from nextview.sensing.tabletop import LOWEST_TOP
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
@@ -164,7 +165,10 @@ def teach(path: Path, name: str, how: TeachingOptions, threads: int = 1) -> Arra
         "held_out": shown.astype(np.float16),
         "held_out_views": np.stack(directions, 1).astype(np.float32),
         "radii": np.array([np.nan if mesh.metres is None else mesh.metres], np.float32),
-        "doubts": np.frombuffer("\n".join(mesh_warnings(mesh)).encode(), np.uint8),
+        "doubts": np.frombuffer(
+            "\n".join([*mesh_warnings(mesh), *_flatness(lying)]).encode(),
+            np.uint8,
+        ),
         "pictures": _picture(
             SimulatedCamera(mesh, 64).observe(
                 look_at_origin(np.radians(25), np.radians(35))
@@ -172,6 +176,19 @@ def teach(path: Path, name: str, how: TeachingOptions, threads: int = 1) -> Arra
         ),
         **_surface(mesh, to_mesh),
     }
+
+
+def _flatness(lying: Sequence[Mesh]) -> Iterator[str]:
+    """A sentence where a thing can lie so flat that depth does not show it."""
+    if lying[0].metres is None:
+        return
+    height = min(float(np.ptp(mesh.vertices[:, 2])) * mesh.radius for mesh in lying)
+    if height < LOWEST_TOP:
+        yield (
+            f"it is {1000 * height:.2g} mm high where it lies flat, and on a table nothing lower"
+            f" than {1000 * LOWEST_TOP:.2g} mm is found by its depth: it is found only where it"
+            " stands or is held; how often it is named right is of views that show it alone"
+        )
 
 
 def _captured(path: Path, how: TeachingOptions) -> Capture:

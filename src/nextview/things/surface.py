@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from nextview.errors import MeshError
-from nextview.geometry.mesh import UNITS, Mesh
+from nextview.geometry.mesh import Mesh
 from nextview.geometry.ray_caster import embree_scene
 from nextview.types import Float, Float32, Index
 
@@ -59,8 +59,7 @@ class Surface:
                 f"{mesh.name}: the unit of length is not known; say it with --unit"
             )
 
-        in_file = mesh.vertices * mesh.radius + mesh.centre
-        vertices = (in_file * UNITS[mesh.unit]).astype(np.float32)
+        vertices = (mesh.vertices * mesh.radius + mesh.centre).astype(np.float32)
         return cls(name, vertices, np.ascontiguousarray(mesh.faces, np.int32))
 
     @cached_property
