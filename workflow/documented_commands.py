@@ -74,6 +74,9 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"^nextview explore": (
         "serves until it is stopped; tests/test_explore_page.py clicks through the page"
     ),
+    r"pyrealsense2|shot_0": (
+        "needs a camera; tests/test_pages.py runs the script with a stand-in and looks at its shots"
+    ),
     r"^rerun ": "opens a window",
     r"^dask ": "serves until it is stopped; tests/test_render.py has a cluster of its own",
     r"--scheduler": "needs the scheduler of the line before",
