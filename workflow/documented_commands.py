@@ -64,8 +64,6 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs the YCB scans; research/tests/test_arm_over_table.py has files of a few"
     ),
     r"^python benchmarks/tables\.py": "needs scans of all things that the bundled memory knows",
-    r"^make (test|lint|docs)": "a job of its own in CI",
-    r"^make demo": "installs; .ci/base_installation runs nextview demo, twice",
     r"^make ": "the workflow is run by tests/test_workflow.py",
     r"^(pip|python3 -m pip) ": "installs; tests/test_wheel.py installs the wheel with each extra",
     r"^nextview download": (
