@@ -22,6 +22,7 @@ lint: .venv-test/installed  ## style and types
 
 docs: .venv-test/installed  ## the documentation site, build/site/index.html; a broken link or notebook ends it
 	NO_MKDOCS_2_WARNING=1 .venv-test/bin/mkdocs build
+	@echo 'build/site/index.html; for its search: python3 -m http.server -d build/site'
 
 DATA ?= data/ModelNet10
 OUT ?= reproduction

@@ -1,7 +1,6 @@
 """The command line: its table of commands, how they end, and what they show."""
 
 import inspect
-import io
 import json
 import re
 import shutil
@@ -17,7 +16,6 @@ from typing import Literal, get_args, get_origin, get_type_hints
 import numpy as np
 import pytest
 from pipeline import run_python, some_predictions
-from rich.console import Console
 
 from nextview.checks import EXTRAS, extras
 from nextview.cli import progress
@@ -405,21 +403,20 @@ def test_a_stage_that_resumes_says_what_it_did(views, tmp_path, capsys, monkeypa
 
 def test_where_there_is_no_terminal_lines_tell_how_far_it_is_the_first_at_once(
     monkeypatch,
+    capsys,
 ):
-    file = io.StringIO()
     seconds = 0
-    monkeypatch.setattr(progress, "console", Console(file=file, width=80))
-    monkeypatch.setattr(progress.time, "monotonic", lambda: seconds)
+    monkeypatch.setattr("nextview.data.progress.time.monotonic", lambda: seconds)
 
     def steps():
         nonlocal seconds
-        assert file.getvalue() == "rendering v.zarr: begun, 100 in all\n"
+        assert capsys.readouterr().err == "rendering v.zarr: begun, 100 in all\n"
         while seconds < 100:
             seconds += 1
             yield seconds
 
     progress.track(steps(), 100, "rendering v.zarr")
-    lines = file.getvalue().splitlines()[1:]
+    lines = capsys.readouterr().err.splitlines()
     assert lines == [
         f"rendering v.zarr: {n} of 100 after {n} s" for n in (6, 17, 38, 69, 100)
     ]

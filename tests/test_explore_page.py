@@ -1,6 +1,8 @@
 """The explorer's page, driven from Python."""
 
+import gzip
 import http.client
+import re
 import time
 from contextlib import closing
 
@@ -80,6 +82,18 @@ def test_a_name_means_nothing_in_the_page_and_a_sensor_may_be_any():
         assert "<img" not in page._label.content
     finally:
         page.stop()
+
+
+@pytest.mark.parametrize("encoding", ["identity", "gzip"])
+def test_the_tab_of_the_browser_says_whose_page_it_is(page, encoding):
+    port = page.server.get_port()
+    with closing(http.client.HTTPConnection("127.0.0.1", port)) as connection:
+        connection.request("GET", "/", headers={"Accept-Encoding": encoding})
+        with connection.getresponse() as response:
+            body = response.read()
+            assert response.headers["Content-Encoding"] == encoding
+    shown = (gzip.decompress(body) if encoding == "gzip" else body).decode()
+    assert re.findall(r"<title>(.*?)</title>", shown) == ["nextview explore"]
 
 
 def sockets(page, **headers):

@@ -30,7 +30,7 @@ def test_a_file_appears_whole_and_replaces_nothing_unless_told(tmp_path):
     with files.new_file(path) as part:
         part.write_text("old")
     with (
-        pytest.raises(ResultsError, match="exists; give another name, or --overwrite"),
+        pytest.raises(ResultsError, match=r"overwrite=True .*--overwrite"),
         files.new_file(path),
     ):
         pass

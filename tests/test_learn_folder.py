@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 import nextview.teaching.learn as teaching
 from nextview import learn
 from nextview.cli.main import main
+from nextview.data.progress import silently
 from nextview.errors import DatasetError, UsageError
 from nextview.recognition.model_card import read_card
 from nextview.recognition.novelty import unit
@@ -187,6 +188,25 @@ def test_the_result_may_lie_beside_the_things_or_in_the_working_folder(
     printed = " ".join("".join(capsys.readouterr()).split())
     assert f"in {folder}: 2 in MESH" in printed
     assert ("mine: is where the result goes" in printed) == (out != ".")
+
+
+def test_from_python_it_tells_how_far_it_is_and_how_a_memory_is_replaced(
+    tmp_path,
+    capsys,
+    quickly,
+):
+    root = scans_in(tmp_path / "things", "box.ply", "tin.ply")
+    out = tmp_path / "mine"
+    learn(root, out, workers=0)
+    assert "things: begun, 2 in all\n" in capsys.readouterr().err
+    with pytest.raises(UsageError, match=r"overwrite=True .*--overwrite"):
+        learn(root, out, workers=0)
+    assert capsys.readouterr().err == ""
+
+    (root / "tin.ply").unlink()
+    learn(root, out, workers=0, overwrite=True, track=silently)
+    assert capsys.readouterr().err == ""
+    assert read_card(out / "memory.json").classes == ("box",)
 
 
 @pytest.mark.skipif(

@@ -115,7 +115,7 @@ def test_a_terminal_gets_a_name_as_it_is(tmp_path, name, shown, capsys):
     (tmp_path / name).unlink()
     assert (
         refused(capsys, "recognise", tmp_path / name)
-        == f"nextview: {tmp_path}/{shown}: no such file"
+        == f"nextview: {tmp_path}/{shown}: no such file or folder"
     )
 
 

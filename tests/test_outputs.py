@@ -134,7 +134,7 @@ def test_the_demo_draws_over_its_own_picture_and_no_other(
     monkeypatch.chdir(tmp_path)
     for _ in range(2):
         main(["demo"])
-    assert "the episode is drawn in nextview_demo.png" in capsys.readouterr().err
+    assert "wrote nextview_demo.png" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["nextview_demo.png"]
     mine = tmp_path / "mine.png"
     mine.write_bytes(b"mine")

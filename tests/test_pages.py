@@ -2,14 +2,18 @@
 
 import doctest
 import importlib
+import json
 import re
 import shutil
 import sys
+import types
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from pipeline import SAMPLE_FILES
+from small_tables import camera_over, view
 
 import nextview
 from nextview.cli.commands import COMMANDS
@@ -264,3 +268,107 @@ def test_making_it_ones_own_works_from_the_first_line_to_the_last(
         there / "benchmark/summary.csv"
     ).exists()
     assert list(there.rglob("*.html"))
+
+
+# From a RealSense
+
+
+class StandInCamera:
+    """What ``pyrealsense2`` is for the script of the page: its calls, on simulated depth images.
+
+    Every thirtieth image shows the table, those before nothing, as of a camera that has just begun.
+    """
+
+    def __init__(self, depth, matrix, scale):
+        self.images = iter(
+            np.zeros_like(depth) if n % 30 < 29 else depth for n in range(90)
+        )
+        self.intrinsics = SimpleNamespace(
+            width=depth.shape[1],
+            height=depth.shape[0],
+            fx=matrix[0, 0],
+            fy=matrix[1, 1],
+            ppx=matrix[0, 2],
+            ppy=matrix[1, 2],
+            coeffs=[0.0] * 5,
+        )
+        sensor = SimpleNamespace(get_depth_scale=lambda: scale)
+        device = SimpleNamespace(first_depth_sensor=lambda: sensor)
+        self.started = SimpleNamespace(get_device=lambda: device)
+        self.stopped = False
+
+    def module(self):
+        found = types.ModuleType("pyrealsense2")
+        found.stream = SimpleNamespace(depth="depth")
+        found.format = SimpleNamespace(z16="z16")
+        found.config = lambda: SimpleNamespace(enable_stream=lambda *_: None)
+        found.pipeline = lambda: SimpleNamespace(
+            start=lambda _: self.started,
+            wait_for_frames=lambda: SimpleNamespace(get_depth_frame=self._frame),
+            stop=self._stop,
+        )
+        return found
+
+    def _frame(self):
+        image = next(self.images)
+        profile = SimpleNamespace(intrinsics=self.intrinsics)
+        return SimpleNamespace(
+            get_data=lambda: image,
+            profile=SimpleNamespace(as_video_stream_profile=lambda: profile),
+        )
+
+    def _stop(self):
+        self.stopped = True
+
+
+@pytest.fixture
+def recorded(tmp_path, monkeypatch, ycb_meshes):
+    """The folder in which the script of the page has taken two shots of a simulated table."""
+    things = [ycb_meshes[name] for name in ("mug", "banana", "cracker_box")]
+    camera = camera_over(things, seed=5)
+    frame = camera.frame(view(20))
+    scale = 0.0005  # of a camera that does not count in millimetres
+    steps = np.where(frame.depth > 0, frame.depth / scale, 0).round().astype(np.uint16)
+    matrix = np.array(frame.intrinsics)
+    matrix[:2, 2] -= 0.5  # from a frame's own to the centre of the first pixel at 0
+    driver = StandInCamera(steps, matrix, scale)
+
+    page = (ROOT / "docs/from_a_realsense.md").read_text()
+    (script,) = re.findall(r"```python\n(.*?)```", page, re.S)
+    pressed = iter(["", "", "q"])
+    monkeypatch.setitem(sys.modules, "pyrealsense2", driver.module())
+    monkeypatch.setattr("builtins.input", lambda _: next(pressed))
+    monkeypatch.chdir(tmp_path)
+    exec(script, {})
+    assert driver.stopped
+    return tmp_path
+
+
+def test_what_the_page_writes_from_a_realsense_is_what_look_reads(recorded, capsys):
+    assert sorted(path.name for path in recorded.iterdir()) == ["shot_0", "shot_1"]
+    page = (ROOT / "docs/from_a_realsense.md").read_text()
+    for key in json.loads((recorded / "shot_1/intrinsics.json").read_text()):
+        assert f"`{key}`" in page, key
+
+    main(["look", "shot_1", "--json", "--figure", "shot_1.png"])
+    shown = capsys.readouterr()
+    names = {thing["name"] for thing in json.loads(shown.out)["objects"]}
+    assert {"mug", "banana", "cracker_box"} <= names
+    assert "wrote shot_1.png" in shown.err
+    assert (recorded / "shot_1.png").exists()
+
+
+def test_shots_with_poses_in_one_folder_are_looked_at_together(recorded, capsys):
+    table = recorded / "table"
+    shutil.copytree(recorded / "shot_0", table)
+    (table / "poses").mkdir()
+    for number in range(3):
+        name = f"{number:06d}"
+        if number:
+            shutil.copy(table / "depth/000000.png", table / f"depth/{name}.png")
+        np.savetxt(table / f"poses/{name}.txt", view(20))
+
+    main(["look", "table", "--frames", "2"])
+    shown = " ".join(capsys.readouterr().err.split())
+    assert "2 of the 3 frames are looked at, evenly spread; --frames 3 for all" in shown
+    assert "frames: begun, 2 in all" in shown

@@ -160,6 +160,9 @@ def test_every_bundled_policy_runs_live(chair, capsys):
     ("arguments", "words"),
     [
         (["missing.off"], "no such file"),
+        (["nowhere"], "nowhere: no such file"),
+        (["nowhere", "--point", "0", "0", "0"], "nowhere: no such file or folder"),
+        (["scans/mug", "--unit", "m"], "scans/mug: no such file or folder"),
         (["chair.off", "--start", "40"], "0 to 39"),
         (["chair.off", "--policy", "clairvoyant"], "no policy is called"),
         (["chair.off", "--risk", "0.000001"], "cannot promise"),

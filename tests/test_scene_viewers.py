@@ -130,7 +130,8 @@ def test_a_page_is_one_file_that_says_all(made, tmp_path, capsys):
     assert capsys.readouterr().out == ""
     page = path.read_text()
     assert "__VISER_EMBED_DATA__" in page
-    assert "&lt;b&gt;my table" in page
+    assert page.count("<title>&lt;b&gt;my table - nextview</title>") == 1
+    assert "<title>Viser" not in page
     assert "3 frames: 2 confident, 0 not confident, 0 unknown" in page
     for thing in scene.objects:
         assert f"{thing.number} {thing.name.replace('_', ' ')} <small>confident" in page

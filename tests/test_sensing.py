@@ -272,6 +272,29 @@ def test_a_mask_on_a_table_reaches_down_to_it():
     assert floating.object_frame.centre[2] > 0.09
 
 
+@pytest.mark.parametrize("told", [{}, {"point": (0, 0, 0.4)}])
+def test_what_stands_on_no_plane_is_told_by_a_mask_or_a_box(told):
+    """A brick that a rod holds above a table: no depth tells where the brick ends."""
+    brick = box((0.1, 0.06, 0.04), (0, 0, 0.4))
+    rod = box((0.02, 0.02, 0.3), (0, 0, 0.57))
+    pose = pose_at(25, 30, 0.7, (0, 0, 0.4))
+    depth, seen = cast([brick, rod, TABLE], pose)
+    whole = Frame(depth, INTRINSICS, pose, pixel_centre=0.5)
+
+    held = ObservedObject(support=False, **told)
+    with pytest.raises(ObservationError, match=r"support=False.*mask.*box") as refused:
+        held.add(whole)
+    assert "OpenGL" not in str(refused.value)
+
+    held.add(Frame(depth, INTRINSICS, pose, seen == 0, pixel_centre=0.5))
+    around = Box(np.array([-0.05, -0.03, 0.38]), np.array([0.05, 0.03, 0.42]))
+    boxed = ObservedObject(support=False, box=around)
+    boxed.add(whole)
+    for thing in (held, boxed):
+        assert np.linalg.norm(thing.object_frame.centre - (0, 0, 0.4)) < 0.03
+        assert thing.warnings == []
+
+
 # More frames
 
 

@@ -203,7 +203,7 @@ def test_half_way_the_result_is_what_is_believed_so_far(system, camera):
         None,
         (),
     )
-    assert repr(before) == "nothing is seen (0 views, 0.00 cells of travel)"
+    assert repr(before) == "nothing is seen (0 views)"
     view = session.update(camera.observe(session.pose))
     result = session.result
     assert result.views == (view,)

@@ -64,8 +64,6 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs the YCB scans; research/tests/test_arm_over_table.py has files of a few"
     ),
     r"^python benchmarks/tables\.py": "needs scans of all things that the bundled memory knows",
-    r"^make (test|lint|docs)": "a job of its own in CI",
-    r"^make demo": "installs; .ci/base_installation runs nextview demo, twice",
     r"^make ": "the workflow is run by tests/test_workflow.py",
     r"^(pip|python3 -m pip) ": "installs; tests/test_wheel.py installs the wheel with each extra",
     r"^nextview download": (
@@ -73,6 +71,9 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     ),
     r"^nextview explore": (
         "serves until it is stopped; tests/test_explore_page.py clicks through the page"
+    ),
+    r"pyrealsense2|shot_0": (
+        "needs a camera; tests/test_pages.py runs the script with a stand-in and looks at its shots"
     ),
     r"^rerun ": "opens a window",
     r"^dask ": "serves until it is stopped; tests/test_render.py has a cluster of its own",

@@ -1,13 +1,15 @@
 """Options of several commands: who looks, what is looked at, and files of pictures."""
 
+import os
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
 from nextview.captured.bag import At
+from nextview.checks import one_line
 from nextview.cli.progress import console
 from nextview.errors import UsageError
-from nextview.files import check_new
+from nextview.files import LONGEST_PATH, check_new
 from nextview.geometry.mesh import MAX_FACES, load_mesh, mesh_warnings
 from nextview.geometry.observation import Camera
 from nextview.session.session import FrameCamera
@@ -127,6 +129,7 @@ class ObjectOptions:
         Raises:
             UsageError: an option does not apply to this kind of input.
         """
+        check_there(path)
         folder = is_frames(path)
         of_meshes = ("unit", "sensor", "max_faces", "largest_part")
         for field in fields(self)[1:]:
@@ -172,6 +175,33 @@ class ObjectOptions:
             not self.raw,
             not self.by_shape,
         )
+
+
+def check_there(path: Path) -> None:
+    """Refuse a path of nothing before it is said what its options are for.
+
+    Args:
+        path: that was given.
+
+    Raises:
+        UsageError: there is no such file or folder.
+    """
+    if not os.path.exists(
+        path
+    ):  # not Path.exists, which raises where a name is too long
+        shown = one_line(str(path), LONGEST_PATH)
+        raise UsageError(f"{shown}: no such file or folder")
+
+
+def say_written(*paths: Path | None) -> None:
+    """Say on standard error which files were written.
+
+    Args:
+        paths: of the files; None where none was asked for.
+    """
+    for path in paths:
+        if path is not None:
+            console.print(f"wrote {path}", soft_wrap=True)
 
 
 def check_file(

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Literal
 
 from nextview.cli.common_options import check_file
-from nextview.cli.progress import console
 from nextview.cli.recognise import Output, show
 from nextview.data.samples import sample_mesh
 from nextview.session.system import load, simulated
@@ -34,4 +33,3 @@ def demo(
     camera = simulated(sample_mesh(shape))
     session = system.session_with(camera, start)
     show(session, camera, f"the sample {shape}", system.policy_name, output)
-    console.print(f"the episode is drawn in {output.figure}")

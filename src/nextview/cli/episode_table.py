@@ -8,7 +8,6 @@ from rich.console import JustifyMethod
 from rich.table import Table
 from rich.text import Text
 
-from nextview.checks import number_of
 from nextview.cli.exit_status import printable
 from nextview.cli.progress import Terminal
 from nextview.session.result import Recognition
@@ -52,10 +51,18 @@ def print_episode(
     console.print(_answer_in_words(result, has_threshold))
     if result.novelty is not None and not result.unknown:
         console.print(
-            f"Novelty: of known objects, {100 * result.novelty:.3g} % look at least as unusual."
+            f"Known or unknown: {100 * result.novelty:.3g} % of known objects fit as badly as this"
+            f" one or worse; {_limit_in_words(result.unknown_rate)}."
         )
     for line in _pose_in_words(result):
         console.print(line, soft_wrap=True)
+
+
+def _limit_in_words(unknown_rate: float) -> str:
+    """Below which novelty an object is called unknown."""
+    if not unknown_rate:
+        return "none is called unknown, as asked for"
+    return f"below {100 * unknown_rate:.3g} % it would be called unknown"
 
 
 def _table_of_views(
@@ -69,7 +76,7 @@ def _table_of_views(
     table = Table(box=box.SIMPLE, show_lines=True, pad_edge=False, padding=(0, 1, 0, 0))
     table.title = f"Looking at {name}, next views by {policy}"
     table.caption = (
-        "view: number, elevation, azimuth; travel: grid cells; "
+        "view: number, elevation, azimuth; travel: around the object; "
         f"stops by {result.stopping}"
     )
 
@@ -108,15 +115,14 @@ def _table_of_views(
             belief,
             *stop,
             after,
-            f"{view.travel:.2f}",
+            f"{np.degrees(view.arc):.0f}°",
         )
     return table
 
 
 def _answer_in_words(result: Recognition, has_threshold: bool) -> Text:
     """What the object is, or that it is unknown, and after how many views."""
-    views = number_of(len(result.views), "view")
-    effort = f"after {views} and {result.travel:.2f} cells of travel"
+    effort = f"after {result.effort_in_words}"
     if result.unknown:
         why = f": {printable(result.why_unknown)}, {effort}."
         return Text.assemble("It is ", (printable(result.none_of_them), "bold"), why)

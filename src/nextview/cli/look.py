@@ -16,7 +16,7 @@ from nextview.captured.camera import UP
 from nextview.captured.check import check_capture
 from nextview.captured.folders import Capture, read_capture
 from nextview.checks import extras
-from nextview.cli.common_options import Three, check_file
+from nextview.cli.common_options import Three, check_file, say_written
 from nextview.cli.progress import Terminal, console, track
 from nextview.errors import ObservationError, UsageError
 from nextview.files import new_file
@@ -155,6 +155,7 @@ def look(
         from nextview.viewers.scene_page import write_scene_page
 
         write_scene_page(scene, output.explorer, path.name, output.overwrite)
+    say_written(output.figure, output.explorer, output.record)
 
 
 def _look_at_frames(
@@ -177,7 +178,14 @@ def _look_at_frames(
         What each frame changed, by its name.
     """
     looks: dict[str, Look] = {}
-    few = np.unique(np.linspace(0, len(capture.frames) - 1, most).round().astype(int))
+    there = len(capture.frames)
+    few = np.unique(np.linspace(0, there - 1, most).round().astype(int))
+    if len(few) < there:
+        console.print(
+            f"{len(few)} of the {there} frames are looked at, evenly spread; --frames {there} for"
+            " all",
+            soft_wrap=True,
+        )
 
     def each() -> Any:
         for done, row in enumerate(few, 1):

@@ -1,6 +1,5 @@
 """Progress on standard error: a bar in a terminal, else lines, the first one at once."""
 
-import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -10,10 +9,7 @@ from rich.table import Column
 from rich.text import Text
 
 from nextview.cli.exit_status import printable
-
-# seconds to the second line where the output is no terminal, and between two lines in the end
-FIRST_WAIT = 5.0
-LONGEST_WAIT = 30.0
+from nextview.data.progress import in_lines
 
 
 class Terminal(Console):
@@ -38,7 +34,10 @@ def track(done: Iterable[int], total: int, what: str, /) -> None:
         total: number that is reached at the end.
         what: name of the work.
     """
-    (_show_bar if console.is_terminal else _print_lines)(done, total, what)
+    if console.is_terminal:
+        _show_bar(done, total, what)
+    else:
+        in_lines(done, total, printable(what))
 
 
 def follow(steps: Iterator[tuple[int, int]], what: str) -> tuple[int, int]:
@@ -121,19 +120,3 @@ def _show_bar(done: Iterable[int], total: int, what: str) -> None:
             if task is None:
                 task = shown.add_task(printable(what), total=total, completed=n)
             shown.update(task, completed=n)
-
-
-def _print_lines(done: Iterable[int], total: int, what: str) -> None:
-    """Print a line when the work begins, and then less and less often."""
-    console.print(f"{what}: begun, {total} in all", soft_wrap=True)
-    begun = last = time.monotonic()
-    wait = FIRST_WAIT
-    for n in done:
-        now = time.monotonic()
-        if now - last > wait:
-            console.print(
-                f"{what}: {n} of {total} after {now - begun:.0f} s",
-                soft_wrap=True,
-            )
-            last = now
-            wait = min(2 * wait, LONGEST_WAIT)

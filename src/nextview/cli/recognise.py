@@ -5,7 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nextview.cli.common_options import EpisodeOptions, ObjectOptions, check_file
+from nextview.cli.common_options import (
+    EpisodeOptions,
+    ObjectOptions,
+    check_file,
+    say_written,
+)
 from nextview.cli.episode_table import print_episode
 from nextview.cli.progress import console
 from nextview.errors import NextviewError, ObservationError, UsageError
@@ -136,3 +141,4 @@ def show(
     if output.figure is not None:
         with new_file(output.figure, output.overwrite) as part:
             result.plot(part, name)
+    say_written(output.figure, output.record)

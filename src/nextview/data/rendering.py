@@ -28,7 +28,7 @@ from nextview.data.store import (
     writing,
 )
 from nextview.errors import DatasetError, MeshError, UsageError
-from nextview.files import command, sha256_of
+from nextview.files import OVERWRITE, command, sha256_of
 from nextview.geometry.depth import CLOUD_POINTS
 from nextview.geometry.mesh import (
     FORMATS,
@@ -389,7 +389,7 @@ def _begin(path: Path, wanted: Attributes, overwrite: bool) -> ViewStore:
             if overwrite:
                 return ViewStore.create(path, wanted, overwrite)
             raise DatasetError(
-                f"{path}: was begun with other {key}; give another store, or --overwrite to"
+                f"{path}: was begun with other {key}; give another store, or {OVERWRITE} to"
                 " replace it"
             )
     if wanted.unit is not None and there.unit is None:

@@ -268,7 +268,7 @@ def load_mesh(
         raise MeshError(
             f"{path}: the unit is one of {', '.join(UNITS)}, not {one_line(repr(unit))}"
         )
-    if suffix not in FORMATS and not os.path.isdir(path):
+    if suffix not in FORMATS and os.path.isfile(path):
         raise MeshError(
             f"{path}: not a mesh format nextview reads ({', '.join(FORMATS)})"
         )

@@ -48,6 +48,11 @@ LESS_NOVEL = 1.0
 SIZE_CHANGE = 2.0
 # change of the centre or the radius, in object radii, below which the object frame is left as it is
 SAME_FRAME = 0.01
+NO_OUTLINE = (
+    "an object that stands on no plane (support=False) is told from what holds it by a mask in each"
+    " frame, Frame(..., mask=...), or by a box, ObservedObject(box=...); a point selects a thing on"
+    " a support plane only"
+)
 NO_PLANE = ViewWarning(
     "support",
     "no support plane is seen, so where the object ends below is guessed: support=False if it"
@@ -100,8 +105,8 @@ class ObservedObject:
             support plane of the first frame. Frames without a pose have no other way.
         point: near the object, world, metres, (3,).
         box: upright, into which the object just fits.
-        support: whether the object stands on a plane in view. False for a gripper or a turntable
-            that masks cut out.
+        support: whether the object stands on a plane in view. False for a gripper or a turntable:
+            then the object is given by the mask of each frame, by a box or by its known frame.
         known: the object frame, if it need not be estimated; the object is what lies in its sphere.
         denoise: smooth depth, fill holes and drop flying pixels. For sensors; renders need it not.
         life_size: whether the object is as large as its kind is in life: then the radius is
@@ -352,6 +357,8 @@ class ObservedObject:
             mask = segmentation.inside_mask(frame, plane, noise)
         elif self.known is not None:
             mask = segmentation.inside_region(frame, self.known, self.box, plane, noise)
+        elif not self.support:
+            raise ObservationError(NO_OUTLINE)
         else:
             return self._segment_on_plane(frame, axes, plane, samples, noise)
 

@@ -315,11 +315,20 @@ class Recognition:
         """Of the whole episode, grid cells."""
         return self.views[-1].travel if self.views else 0.0
 
+    @property
+    def effort_in_words(self) -> str:
+        """How many views there were and how far the camera moved between them, as angles.
+
+        It reads ``2 views, moved by 63° around it``.
+        """
+        views = number_of(len(self.views), "view")
+        if len(self.views) < 2:
+            return views
+        return f"{views}, moved by {np.degrees(self.views[-1].arc):.0f}° around it"
+
     def __repr__(self) -> str:
-        """One line: ``chair (belief 0.998, 2 views, 1.41 cells of travel, confident)``."""
-        views = (
-            f"{number_of(len(self.views), 'view')}, {self.travel:.2f} cells of travel"
-        )
+        """One line: ``chair (belief 0.998, 2 views, moved by 63° around it, confident)``."""
+        views = self.effort_in_words
 
         if not self.seen:
             return f"nothing is seen ({views})"

@@ -124,7 +124,7 @@ class System:
                 any.
             any_orientation: it is a taught thing that may be held, lean or fly: it need not rest
                 as it was taught. A frame takes about twice as long. What hangs in the air is found
-                by a mask, or near a point, with ``ObservedObject(support=False)``.
+                by a mask or in a box, with ``ObservedObject(support=False)``.
             goal: "thing" looks until it is sure which thing it is; "pose" until its pose is as
                 sure, too, see ``Session.goal``.
 

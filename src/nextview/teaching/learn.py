@@ -17,9 +17,10 @@ from safetensors.numpy import load_file, save_file
 
 from nextview.data.pool import WorkerDied, each
 from nextview.data.pool import count as count_workers
-from nextview.data.progress import TrackProgress, silently
+from nextview.data.progress import TrackProgress, in_lines, silently
 from nextview.errors import DatasetError, NextviewError, UsageError
 from nextview.files import (
+    OVERWRITE,
     check_new,
     command,
     new_file,
@@ -192,7 +193,7 @@ class LearnOptions(TypedDict, total=False):
         workers: number of processes; None for one on each core, 0 for this process.
         scheduler: address of a dask.distributed scheduler to use instead.
         overwrite: whether to replace an existing memory.
-        track: follows the work; by default nothing is shown.
+        track: follows the work; by default it is told in lines on standard error.
     """
 
     unit: Literal["mm", "cm", "inch", "foot", "m"] | None
@@ -242,7 +243,7 @@ def learn(
         >>> nextview.learn("scans", "mine", unit="m")  # doctest: +SKIP
         >>> nextview.load(models="mine").recognise("scans/mug.ply", unit="m")  # doctest: +SKIP
     """
-    given: dict[str, Any] = dict(options)
+    given: dict[str, Any] = {"track": in_lines} | options
     names = TeachingOptions.__dataclass_fields__
     how = {name: given.pop(name) for name in names if name in given}
     return learn_things(Path(folder), Path(out), TeachingOptions(**how), **given)
@@ -328,7 +329,8 @@ def _check_places(out: Path, keeps: bool, overwrite: bool) -> None:
     card = out / CARD
     if card.exists() and not keeps and not overwrite:
         raise UsageError(
-            f"{out}: already knows things; --add adds others, --overwrite replaces them"
+            f"{out}: already knows things; add=True (in a shell: --add) adds others,"
+            f" {OVERWRITE} replaces them"
         )
     check_new(out, keeps or overwrite, folder=True)
     for place in (card, out / LEARNED_PICTURE):

@@ -1,6 +1,7 @@
 """The explorer's page: passes clicks to an ``Exploration`` and draws its state."""
 
 import errno
+import gzip
 import re
 import socket
 import threading
@@ -8,6 +9,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from html import escape
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -36,6 +38,8 @@ APART = 8.5  # between two objects side by side, object radii
 LAMP_PLACE = (-4.0, -5.0, 8.0)  # where it hangs
 # between the views of a policy that walks, seconds: long enough to see each
 PAUSE = 0.5
+PAGE_TITLE = "nextview explore"
+VISER_TITLE = "<title>Viser</title>"  # of every page that viser makes
 HELP = """Click a **ball** to look from there, or drag the **arrows**. The large **red** ball is where the policy would
 look next. Yellow views promise most, violet ones least; small dark ones are done."""
 _starting = threading.Lock()
@@ -68,7 +72,7 @@ class Page:
             show_share_button=False,
             brand_color=(209, 73, 91),
         )
-        gui.set_panel_label("nextview explore")
+        gui.set_panel_label(PAGE_TITLE)
         scene.set_up_direction("+z")
         # darkens a little towards the ground
         sky = np.linspace(rgb(PAPER), rgb(SAND), 256)
@@ -364,11 +368,9 @@ def serve(host: str, port: int) -> viser.ViserServer:
         def check(connection: Any, request: Any) -> Any:
             headers = request.headers
             reason = refused(headers.get_all("Host"), headers.get_all("Origin"), host)
-            return (
-                connection.respond(403, f"{reason}\n")
-                if reason
-                else process_request(connection, request)
-            )
+            if reason:
+                return connection.respond(403, f"{reason}\n")
+            return _with_title(process_request(connection, request))
 
         return plain(handler, *address, process_request=check, **options)
 
@@ -378,13 +380,36 @@ def serve(host: str, port: int) -> viser.ViserServer:
             server = viser.ViserServer(
                 host,
                 port,
-                label="nextview explore",
+                label=PAGE_TITLE,
                 verbose=False,
             )
         finally:
             websocket.serve = plain  # type: ignore[misc]
     server.request_share_url = lambda verbose=True: None  # no visitor opens a tunnel
     return server
+
+
+def titled(page: str, title: str) -> str:
+    """A page of viser's under a title of its own, which the tab of the browser shows.
+
+    Args:
+        page: HTML.
+        title: plain text.
+    """
+    return page.replace(VISER_TITLE, f"<title>{escape(title)}</title>", 1)
+
+
+def _with_title(response: Any) -> Any:
+    """What the server answers, with the title of the explorer where it is the page itself."""
+    if response is None or "text/html" not in response.headers.get("Content-Type", ""):
+        return response
+    zipped = response.headers.get("Content-Encoding") == "gzip"
+    body = gzip.decompress(response.body) if zipped else response.body
+    page = titled(body.decode(), PAGE_TITLE).encode()
+    response.body = gzip.compress(page) if zipped else page
+    del response.headers["Content-Length"]
+    response.headers["Content-Length"] = str(len(response.body))
+    return response
 
 
 def refused(hosts: Sequence[str], origins: Sequence[str], served: str) -> str | None:

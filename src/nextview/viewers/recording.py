@@ -198,8 +198,8 @@ class Recorder:
         onward = "the end" if to is None else f"next view {to}"
         believed = f"{session.models.classes[best]} {view.belief[best]:.3f}"
         self._log_text(
-            f"step {step}: view {view.index}, {believed}, {view.travel:.2f} cells of travel,"
-            f" {onward}"
+            f"step {step}: view {view.index}, {believed}, moved by"
+            f" {np.degrees(view.arc):.0f}° around it so far, {onward}"
         )
 
     def _log_text(self, text: str, level: str = rr.TextLogLevel.INFO) -> None:

@@ -28,7 +28,7 @@ from nextview.viewers.scene_shapes import colour_of, named, placed_shape, points
 with extras():
     import viser
 
-    from nextview.viewers.page import serve
+    from nextview.viewers.page import serve, titled
 
 PAGE_CANDIDATES = 4  # things of which the belief is shown for an object
 LEAST_BELIEF = 0.005  # of what is shown
@@ -97,7 +97,7 @@ def write_scene_page(
         server = serve("127.0.0.1", 0)
         try:
             draw_scene_in_3d(server, scene)
-            page = server.scene.as_html()
+            page = titled(server.scene.as_html(), f"{title} - nextview")
         finally:
             server.stop()
     before, end, after = page.rpartition("</body>")
@@ -125,7 +125,9 @@ def scene_card(scene: Scene, title: str) -> str:
     if not objects:
         said = f"{frames}: nothing stands on the plane"
     parts = "".join(_object_card(thing) for thing in objects)
-    return f'{PANEL}<div class="nv"><h1>{escape(title)}</h1><p>{said}</p>{parts}</div>'
+    # reached by Tab, so that it can be scrolled without a mouse
+    panel = '<div class="nv" role="region" aria-label="what was found" tabindex="0">'
+    return f"{PANEL}{panel}<h1>{escape(title)}</h1><p>{said}</p>{parts}</div>"
 
 
 def _object_card(thing: SceneObject) -> str:
