@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nextview.checks import number, number_of
+from nextview.checks import number
 from nextview.errors import ObservationError, SessionError
 from nextview.scene.floating import floating
 from nextview.scene.following import (
@@ -30,7 +30,7 @@ from nextview.scene.judging import Judge
 from nextview.scene.next_view import best, candidates, is_sure, values
 from nextview.scene.objects import SceneObject
 from nextview.scene.parting import GOOD_FIT, Bench, merged, new_track, part, taken_over
-from nextview.scene.state import SceneState
+from nextview.scene.state import MOST_VERIFIED, SceneState
 from nextview.scene.tracks import Track, render_track
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import KnownFrames
@@ -48,8 +48,6 @@ if TYPE_CHECKING:
 
 ENOUGH_FRAMES = 2  # of an object that is sure, after which it is not judged anew
 CORES = 2  # objects that are judged at the same time
-# objects that are verified in a frame at most, those with the most pixels first
-MOST_VERIFIED = 20
 WRONG_POSE = (
     "this frame does not fit the others and is left out: most objects are not where they were, so"
     " its pose is likely to be wrong"
@@ -66,11 +64,6 @@ MOVED_OR_POSE = ViewWarning(
 LOWER_GROUND = ViewWarning(
     "ground",
     "this frame shows that the ground is lower than it was taken to be: all frames are judged anew",
-)
-EMPTY_WARNING = ViewWarning("empty", "nothing stands on the plane in this frame")
-UNSEEN_GROUND = ViewWarning(
-    "ground unseen",
-    "no object is found, and less than half of the ground is seen: something may stand there",
 )
 
 
@@ -153,9 +146,9 @@ class Scene:
         return tuple(SceneObject.of(track, state.touching) for track in tracks)
 
     @property
-    def left_unknown(self) -> int:
-        """How many small objects of the last frame were not verified, and are in no list."""
-        return self._state.left_unknown
+    def remarks(self) -> tuple[ViewWarning, ...]:
+        """What is left open: small objects that were not verified, what is no object, no ground."""
+        return self._state.remarks
 
     @property
     def tops(self) -> tuple[TableTop, ...]:
@@ -498,35 +491,8 @@ def _numbered(
         next_number=number,
     )
     look = Look(True, tuple(appeared), tuple(moved), gone, tuple(joined))
-    return after, replace(look, warnings=_warnings_of(after))
-
-
-def _warnings_of(state: SceneState) -> tuple[ViewWarning, ...]:
-    """What is likely to be wrong with the last frame, and what it leaves open."""
-    warnings = state.tops[-1].warnings
-    if state.left_unknown:
-        small = number_of(state.left_unknown, "small object")
-        warnings += (
-            ViewWarning(
-                "left unknown",
-                f"{small} left unknown: at most {MOST_VERIFIED} objects are verified in a frame,"
-                " the largest first",
-                holds=False,
-            ),
-        )
-    if state.unexplained:
-        area = 1e4 * sum(one.area for one in state.unexplained)
-        warnings += (
-            ViewWarning(
-                "unexplained",
-                f"{area:.0f} square centimetres in view are neither ground nor an object: is the"
-                " ground taken for another plane, or does a box stand there?",
-                holds=False,
-            ),
-        )
-    elif not state.tracks:
-        warnings += (EMPTY_WARNING if state.ground_seen else UNSEEN_GROUND,)
-    return warnings
+    warnings = (*state.tops[-1].warnings, *after.remarks)
+    return after, replace(look, warnings=warnings)
 
 
 def _touching(

@@ -7,12 +7,22 @@ from functools import cached_property
 
 import numpy as np
 
+from nextview.checks import number_of
 from nextview.scene.next_view import FEWEST_HIDDEN, TableGround, is_sure
 from nextview.scene.tracks import Track
 from nextview.scene.unexplained import UnexplainedPatch, ground_seen, unexplained
 from nextview.sensing.object_frame import Box
+from nextview.sensing.plausibility import ViewWarning
 from nextview.sensing.tabletop import TableTop
 from nextview.types import Float
+
+# objects that are verified in a frame at most, those with the most pixels first
+MOST_VERIFIED = 20
+EMPTY_WARNING = ViewWarning("empty", "nothing stands on the plane in this frame")
+UNSEEN_GROUND = ViewWarning(
+    "ground unseen",
+    "no object is found, but less than half of the ground is seen: something may stand there",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,3 +71,22 @@ class SceneState:
         of_objects = [one.hull for each in self.tracks for one in each.thing.sightings]
         corners = of_objects or [patch.points for patch in self.unexplained]
         return np.concatenate([np.zeros((0, 3)), *corners])
+
+    @property
+    def remarks(self) -> tuple[ViewWarning, ...]:
+        """What the frames leave open, or that nothing is there; none before the first frame."""
+        remarks = []
+        if self.left_unknown:
+            small = number_of(self.left_unknown, "small object")
+            what = f"{small} left unknown: at most {MOST_VERIFIED} objects are verified in a frame"
+            remarks.append(
+                ViewWarning("left unknown", f"{what}, the largest first", holds=False)
+            )
+        if self.unexplained:
+            area = 1e4 * sum(patch.area for patch in self.unexplained)
+            what = f"{area:.0f} square centimetres in view are neither ground nor an object"
+            why = "is the ground another plane, or is much of a thing not told apart?"
+            remarks.append(ViewWarning("unexplained", f"{what}: {why}", holds=False))
+        elif self.tops and not self.tracks:
+            remarks.append(EMPTY_WARNING if self.ground_seen else UNSEEN_GROUND)
+        return tuple(remarks)

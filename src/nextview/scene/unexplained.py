@@ -19,6 +19,8 @@ from nextview.sensing.tabletop import LOWEST_SHARE, NEAR_TABLE, THINNEST, TableT
 from nextview.types import Float, Mask
 
 NEAR_DEVIATIONS = 4.0  # of the noise by which the ground's pixels deviate, at most
+# metres at a distance of 1 m, standard deviation: what is noisier is no noise, but many small steps
+NOISIEST_CAMERA = 0.005
 CONSIDERABLE_AREA = 1e-3  # square metres that are seen: a patch of 3 cm
 PATCH_GAP = 0.02  # metres between the parts of a patch, at most
 PATCH_POINTS = 400  # points of a patch that are looked at
@@ -95,7 +97,8 @@ def _near_ground(top: TableTop) -> Mask:
     """Pixels so near to the ground that they are likely to be its own, (H, W) bool."""
     depth = top.frame.depth
     near = np.maximum(NEAR_TABLE, LOWEST_SHARE * depth)
-    near = np.maximum(near, NEAR_DEVIATIONS * top.noise.at(depth) * depth**2)
+    sigma = np.minimum(top.noise.at(depth), NOISIEST_CAMERA) * depth**2
+    near = np.maximum(near, NEAR_DEVIATIONS * sigma)
     return np.asarray(np.abs(top.height) <= near)
 
 

@@ -106,6 +106,7 @@ class TableTop:
         noise = noise_of(frame)
         samples = sample(frame, frame.depth > 0, noise)
         lower = False
+        shows_ground = True
         if ground is None:
             ground = _find_ground(frame, samples, up, widest)
         else:
@@ -120,9 +121,12 @@ class TableTop:
                 near = _near(samples, known)
                 plane = planes.find_again(ground.plane, samples, near)
                 # few samples fit a plane that leans: a later frame may not show the floor
-                if ground.wide or plane.holds(samples).mean() > LEAST_SUPPORT:
+                enough = bool(plane.holds(samples).mean() > LEAST_SUPPORT)
+                shows_ground = enough and planes.is_seen(plane, samples)
+                if ground.wide or enough:
                     ground = replace(ground, plane=plane)
         plane = ground.plane
+        shows_ground &= ground.seen
 
         above = segmentation.above_plane(frame, plane, noise)
         walls = find_walls(samples, plane, np.random.default_rng(0))
@@ -147,7 +151,7 @@ class TableTop:
             height,
             tuple(levels),
             lower,
-            ground.seen and bool(plane.holds(samples).mean() > LEAST_SUPPORT),
+            shows_ground,
         )
 
     @property
