@@ -118,9 +118,10 @@ def test_a_look_tells_which_numbers_end_in_another_object(ycb, ycb_meshes):
     camera = camera_over([ycb_meshes["mug"], ycb_meshes["cracker_box"]])
     scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20)))
-    mug = next(track for track in scene._tracks if track.result.answer == "mug")
+    mug = next(track for track in scene._state.tracks if track.result.answer == "mug")
     # as if another frame had shown it as another one
-    scene._tracks.append(replace(mug, number=7))
+    state = scene._state
+    scene._state = replace(state, tracks=(*state.tracks, replace(mug, number=7)))
     look = scene.update(camera.frame(view(140)))
     assert look.joined == ((7, mug.number),)
     assert look.appeared == look.gone == look.moved == ()
@@ -224,12 +225,12 @@ def test_what_stands_behind_another_thing_is_not_seen(ycb, ycb_meshes):
     camera = camera_over([ycb_meshes["cracker_box"], ycb_meshes["tomato_soup_can"]])
     scene = nextview.Scene(ycb)
     scene.update(camera.frame(view(20, elevation=65.0)))
-    tracks = {track.result.most_like: track for track in scene._tracks}
+    tracks = {track.result.most_like: track for track in scene._state.tracks}
     box, can = (
         tracks[name].thing.object_frame.centre
         for name in ("cracker_box", "tomato_soup_can")
     )
-    ground = TableGround.of(scene.tops, scene._tracks)
+    ground = TableGround.of(scene.tops, scene._state.tracks)
     away = (box - can)[:2] / np.linalg.norm((box - can)[:2])
     behind_the_box = np.append(box[:2] + 0.5 * away, 0.08)
     before_the_can = np.append(can[:2] - 0.5 * away, 0.08)

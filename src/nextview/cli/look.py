@@ -234,8 +234,9 @@ def print_scene(scene: Scene, name: str) -> None:
     """
     objects = scene.objects
     console = Terminal()
+    remarks = [f"{remark.message}." for remark in scene.remarks]
     if not objects:
-        console.print(f"{name}: nothing stands on the plane.")
+        console.print(f"{name}: {' '.join(remarks)}")
         return
     table = Table(box=box.SIMPLE, pad_edge=False, padding=(0, 1, 0, 0))
     frames = len(scene.frames)
@@ -249,5 +250,5 @@ def print_scene(scene: Scene, name: str) -> None:
         table.add_row(*row_of(thing))
 
     console.print(table)
-    for line in doubts_of(scene):
+    for line in (*doubts_of(scene), *remarks):
         console.print(line)

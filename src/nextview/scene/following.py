@@ -278,6 +278,17 @@ def _points_in(points: Float, frame: Frame) -> tuple[tuple[Index, Index], Float]
     return (row[seen], column[seen]), (depth - in_camera[inside, 2])[seen]
 
 
+def seen_through(points: Float, frame: Frame) -> float:
+    """Share of points, (N, 3), world, metres, through which a frame sees something behind them.
+
+    0 where the frame shows too few of them.
+    """
+    _, off = _points_in(points, frame)
+    if len(off) < FEWEST_TESTED:
+        return 0.0
+    return float((off > STEP_BEHIND).mean())
+
+
 def contradicted(found: Sequence[SegmentAgreement]) -> bool:
     """Whether a frame contradicts so many objects that its pose is wrong, not that they moved."""
     against = sum(one.contradicts for one in found)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -20,7 +21,7 @@ from nextview.session.pose_frame import PoseFrame
 from nextview.session.result import SUSPICIOUS, Recognition
 from nextview.session.session import THING_SIZE
 from nextview.session.system import System
-from nextview.session.view import View
+from nextview.session.view import View, is_doubtful
 from nextview.types import Floats
 
 
@@ -40,6 +41,13 @@ class Judge:
         self.system = system
         self._threads = threads
         self._said: WeakKeyDictionary[Observation, Evidence] = WeakKeyDictionary()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what the networks said, which is asked anew."""
+        return vars(self) | {"_said": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _said=WeakKeyDictionary())
 
     def __call__(self, things: Sequence[ObservedObject]) -> list[Recognition]:
         """Judge some objects.
@@ -71,7 +79,7 @@ class Judge:
         recogniser = system.models.recogniser
         seen = [one for one in thing.observations if one.seen]
         joint = None
-        views = self._views(thing.observations)
+        views = self._views(thing)
         if seen and isinstance(recogniser, JudgesTogether):
             total = np.sum([self._log_evidence(one) for one in seen], axis=0)
             joint = recogniser.together(seen, total, len(seen))
@@ -96,7 +104,7 @@ class Judge:
         azimuth = azimuth_of(direction_of(seen.pose)[None])
         return np.asarray(log_evidence_of(found.logits, found.azimuth_bins, azimuth)[0])
 
-    def _views(self, observations: Sequence[Observation]) -> list[View]:
+    def _views(self, thing: ObservedObject) -> list[View]:
         """The views of an object, each with what it says alone and with those before it."""
         calibration = self.system.models.recogniser.calibration
         sphere = self.system.sphere
@@ -107,7 +115,7 @@ class Judge:
         belief = even
         views = []
 
-        for seen in observations:
+        for number, seen in enumerate(thing.observations):
             alone = even
             score: ViewScore | None = None
             if seen.seen:
@@ -130,6 +138,7 @@ class Judge:
                 arc=0.0,
                 direction=direction,
                 score=score,
+                warnings=thing.warnings_of_view(number),
             )
             views.append(view)
 
@@ -160,6 +169,8 @@ class Judge:
         """Whether the belief is high enough, and the object fits what it is taken for."""
         system = self.system
         if not result.seen or result.unknown:
+            return False
+        if is_doubtful([view.warnings for view in result.views]):
             return False
         counted = np.cumsum([view.observation.seen for view in result.views])
         beliefs = np.stack([view.belief for view in result.views])

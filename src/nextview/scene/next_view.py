@@ -209,7 +209,8 @@ def is_sure(track: Track) -> bool:
         return False
     if track.confident:
         return True
-    return bool(result.unknown and len(track.frames) >= ENOUGH_VIEWS)
+    settled = not track.lately_named and len(track.frames) >= ENOUGH_VIEWS
+    return bool(result.unknown and settled)
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +231,7 @@ class Candidates:
 def candidates(
     system: System,
     tops: Sequence[TableTop],
-    tracks: Sequence[Track],
+    around: Float,
     distance: float | None,
 ) -> Candidates:
     """Views from around a scene, all at one distance from its middle.
@@ -238,14 +239,11 @@ def candidates(
     Args:
         system: with the directions of the candidates.
         tops: what the frames show.
-        tracks: the objects.
+        around: corners of what is looked at, (N, 3), world, metres.
         distance: of the cameras from the middle, metres; None: that of the last camera.
     """
     axes = upright_axes(tops[0].up)
-    hulls = np.concatenate(
-        [one.hull for track in tracks for one in track.thing.sightings]
-    )
-    middle = (hulls.min(0) + hulls.max(0)) / 2
+    middle = (around.min(0) + around.max(0)) / 2
     places = np.stack([top.frame.camera_to_world[:3, 3] for top in tops])
     away = float(np.linalg.norm(places[-1] - middle)) if distance is None else distance
     poses = ObjectFrame(middle, away / 3, axes).pose_in_world(system.sphere.poses, away)
@@ -272,9 +270,11 @@ def values(
     Args:
         system: that knows the things.
         tops: what the frames show, at least one.
-        tracks: the objects, at least one, judged.
+        tracks: the objects, judged. Without any, a view is worth by how far it is from others.
         views: the candidates.
     """
+    if not tracks:
+        return _from_elsewhere(tops, views)
     worth = np.zeros(len(views.poses))
     ground = TableGround.of(tops, tracks)
     for track in tracks:
@@ -318,6 +318,15 @@ def _information(system: System, track: Track, views: Candidates) -> Float | Non
     inside = frame.pose_in_object(views.poses)
     inside[:, :3, 3] *= frame.radius
     return np.asarray(outlook.expect(inside).information("thing"))
+
+
+def _from_elsewhere(tops: Sequence[TableTop], views: Candidates) -> Float:
+    """What each view is worth by how far it is from those of all frames, nats, (V,)."""
+    turned = np.full(len(views.poses), np.pi)
+    for top in tops:
+        ahead = views.poses[:, :3, 2] @ top.frame.camera_to_world[:3, 2]
+        turned = np.minimum(turned, np.arccos(np.clip(ahead, -1, 1)))
+    return UNKNOWN_WORTH * turned / np.pi
 
 
 def _from_another_side(

@@ -248,11 +248,11 @@ def _taken(loser: Track, taker: Track, bench: Bench) -> tuple[Track, Track] | No
     if mask is None or rendered is None:
         return None
 
-    own = mask & rendered.explained(mask.shape)
-    count = int(np.count_nonzero(own))
+    count = int(np.count_nonzero(mask[rendered.part] & rendered.agrees))
     if count < FEWEST_OBJECT_PIXELS or count < LEAST_TAKEN * np.count_nonzero(mask):
         return None
 
+    own = mask & rendered.explained(mask.shape)
     rest = mask & ~rendered.around(mask.shape)
     before = taker.mask_in(bench.number)
     own = own if before is None else own | before
@@ -361,12 +361,16 @@ def _groups(tracks: Sequence[Track], bench: Bench) -> list[tuple[int, ...]]:
     masks = [track.mask_in(bench.number) for track in tracks]
     good = np.array([bench.is_good(track) for track in tracks], bool)
     linked = np.zeros((len(tracks), len(tracks)), bool)
+    near = set(bench.top.neighbours(masks, NEAR_GAP))
     for one, other in combinations(range(len(tracks)), 2):
         first, second = masks[one], masks[other]
         if first is None or second is None or (good[one] and good[other]):
             continue
         linked[one, other] = linked[other, one] = (
-            bench.top.touching(first, second, NEAR_GAP, NEAR_STEP)
+            (
+                (one, other) in near
+                and bench.top.touching(first, second, NEAR_GAP, NEAR_STEP)
+            )
             or _shares(tracks[one], second, bench)
             or _shares(tracks[other], first, bench)
         )
@@ -414,7 +418,8 @@ def _union(tracks: Sequence[Track], bench: Bench) -> Track:
         one = seen[number][0]
         if len(seen[number]) > 1:
             every = np.any([other.mask for other in seen[number]], axis=0)
-            one = sighting_of(one.frame, every, one.plane, one.noise)
+            union = sighting_of(one.frame, every, one.plane, one.noise)
+            one = replace(union, warnings=one.warnings)
         sightings.append(one)
 
     again = dict(pair for track in tracks for pair in track.again) | dict(first.again)

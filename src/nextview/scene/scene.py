@@ -4,19 +4,17 @@ look next.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from copy import copy
 from dataclasses import dataclass, replace
-from itertools import combinations
 from pathlib import Path
 from threading import RLock
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nextview.checks import number, one_line
+from nextview.checks import number
 from nextview.errors import ObservationError, SessionError
 from nextview.scene.floating import floating
 from nextview.scene.following import (
@@ -29,22 +27,18 @@ from nextview.scene.following import (
 )
 from nextview.scene.fragments import fragments
 from nextview.scene.judging import Judge
-from nextview.scene.next_view import (
-    FEWEST_HIDDEN,
-    TableGround,
-    best,
-    candidates,
-    is_sure,
-    values,
-)
+from nextview.scene.next_view import best, candidates, is_sure, values
 from nextview.scene.objects import SceneObject
 from nextview.scene.parting import GOOD_FIT, Bench, merged, new_track, part, taken_over
+from nextview.scene.state import MOST_VERIFIED, SceneState
 from nextview.scene.tracks import Track, render_track
 from nextview.sensing.frame import Frame
+from nextview.sensing.known_frames import KnownFrames
 from nextview.sensing.object_frame import Box, upright_axes
-from nextview.sensing.plausibility import ViewWarning, check_frame
+from nextview.sensing.plausibility import ViewWarning
 from nextview.sensing.support import GroundPlane
 from nextview.sensing.tabletop import TableTop
+from nextview.session.repeated import REPEATED
 from nextview.session.system import System, load
 from nextview.types import Float, Mask
 
@@ -58,6 +52,10 @@ WRONG_POSE = (
     "this frame does not fit the others and is left out: most objects are not where they were, so"
     " its pose is likely to be wrong"
 )
+ELSEWHERE = (
+    "this frame shows neither the plane that things stand on nor any object where they were: check"
+    " its pose, or aim the camera at them"
+)
 MOVED_OR_POSE = ViewWarning(
     "pose",
     "what was known is not where it was, and nothing else stands where it was: it is taken to have"
@@ -67,7 +65,6 @@ LOWER_GROUND = ViewWarning(
     "ground",
     "this frame shows that the ground is lower than it was taken to be: all frames are judged anew",
 )
-EMPTY_WARNING = ViewWarning("empty", "nothing stands on the plane in this frame")
 
 
 @dataclass(frozen=True)
@@ -130,42 +127,50 @@ class Scene:
         self.region = region
         self._judge = Judge(self.system, CORES)
         self._widest = self._judge.widest
-        self._tops: list[TableTop] = []
-        self._tracks: list[Track] = []
+        self._state = SceneState(region=region)
         self._target: Float | None = None
-        self._touching: set[tuple[int, int]] = set()
-        self._next_number = 1
         self._lock = RLock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the lock: a scene can be copied and pickled."""
+        return {name: value for name, value in vars(self).items() if name != "_lock"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _lock=RLock())
 
     @property
     def objects(self) -> tuple[SceneObject, ...]:
         """What is on the table, in the order in which it was found."""
-        tracks = sorted(self._tracks, key=lambda track: track.number)
-        return tuple(SceneObject.of(track, self._touching) for track in tracks)
+        state = self._state
+        tracks = sorted(state.tracks, key=lambda track: track.number)
+        return tuple(SceneObject.of(track, state.touching) for track in tracks)
+
+    @property
+    def remarks(self) -> tuple[ViewWarning, ...]:
+        """What is left open: small objects that were not verified, what is no object, no ground."""
+        return self._state.remarks
 
     @property
     def tops(self) -> tuple[TableTop, ...]:
         """What each frame that was taken in shows on the plane."""
-        return tuple(self._tops)
+        return self._state.tops
 
     @property
     def frames(self) -> tuple[Frame, ...]:
         """The frames that were taken in."""
-        return tuple(top.frame for top in self._tops)
+        return tuple(top.frame for top in self._state.tops)
 
     @property
     def done(self) -> bool:
-        """Whether more views would tell little, or as many were taken as the system may take."""
-        with self._lock:
-            if len(self._tops) >= self.system.stopping.max_views:
-                return True
-            if not self._tops or not all(is_sure(track) for track in self._tracks):
-                return False
-            if not self._tracks:
-                return True
-            return (
-                TableGround.of(self._tops, self._tracks).largest_hidden < FEWEST_HIDDEN
-            )
+        """Whether more views would tell little, or as many were taken as the system may take.
+
+        They would where an object is not sure; where much of what stands in ``region``, or on the
+        ground that is seen, is no object yet; and where something hides much of the ground.
+        """
+        state = self._state
+        if len(state.tops) >= self.system.stopping.max_views:
+            return True
+        return bool(state.tops) and state.settled
 
     @property
     def target(self) -> Float | None:
@@ -176,42 +181,54 @@ class Scene:
         frame, where nothing was found, or no view is left.
         """
         with self._lock:
-            if not self._tracks:
+            state = self._state
+            around = state.around
+            if not len(around):
                 return None
             if self._target is None:
-                views = candidates(self.system, self._tops, self._tracks, self.distance)
+                views = candidates(self.system, state.tops, around, self.distance)
                 if self.reachable is not None:
                     can = [bool(self.reachable(pose)) for pose in views.poses]
                     views = replace(views, free=views.free & np.array(can))
-                worth = values(self.system, self._tops, self._tracks, views)
-                row = best(views, worth, self._tops[-1].frame.camera_to_world[:3, 3])
+                worth = values(self.system, state.tops, state.tracks, views)
+                row = best(views, worth, state.tops[-1].frame.camera_to_world[:3, 3])
                 self._target = None if row is None else views.poses[row]
             return self._target
 
     def update(self, frame: Frame) -> Look:
         """Take in what the camera sees.
 
-        Where this raises, nothing is taken in.
+        Where this raises, nothing is taken in: the scene is as it was.
 
         Args:
             frame: of a depth camera; all frames but a single one need a pose. Its mask, if it has
                 one, limits where is looked.
 
         Returns:
-            What the frame changed. A frame whose pose does not fit is left out with a warning.
+            What the frame changed. A frame whose pose does not fit, and one that was handed in
+            before, is left out with a warning.
 
         Raises:
-            ObservationError: no support plane is seen, or this is no frame, or has no pose.
+            ObservationError: no support plane is seen, this is no frame, or has no pose, or it
+                cannot be of the same world as what is known.
         """
-        self._refuse(frame)
         with self._lock:
-            top = self._top_of(frame, self._tops[0].ground if self._tops else None)
+            known = self._known_frames
+            known.refuse(frame)
+            if known.repeats(frame):
+                return Look(False, warnings=(REPEATED,))
+            before = self._state
+            ground = before.tops[0].ground if before.tops else None
+            top = self._top_of(frame, ground, before.tracks)
+            shown = top.plane if top.shows_ground else None
+            top = replace(top, warnings=tuple(known.check(frame, shown)))
             if top.lower:
-                return self._begin_anew(top)
-            found = [agreement(track, top) for track in self._tracks]
-            if contradicted(found):
-                return Look(False, warnings=(ViewWarning("pose", WRONG_POSE),))
-            return self._take(top, found)
+                state, look = self._judged_anew(top)
+            else:
+                state, look = self._after(before, top)
+            self._state = state
+            self._target = None
+            return look
 
     def plot(self, path: str | Path | None = None, title: str = "") -> Figure:
         """Draw the last frame with outlines, names and axes of the poses, and all from above.
@@ -228,68 +245,78 @@ class Scene:
         from nextview.scene.figure import draw_scene
         from nextview.session.episode_figure import save_figure
 
-        if not self._tops:
+        if not self._state.tops:
             raise SessionError(
                 "there is nothing to draw before the first frame: update with one"
             )
         target = None if self.done else self.target
-        figure = draw_scene(self._tops, self.objects, target, title)
+        figure = draw_scene(self._state.tops, self.objects, target, title)
         if path is not None:
             save_figure(figure, Path(path))
         return figure
 
-    def _refuse(self, frame: Frame) -> None:
-        if not isinstance(frame, Frame):
-            raise ObservationError(
-                f"what a depth camera gave is a Frame, not {one_line(repr(frame))}"
-            )
-        if self._tops and (frame.pose is None or self._tops[0].frame.pose is None):
-            raise ObservationError(
-                "a second frame needs a pose, and the first one too: how else do they fit together?"
-            )
+    @property
+    def _known_frames(self) -> KnownFrames:
+        """What is known before another frame."""
+        tops = self._state.tops
+        box = None if self.region is None else self.region.object_frame
+        return KnownFrames(
+            tuple(top.frame for top in tops),
+            tuple(top.plane if top.shows_ground else None for top in tops),
+            self.up,
+            None if box is None else box.centre,
+            0.0 if box is None else box.radius,
+        )
 
-    def _top_of(self, frame: Frame, ground: GroundPlane | None) -> TableTop:
+    def _top_of(
+        self,
+        frame: Frame,
+        ground: GroundPlane | None,
+        tracks: Sequence[Track],
+    ) -> TableTop:
         """What a frame shows on the ground, which is looked for if it is not known.
 
         Raises:
             ObservationError: no support plane is seen.
         """
-        known = [_sphere(track) for track in self._tracks]
+        known = [_sphere(track) for track in tracks]
         return TableTop.of(frame, self.up, ground, known, self.region, self._widest)
 
-    def _begin_anew(self, last: TableTop) -> Look:
+    def _judged_anew(self, last: TableTop) -> tuple[SceneState, Look]:
         """Judge all frames anew, on the lower ground that a new one shows.
 
         Args:
             last: what the new frame shows.
         """
-        anew = copy(self)
-        anew._tops = []
-        anew._tracks = []
-        anew._touching = set()
-        tops = [anew._top_of(frame, last.ground) for frame in self.frames]
-        for top in (*tops, last):
-            found = [agreement(track, top) for track in anew._tracks]
-            if not contradicted(found):
-                look = anew._take(top, found)
-            elif top is last:
-                return Look(False, warnings=(ViewWarning("pose", WRONG_POSE),))
-
-        same = same_objects(anew._tracks, self._tracks)
-        joined = parts_of(self._tracks, anew._tracks, same)
-        known = {track.number for track in self._tracks}
-        self._tops = anew._tops
-        self._tracks = [
-            replace(track, number=same.get(track.number, track.number))
-            for track in anew._tracks
+        before = self._state
+        anew = SceneState(region=self.region)
+        tops = [
+            replace(
+                self._top_of(old.frame, last.ground, anew.tracks),
+                warnings=old.warnings,
+            )
+            for old in before.tops
         ]
-        pairs = [(same.get(a, a), same.get(b, b)) for a, b in anew._touching]
-        self._touching = {(min(pair), max(pair)) for pair in pairs}
-        self._next_number = anew._next_number
-        self._target = None
+        for top in (*tops, last):
+            anew, look = self._after(anew, top)
+        if not look.taken:
+            return before, look
 
-        now = {track.number for track in self._tracks}
-        return replace(
+        same = same_objects(anew.tracks, before.tracks)
+        joined = parts_of(before.tracks, anew.tracks, same)
+        known = {track.number for track in before.tracks}
+        pairs = [(same.get(a, a), same.get(b, b)) for a, b in anew.touching]
+        state = replace(
+            anew,
+            tracks=tuple(
+                replace(track, number=same.get(track.number, track.number))
+                for track in anew.tracks
+            ),
+            touching=frozenset((min(pair), max(pair)) for pair in pairs),
+        )
+
+        now = {track.number for track in state.tracks}
+        look = replace(
             look,
             appeared=tuple(sorted(now - known)),
             gone=tuple(sorted(known - now - {ended for ended, _ in joined})),
@@ -297,119 +324,79 @@ class Scene:
             joined=joined,
             warnings=(*look.warnings, LOWER_GROUND),
         )
+        return state, look
 
-    def _take(self, top: TableTop, found: Sequence[SegmentAgreement]) -> Look:
-        """Take in a frame that fits."""
-        number = len(self._tops)
-        segments = top.segments()
+    def _after(self, before: SceneState, top: TableTop) -> tuple[SceneState, Look]:
+        """The scene after a frame, which is left out where it does not fit.
+
+        Raises:
+            ObservationError: it shows nothing where it was.
+        """
+        found = [agreement(track, top) for track in before.tracks]
+        if contradicted(found):
+            return before, Look(False, warnings=(ViewWarning("pose", WRONG_POSE),))
+        seen_again = any(one.confirms for one in found)
+        if before.tops and top.ground.wide and not (top.shows_ground or seen_again):
+            self._top_of(top.frame, None, ())  # names a mistake in the pose
+            raise ObservationError(ELSEWHERE)
+
+        state, look = self._taken(before, top, found)
+        if look.moved and not seen_again:
+            look = replace(look, warnings=(*look.warnings, MOVED_OR_POSE))
+        return state, look
+
+    def _taken(
+        self,
+        before: SceneState,
+        top: TableTop,
+        found: Sequence[SegmentAgreement],
+    ) -> tuple[SceneState, Look]:
+        """The scene after a frame that fits."""
+        number = len(before.tops)
         bench = Bench(top, number, self._judged)
-        there = [
-            track
-            for track, one in zip(self._tracks, found, strict=True)
-            if not one.contradicts
-        ]
-        lost = [
-            track
-            for track, one in zip(self._tracks, found, strict=True)
-            if one.contradicts
-        ]
+        pairs = list(zip(before.tracks, found, strict=True))
+        there = [track for track, one in pairs if not one.contradicts]
+        lost = [track for track, one in pairs if one.contradicts]
 
-        own, new = assign(segments, there, top)
-        shown = []
-        hidden = []
-        for row, track in enumerate(there):
-            if row not in own:
-                hidden.append(track)
+        own, new = assign(top.segments(), there, top)
+        hidden = [track for row, track in enumerate(there) if row not in own]
+        seen = {row: self._explained(there[row], own[row], top, number) for row in own}
+        shown = [track for track in seen.values() if track is not None]
+        doubtful = {row: own[row] for row, track in seen.items() if track is None}
+        chosen, left = _most_pixels([*doubtful.values(), *new])
+        for mask, row in zip(doubtful.values(), doubtful, strict=True):
+            track = there[row]
+            if id(mask) not in chosen:
+                hidden.append(replace(track, again=(*track.again, (number, mask))))
                 continue
             try:
-                shown.append(self._seen_again(track, own[row], top, number))
+                shown.append(track.with_mask(number, mask, top))
             except ObservationError:  # too little of it shows to say anything
                 hidden.append(track)
         for mask in new:
-            with suppress(ObservationError):
-                shown.append(new_track(mask, bench))
+            if id(mask) in chosen:
+                with suppress(ObservationError):
+                    shown.append(new_track(mask, bench))
 
-        before = {track.number: track for track in there}
-        shown = part(self._judged_if_new(shown), bench, before)
-        self._tops.append(top)
-        self._target = None
-        benches = [Bench(one, k, self._judged) for k, one in enumerate(self._tops)]
+        known = {track.number: track for track in there}
+        shown = part(self._judged_if_new(shown), bench, known)
+        tops = (*before.tops, top)
+        benches = [Bench(one, k, self._judged) for k, one in enumerate(tops)]
         every = merged(taken_over([*hidden, *shown], benches), benches)
-        look = self._numbered(every, lost, top, number)
-        if look.moved and not any(one.confirms for one in found):
-            return replace(look, warnings=(*look.warnings, MOVED_OR_POSE))
-        return look
+        left_unknown = sum(id(mask) in left for mask in new)
+        state = replace(before, tops=tops, left_unknown=left_unknown)
+        return _numbered(state, [_with_past(one, known, number) for one in every], lost)
 
-    def _numbered(
-        self,
-        tracks: Sequence[Track],
-        lost: Sequence[Track],
-        top: TableTop,
-        number: int,
-    ) -> Look:
-        """Give new objects their numbers: what is lost in one place may be found in another."""
-        away = {
-            track.result.answer: track for track in lost if track.result is not None
-        }
-        appeared = []
-        moved = []
-        kept = []
-        joined = []
-        for track in tracks:
-            if track.number < 0:
-                assert track.result is not None
-                old = (
-                    away.pop(track.result.answer, None) if track.result.answer else None
-                )
-                if old is not None:
-                    track = replace(track, number=old.number)
-                    moved.append(old.number)
-                else:
-                    track = replace(track, number=self._next_number)
-                    self._next_number += 1
-                    appeared.append(track.number)
-            joined += [(ended, track.number) for ended in track.absorbed]
-            kept.append(replace(track, absorbed=()))
-        in_the_air = floating(kept, top.plane)
-        self._tracks = [
-            replace(track, floats=floats)
-            for track, floats in zip(kept, in_the_air, strict=True)
-        ]
-
-        gone = tuple(track.number for track in lost if track.number not in moved)
-        changed = {*gone, *moved, *(ended for ended, _ in joined)}
-        self._touching = {pair for pair in self._touching if not set(pair) & changed}
-        self._note_touching(top, number)
-        small = fragments(self._tracks, self._touching)
-        self._tracks = [
-            replace(track, is_fragment=is_fragment)
-            for track, is_fragment in zip(self._tracks, small, strict=True)
-        ]
-        warnings = tuple(check_frame(top.frame))
-        if not kept:
-            warnings += (EMPTY_WARNING,)
-        return Look(True, tuple(appeared), tuple(moved), gone, tuple(joined), warnings)
-
-    def _note_touching(self, top: TableTop, number: int) -> None:
-        """Remember which objects touch in a frame."""
-        here = [(track.number, track.mask_in(number)) for track in self._tracks]
-        for (one, first), (other, second) in combinations(here, 2):
-            if first is not None and second is not None and top.touching(first, second):
-                self._touching.add((min(one, other), max(one, other)))
-
-    def _seen_again(
+    def _explained(
         self,
         track: Track,
         mask: Mask,
         top: TableTop,
         number: int,
-    ) -> Track:
-        """An object with its pixels in another frame.
+    ) -> Track | None:
+        """An object with its pixels in another frame, if these change nothing.
 
         What is sure by some frames already, and is seen where it should be, is not judged anew.
-
-        Raises:
-            ObservationError: too little is seen of it.
         """
         if is_sure(track) and len(track.frames) >= ENOUGH_FRAMES:
             rendered = render_track(track, top, number, track.posed)
@@ -417,7 +404,7 @@ class Scene:
                 explained, every = rendered.fit(mask)
                 if explained >= GOOD_FIT * every:
                     return replace(track, again=(*track.again, (number, mask)))
-        return track.with_mask(number, mask, top)
+        return None
 
     def _judged_if_new(self, tracks: Sequence[Track]) -> list[Track]:
         """The same objects with what each is; those of which that is known stay as they are."""
@@ -437,3 +424,90 @@ def _sphere(track: Track) -> tuple[Float, float]:
     """Centre, (3,), and radius of an object, metres."""
     frame = track.thing.object_frame
     return frame.centre, frame.radius
+
+
+def _most_pixels(masks: Sequence[Mask]) -> tuple[set[int], set[int]]:
+    """The ``id`` of each of the largest masks, that are verified, and of the others."""
+    order = sorted(masks, key=lambda mask: -np.count_nonzero(mask))
+    ids = [id(mask) for mask in order]
+    return set(ids[:MOST_VERIFIED]), set(ids[MOST_VERIFIED:])
+
+
+def _with_past(track: Track, known: Mapping[int, Track], number: int) -> Track:
+    """An object that remembers whether it had a name before a frame that shows it."""
+    if track.number not in known or track.mask_in(number) is None:
+        return track
+    before = known[track.number].result
+    named = before is not None and before.answer is not None
+    return replace(track, lately_named=named)
+
+
+def _numbered(
+    state: SceneState,
+    tracks: Sequence[Track],
+    lost: Sequence[Track],
+) -> tuple[SceneState, Look]:
+    """Give new objects their numbers: what is lost in one place may be found in another.
+
+    Args:
+        state: with the last frame, and the objects as they were before it.
+        tracks: the objects.
+        lost: those that are not where they were.
+    """
+    away = {track.result.answer: track for track in lost if track.result is not None}
+    number = state.next_number
+    appeared = []
+    moved = []
+    kept = []
+    joined = []
+    for track in tracks:
+        if track.number < 0:
+            assert track.result is not None
+            answer = track.result.answer
+            old = away.pop(answer, None) if answer else None
+            if old is not None:
+                track = replace(track, number=old.number)
+                moved.append(old.number)
+            else:
+                track = replace(track, number=number)
+                appeared.append(number)
+                number += 1
+        joined += [(ended, track.number) for ended in track.absorbed]
+        kept.append(replace(track, absorbed=()))
+
+    gone = tuple(track.number for track in lost if track.number not in moved)
+    changed = {*gone, *moved, *(ended for ended, _ in joined)}
+    touching = {pair for pair in state.touching if not set(pair) & changed}
+    touching |= _touching(kept, state.tops[-1], len(state.tops) - 1)
+    in_the_air = floating(kept, state.tops[-1].plane)
+    small = fragments(kept, touching)
+    after = replace(
+        state,
+        tracks=tuple(
+            replace(track, floats=floats, is_fragment=is_fragment)
+            for track, floats, is_fragment in zip(kept, in_the_air, small, strict=True)
+        ),
+        touching=frozenset(touching),
+        next_number=number,
+    )
+    look = Look(True, tuple(appeared), tuple(moved), gone, tuple(joined))
+    warnings = (*state.tops[-1].warnings, *after.remarks)
+    return after, replace(look, warnings=warnings)
+
+
+def _touching(
+    tracks: Sequence[Track],
+    top: TableTop,
+    number: int,
+) -> set[tuple[int, int]]:
+    """Numbers of all pairs of objects that touch in a frame, the smaller number first."""
+    masks = [track.mask_in(number) for track in tracks]
+    found = set()
+    for row, beside in top.neighbours(masks):
+        one, other = masks[row], masks[beside]
+        assert one is not None
+        assert other is not None
+        if top.touching(one, other):
+            pair = tracks[row].number, tracks[beside].number
+            found.add((min(pair), max(pair)))
+    return found

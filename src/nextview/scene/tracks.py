@@ -16,7 +16,7 @@ from nextview.geometry.pinhole import PinholeCamera
 from nextview.recognition.poses import PoseCandidate
 from nextview.sensing.frame import Part, spans
 from nextview.sensing.observed_object import ObservedObject
-from nextview.sensing.sighting import Sighting, sighting_of
+from nextview.sensing.sighting import Sighting
 from nextview.sensing.tabletop import TableTop
 from nextview.session.result import Recognition
 from nextview.things.surface import Surface, SurfaceCaster
@@ -47,6 +47,7 @@ class Track:
         absorbed: numbers of objects whose pixels all became its own since the last frame.
         floats: whether its scan stands neither on the plane nor on another object.
         is_fragment: whether it may be a part of a larger object that it touches.
+        lately_named: whether it had a name before the last frame that shows it.
     """
 
     number: int
@@ -58,6 +59,7 @@ class Track:
     absorbed: tuple[int, ...] = ()
     floats: bool = False
     is_fragment: bool = False
+    lately_named: bool = False
 
     @property
     def confident(self) -> bool:
@@ -146,7 +148,7 @@ class Track:
         Raises:
             ObservationError: too little is seen of the object.
         """
-        sighting = sighting_of(top.frame, mask, top.under(mask), top.noise)
+        sighting = top.sighting(mask)
         kept = [
             (frame, one)
             for frame, one in zip(self.frames, self.thing.sightings, strict=True)

@@ -11,7 +11,6 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nextview.checks import one_line
 from nextview.errors import ObservationError, UsageError
 from nextview.geometry.observation import Observation
 from nextview.sensing import clusters, plausibility, segmentation
@@ -20,7 +19,7 @@ from nextview.sensing.convex_pieces import STANDS, cut
 from nextview.sensing.displacement import displacement
 from nextview.sensing.facets import Noise, noise_of
 from nextview.sensing.frame import Frame
-from nextview.sensing.lean import lean_of
+from nextview.sensing.known_frames import KnownFrames
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, ObjectFrame, three, upright_axes
 from nextview.sensing.planes import Plane, Samples, find_again, sample
@@ -228,11 +227,13 @@ class ObservedObject:
     def _after(self, frame: Frame) -> ObjectState:
         """The state after a frame: all stages from the frame to its observation, in order."""
         before = self.state
-        self._refuse_misfit(frame)
+        known = self._known_frames
+        known.refuse(frame)
 
         noise = noise_of(frame)
         samples = self._samples(frame, noise)
         plane, up, rng = self._find_plane(frame, samples)
+        warnings = known.check(frame, plane)
         sightings, may_be_two = self._segment(
             frame,
             upright_axes(up),
@@ -248,10 +249,10 @@ class ObservedObject:
             sightings[-1] = sightings[-1].shifted(-displaced.shift)
 
         after = self._known_by(sightings, up)
-        warnings = self._check(frame, after, plane, may_be_two)
-        warnings = warnings or plausibility.check_last_view(after.observations)
+        warnings += self._check(after, plane, may_be_two)
+        if not any(warning.holds for warning in warnings):
+            warnings += plausibility.check_last_view(after.observations)
         warnings += plausibility.check_place(displaced)
-        warnings += self._check_world(frame, after, plane, up)
         return replace(after, rng=rng, warnings=tuple(warnings))
 
     def take_sightings(self, sightings: Sequence[Sighting], up: Float) -> None:
@@ -267,27 +268,35 @@ class ObservedObject:
         Raises:
             ObservationError: what is seen of the object has no size.
         """
-        after = self._known_by(sightings, up)
-        warnings = plausibility.check_observation(after.observations[-1])
-        warnings = warnings or plausibility.check_last_view(after.observations)
-        self.state = replace(after, warnings=tuple(warnings))
+        self.state = replace(self._known_by(sightings, up), warnings=())
+        self.state = replace(self.state, warnings=self.warnings_of_view(-1))
 
-    def _refuse_misfit(self, frame: Frame) -> None:
-        """Refuse what is no frame, does not fit those before, or is too far from the object."""
-        if not isinstance(frame, Frame):
-            raise ObservationError(
-                f"what a depth camera gave is a Frame, not {one_line(repr(frame))}"
-            )
+    def warnings_of_view(self, number: int) -> tuple[ViewWarning, ...]:
+        """What is likely to be wrong with a view, by its frame and by the views before it.
+
+        Args:
+            number: of the view, from 0, or from -1 backwards.
+        """
+        observations = self.state.observations
+        warnings = list(self.state.sightings[number].warnings)
+        warnings += plausibility.check_observation(observations[number])
+        if not any(warning.holds for warning in warnings):
+            last = range(len(observations))[number]
+            warnings += plausibility.check_last_view(observations[: last + 1])
+        return tuple(warnings)
+
+    @property
+    def _known_frames(self) -> KnownFrames:
+        """What is known before another frame."""
         sightings = self.state.sightings
-        if sightings and (frame.pose is None or sightings[0].frame.pose is None):
-            raise ObservationError(
-                "a second frame needs a pose, and the first one too: how else do they fit together?"
-            )
-
-        last = sightings[-1].frame_as_given if sightings else None
-        target = self.point if self.known is None else self.known.centre
-        radius = 0.0 if self.known is None else self.known.radius
-        plausibility.refuse_far(frame, last, target, radius)
+        known = self.known
+        return KnownFrames(
+            tuple(sighting.frame_as_given for sighting in sightings),
+            tuple(sighting.plane for sighting in sightings),
+            self.up,
+            self.point if known is None else known.centre,
+            0.0 if known is None else known.radius,
+        )
 
     def _samples(self, frame: Frame, noise: Noise) -> Samples | None:
         """Samples of all beside the mask; None where no plane is looked for."""
@@ -554,22 +563,16 @@ class ObservedObject:
 
     def _check(
         self,
-        frame: Frame,
         after: ObjectState,
         plane: Plane | None,
         may_be_two: bool,
     ) -> list[ViewWarning]:
-        """Return likely faults of a frame, and of what it shows of the object."""
+        """Return likely faults of what a frame shows of the object."""
         before = self.state
         assert after.frame is not None
-        warnings = plausibility.check_frame(frame)
-        warnings += plausibility.check_observation(after.observations[-1])
+        warnings = plausibility.check_observation(after.observations[-1])
         if may_be_two:
             warnings.append(MAY_BE_TWO)
-        if before.sightings:
-            last = before.sightings[-1].frame_as_given
-            warnings += plausibility.check_pose_moved(frame, last)
-
         if before.frame is not None:
             radius = after.frame.radius
             warnings += plausibility.check_size(radius, before.frame.radius)
@@ -578,31 +581,6 @@ class ObservedObject:
             warnings += plausibility.check_point(aside, after.frame.radius)
         if self.support and plane is None and self.known is None:
             warnings.append(NO_PLANE)
-        return warnings
-
-    def _check_world(
-        self,
-        frame: Frame,
-        after: ObjectState,
-        plane: Plane | None,
-        up: Float,
-    ) -> list[ViewWarning]:
-        """Return likely faults of poses and depth by the support plane; refuse certain ones."""
-        warnings = list[ViewWarning]()
-        if frame.pose is None:
-            return warnings
-        if plane is not None and len(after.sightings) == 1:
-            height = float(plane.height(frame.pose[:3, 3]))
-            plausibility.refuse_millimetres(frame.pose, height, up)
-            warnings += plausibility.check_steps(frame, height, up)
-
-        shown = [one for one in after.sightings if one.plane is not None]
-        if self.up is not None and len(shown) > 1:
-            # of one frame a lean may be an error of its depth
-            planes = [one.plane for one in shown if one.plane is not None]
-            poses = [one.frame.camera_to_world for one in shown]
-            lean = lean_of(planes, poses, upright_axes(self.up))
-            warnings += plausibility.check_lean(lean)
         return warnings
 
 

@@ -298,7 +298,7 @@ def find_again(plane: Plane, samples: Samples, other: Mask) -> Plane:
         The plane in this frame; that of least squares where no other holds more samples.
     """
     fit = refine_plane(plane, samples, loose=2)
-    if _is_seen(fit, samples):
+    if is_seen(fit, samples):
         return fit
 
     away = np.linalg.norm(samples.points - samples.camera, axis=1)
@@ -310,8 +310,13 @@ def find_again(plane: Plane, samples: Samples, other: Mask) -> Plane:
     return found if found.holds(around).sum() > fit.holds(around).sum() else fit
 
 
-def _is_seen(plane: Plane, samples: Samples) -> bool:
-    """Whether more samples lie on a plane than closely beside it, as those of a surface do."""
+def is_seen(plane: Plane, samples: Samples) -> bool:
+    """Whether more samples lie on a plane than closely beside it, as those of a surface do.
+
+    Args:
+        plane: the plane.
+        samples: of a frame.
+    """
     away = np.abs(plane.height(samples.points)) / samples.tolerance
     on = np.count_nonzero(away < 1)
     beside = np.count_nonzero(away < TOLERANCES_ASIDE) - on

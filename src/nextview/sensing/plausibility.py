@@ -68,7 +68,8 @@ class ViewWarning:
 
     Names are "nothing seen", "opengl axes", "ros axes", "inverse pose", "scale", "outside",
     "contradiction" and "repeated"; of a frame "intrinsics", "unit", "far origin", "outline",
-    "support", "point", "size", "stale pose", "displaced" and "lean".
+    "support", "point", "size", "stale pose", "displaced" and "lean". Those of scenes are on the
+    page on tables.
 
     Attributes:
         name: one of these.

@@ -16,6 +16,7 @@ from nextview.sensing.frame import Frame, within
 from nextview.sensing.object_frame import ObjectFrame, enclose
 from nextview.sensing.outliers import without_outliers
 from nextview.sensing.planes import Plane
+from nextview.sensing.plausibility import ViewWarning
 from nextview.types import Float, Mask
 
 FEWEST_OBJECT_PIXELS = 60  # pixels that an object has to have in a frame
@@ -39,6 +40,7 @@ class Sighting:
         footprint: of all that is above the plane, where the object was found so.
         chosen: which cells of the footprint are the object's, (cells,) bool.
         shift: by which the pose was shifted, (3,), metres.
+        warnings: about the frame, whatever it shows of the object.
     """
 
     frame: Frame
@@ -50,6 +52,7 @@ class Sighting:
     footprint: Footprint | None = None
     chosen: Mask | None = None
     shift: Float = field(default_factory=lambda: np.zeros(3))
+    warnings: tuple[ViewWarning, ...] = ()
 
     @property
     def frame_as_given(self) -> Frame:

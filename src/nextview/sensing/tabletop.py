@@ -18,7 +18,8 @@ from nextview.sensing.frame import Frame, within
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, upright_axes
 from nextview.sensing.planes import LEAST_SUPPORT, Plane, Samples, sample
-from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
+from nextview.sensing.plausibility import ViewWarning
+from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS, Sighting, sighting_of
 from nextview.sensing.support import GroundPlane
 from nextview.sensing.support_plane import (
     MASK_POINTS,
@@ -62,6 +63,8 @@ class TableTop:
         levels: level planes over a ground that may be a part of a thing, the highest first: table
             tops, seats. On one of them another thing may stand.
         lower: whether the frame shows that the ground of earlier frames is none, and a lower one.
+        shows_ground: whether the ground is in the picture.
+        warnings: about the frame.
     """
 
     frame: Frame
@@ -73,6 +76,8 @@ class TableTop:
     height: Float32
     levels: tuple[Plane, ...] = ()
     lower: bool = False
+    shows_ground: bool = True
+    warnings: tuple[ViewWarning, ...] = ()
 
     @classmethod
     def of(
@@ -101,6 +106,7 @@ class TableTop:
         noise = noise_of(frame)
         samples = sample(frame, frame.depth > 0, noise)
         lower = False
+        shows_ground = True
         if ground is None:
             ground = _find_ground(frame, samples, up, widest)
         else:
@@ -115,9 +121,12 @@ class TableTop:
                 near = _near(samples, known)
                 plane = planes.find_again(ground.plane, samples, near)
                 # few samples fit a plane that leans: a later frame may not show the floor
-                if ground.wide or plane.holds(samples).mean() > LEAST_SUPPORT:
+                enough = bool(plane.holds(samples).mean() > LEAST_SUPPORT)
+                shows_ground = enough and planes.is_seen(plane, samples)
+                if ground.wide or enough:
                     ground = replace(ground, plane=plane)
         plane = ground.plane
+        shows_ground &= ground.seen
 
         above = segmentation.above_plane(frame, plane, noise)
         walls = find_walls(samples, plane, np.random.default_rng(0))
@@ -142,6 +151,7 @@ class TableTop:
             height,
             tuple(levels),
             lower,
+            shows_ground,
         )
 
     @property
@@ -165,6 +175,18 @@ class TableTop:
         others = sample(self.frame, (self.frame.depth > 0) & ~mask, self.noise)
         found = support.under_points(others, list(self.levels), points)
         return self.plane if found is None else found
+
+    def sighting(self, mask: Mask) -> Sighting:
+        """What the frame shows of a thing.
+
+        Args:
+            mask: its pixels, (H, W) bool.
+
+        Raises:
+            ObservationError: too little is seen of it.
+        """
+        seen = sighting_of(self.frame, mask, self.under(mask), self.noise)
+        return replace(seen, warnings=self.warnings)
 
     def segments(
         self,
@@ -199,15 +221,16 @@ class TableTop:
 
         of_piece = _clusters_of_pieces(foot.piece, labels, pieces)
         found = []
-        for label in range(1, int(of_piece.max(initial=0)) + 1):
-            mask = (of_piece == label)[pieces.grown]
-            if np.count_nonzero(mask) >= FEWEST_OBJECT_PIXELS:
-                mask = trimmed(
-                    frame.depth,
-                    mask,
-                    self.noise,
-                    self.height > STANDS * frame.depth,
-                )
+        owner = of_piece[pieces.grown]
+        pixels_of = np.bincount(owner.ravel())
+        pixels_of[0] = 0
+        for label in np.flatnonzero(pixels_of >= FEWEST_OBJECT_PIXELS):
+            mask = trimmed(
+                frame.depth,
+                owner == label,
+                self.noise,
+                self.height > STANDS * frame.depth,
+            )
             if self.is_thing(mask):
                 found.append(mask)
         return sorted(found, key=lambda mask: -np.count_nonzero(mask))
@@ -231,6 +254,36 @@ class TableTop:
         return bool(
             ndimage.binary_erosion(filled, np.ones((3, 3), bool), max(half, 1)).any()
         )
+
+    def neighbours(
+        self,
+        masks: Sequence[Mask | None],
+        gap: float = TOUCHING_GAP,
+    ) -> list[tuple[int, int]]:
+        """Which pairs of things are so near in the picture that they may touch.
+
+        Args:
+            masks: the pixels of each, (H, W) bool; None where the frame does not show it.
+            gap: metres between two things that touch, at most.
+
+        Returns:
+            Their places in ``masks``, the smaller one first.
+        """
+        shown = [row for row, mask in enumerate(masks) if mask is not None]
+        parts = np.array(
+            [
+                [(side.start, side.stop) for side in within(mask)]
+                for mask in masks
+                if mask is not None
+            ]
+        ).reshape(-1, 2, 2)
+        nearest = self.frame.depth[self.frame.depth > 0].min(initial=np.inf)
+        focal = float(self.frame.intrinsics[[0, 1], [0, 1]].max())
+        reach = max(2.0, gap * focal / nearest) + 1
+        low, high = parts[..., 0], parts[..., 1]
+        apart = np.maximum(low[:, None] - high, low - high[:, None]).max(-1)
+        pairs = np.argwhere(np.triu(apart <= reach, 1))
+        return [(shown[one], shown[other]) for one, other in pairs]
 
     def touching(
         self,

@@ -47,7 +47,8 @@ def after_repeated(
 ) -> "ObjectState | None":
     """Return the state of an object after a frame that repeats an earlier one.
 
-    Its true camera pose is not known, so the earlier sighting stands for it.
+    No two pictures of a depth camera are the same to the last bit. The true camera pose of such a
+    frame is not known, so the earlier sighting stands for it.
 
     Args:
         state: before the frame.
@@ -60,23 +61,11 @@ def after_repeated(
     for sighting, seen in list(zip(state.sightings, state.observations, strict=True))[
         first:
     ]:
-        if frame.pose is None or not np.array_equal(sighting.frame.depth, frame.depth):
-            continue
-        assert state.frame is not None
-        was, now = (
-            state.frame.pose_in_object(f.camera_to_world)
-            for f in (sighting.frame_as_given, frame)
-        )
-        if _is_one_picture(
-            seen,
-            replace(seen, pose=now @ np.linalg.inv(was) @ seen.pose),
-        ):
-            sightings = (*state.sightings, sighting)
-            observations = (*state.observations, seen)
+        if frame.pose is not None and np.array_equal(sighting.frame.depth, frame.depth):
             return replace(
                 state,
-                sightings=sightings,
-                observations=observations,
+                sightings=(*state.sightings, sighting),
+                observations=(*state.observations, seen),
                 warnings=(REPEATED,),
             )
     return None

@@ -57,7 +57,7 @@ from nextview.session.reach import (
 from nextview.session.repeated import REPEATED, after_repeated, is_repeated
 from nextview.session.result import SUSPICIOUS, Recognition
 from nextview.session.surroundings import Surroundings
-from nextview.session.view import View
+from nextview.session.view import View, is_doubtful
 from nextview.things.expected_views import Goal, Outlook
 from nextview.types import Float, Mask
 
@@ -763,8 +763,7 @@ class Session:
         episodes = self._replayed(evidence, directions) if changed else self._episodes
 
         reach = self._reach
-        doubtful = any(warning.holds for warning in warnings)
-        doubtful = doubtful or self._contradicted(last + 1)
+        doubtful = is_doubtful([*(view.warnings for view in self.views), warnings])
         taken = episodes.next_step(
             evidence[last],
             directions[last][None],
@@ -901,18 +900,6 @@ class Session:
             )
             return ViewScore(observation, None, value)
         return None if evidence.novelty is None else evidence.novelty[0]
-
-    def _contradicted(self, n_views: int) -> bool:
-        """Return whether half of the views or more contradict others."""
-        return (
-            2
-            * sum(
-                any(w.name == "contradiction" for w in view.warnings)
-                for view in self.views
-            )
-            >= n_views
-            > 0
-        )
 
     def _suspicious(
         self,

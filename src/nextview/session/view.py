@@ -1,5 +1,6 @@
 """One view of a session, and what followed from it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -73,3 +74,22 @@ class View:
         return float(np.degrees(elevation_of(self.direction))), float(
             np.degrees(azimuth_of(self.direction))
         )
+
+
+def is_doubtful(warned: Sequence[Sequence[ViewWarning]]) -> bool:
+    """Whether no answer is confident by some views, whatever they show.
+
+    Args:
+        warned: the warnings of each view, in order.
+
+    Returns:
+        Whether a warning of the last one holds, or half of the views contradict others.
+    """
+    contradicting = sum(
+        any(warning.name == "contradiction" for warning in warnings)
+        for warnings in warned
+    )
+    last = warned[-1] if warned else ()
+    return (
+        any(warning.holds for warning in last) or 2 * contradicting >= len(warned) > 0
+    )

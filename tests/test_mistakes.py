@@ -1,0 +1,261 @@
+"""What is wrong with a frame is refused or told by a session and by a scene alike."""
+
+import pickle
+from copy import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_tables import camera_over, view
+
+import nextview
+from nextview.errors import NextviewError
+from nextview.sensing.frame import Frame
+
+
+def posed(frame: Frame, pose: np.ndarray) -> Frame:
+    return replace(frame, pose=pose, pixel_centre=0.5)
+
+
+def moved(frame: Frame, shift) -> Frame:
+    pose = frame.pose.copy()
+    pose[:3, 3] += shift
+    return posed(frame, pose)
+
+
+def in_millimetres(frame: Frame) -> Frame:
+    pose = frame.pose.copy()
+    pose[:3, 3] *= 1000
+    return posed(frame, pose)
+
+
+def deeper(frame: Frame, times: float) -> Frame:
+    return Frame(times * frame.depth, frame.intrinsics, frame.pose, pixel_centre=0.5)
+
+
+def counted(frame: Frame, times: float) -> Frame:
+    steps = np.rint(1000 * times * frame.depth).astype(np.uint16)
+    return Frame(steps, frame.intrinsics, frame.pose, pixel_centre=0.5)
+
+
+MISTAKES = {
+    "a first pose in millimetres": (
+        lambda first, second: [in_millimetres(first)],
+        "refused",
+    ),
+    "a first pose that is inverse": (
+        lambda first, second: [posed(first, np.linalg.inv(first.pose))],
+        "refused",
+    ),
+    "a first pose with OpenGL's axes": (
+        lambda first, second: [replace(first, axes="opengl", pixel_centre=0.5)],
+        "refused",
+    ),
+    "first steps of a fifth of a millimetre": (
+        lambda first, second: [counted(first, 5)],
+        "unit",
+    ),
+    "a second pose in millimetres": (
+        lambda first, second: [first, in_millimetres(second)],
+        "refused",
+    ),
+    "a second pose that is inverse": (
+        lambda first, second: [first, posed(second, np.linalg.inv(second.pose))],
+        "refused",
+    ),
+    "a second pose with the axes of ROS": (
+        lambda first, second: [first, replace(second, axes="ros", pixel_centre=0.5)],
+        "refused",
+    ),
+    "no second pose": (
+        lambda first, second: [
+            first,
+            replace(second, pose=None, pixel_centre=0.5),
+        ],
+        "refused",
+    ),
+    "a second pose that is too high": (
+        lambda first, second: [first, moved(second, [0, 0, 0.15])],
+        "refused",
+    ),
+    "depth that is five times as large": (
+        lambda first, second: [first, deeper(second, 5)],
+        "refused",
+    ),
+    "a pose that stays what it was": (
+        lambda first, second: [first, posed(second, first.pose)],
+        "stale pose",
+    ),
+    "one frame again and again": (
+        lambda first, second: [first, first, first, first],
+        "repeated",
+    ),
+    "one picture with another pose": (
+        lambda first, second: [first, posed(first, second.pose)],
+        "repeated",
+    ),
+    "a world far away": (
+        lambda first, second: [
+            moved(first, [700, 0, 0]),
+            moved(second, [700, 0, 0]),
+        ],
+        "far origin",
+    ),
+    "no mistake": (lambda first, second: [first, second], None),
+}
+
+
+@pytest.fixture(scope="module")
+def two_frames(ycb_meshes):
+    camera = camera_over([ycb_meshes["mug"]])
+    return camera.frame(view(20)), camera.frame(view(60))
+
+
+def through_session(ycb):
+    """A session that goes on after it could answer; and how it stands."""
+    system = replace(ycb, stopping=nextview.Stopping(1.0, 8))
+    session = system.session(distance=0.6)
+    return session, lambda: len(session.views)
+
+
+def through_scene(ycb):
+    """A scene; and how it stands."""
+    scene = nextview.Scene(ycb)
+
+    def stands():
+        return [
+            (thing.number, thing.name, thing.confident, len(thing.pixels))
+            for thing in scene.objects
+        ]
+
+    return scene, stands
+
+
+@pytest.mark.parametrize("door", [through_session, through_scene])
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_refused_or_told_whatever_takes_it_in(
+    ycb,
+    two_frames,
+    mistake,
+    door,
+):
+    make, outcome = MISTAKES[mistake]
+    *earlier, last = make(*two_frames)
+    taker, stands = door(ycb)
+    for frame in earlier:
+        taker.update(frame)
+    before = stands()
+
+    if outcome == "refused":
+        with pytest.raises(NextviewError) as refused:
+            taker.update(last)
+        assert "\n" not in str(refused.value)
+        assert stands() == before
+    else:
+        said = [warning.name for warning in taker.update(last).warnings]
+        assert outcome in said if outcome else not said
+
+
+@pytest.mark.parametrize(
+    "mistake", ["a pose that stays what it was", "a world far away"]
+)
+def test_an_object_tells_what_is_wrong_with_its_frames_and_is_not_confident(
+    ycb,
+    two_frames,
+    mistake,
+):
+    make, name = MISTAKES[mistake]
+    scene = nextview.Scene(ycb)
+    for frame in make(*two_frames):
+        scene.update(frame)
+    assert scene.objects
+    for thing in scene.objects:
+        assert name in [warning.name for warning in thing.warnings]
+        assert not thing.confident
+
+    right = nextview.Scene(ycb)
+    for frame in two_frames:
+        right.update(frame)
+    (mug,) = right.objects
+    assert (mug.name, mug.confident, mug.warnings) == ("mug", True, ())
+
+
+def test_a_frame_that_was_handed_in_before_counts_once(ycb, two_frames):
+    scene = nextview.Scene(ycb)
+    scene.update(two_frames[0])
+    (once,) = scene.objects
+    looks = [scene.update(two_frames[0]) for _ in range(3)]
+    (again,) = scene.objects
+    assert not any(look.taken for look in looks)
+    assert len(again.result.views) == 1
+    assert again.confidence == once.confidence
+    masked = replace(two_frames[0], mask=again.pixels[0], pixel_centre=0.5)
+    assert scene.update(masked).taken  # another part of the picture is asked for
+
+
+class FailsLater:
+    """A recogniser that fails after it has judged some objects."""
+
+    def __init__(self, recogniser) -> None:
+        self._recogniser = recogniser
+        self.left = 1000
+
+    def __getattr__(self, name):
+        return getattr(self._recogniser, name)
+
+    def __call__(self, observations):
+        return self._recogniser(observations)
+
+    def together(self, *views):
+        self.left -= 1
+        if self.left < 0:
+            raise RuntimeError("the recogniser fails")
+        return self._recogniser.together(*views)
+
+    def outlook(self, *views):
+        return self._recogniser.outlook(*views)
+
+
+def test_a_frame_that_raises_leaves_no_trace(ycb, ycb_meshes):
+    """Neither where it fails at once nor where it fails last, when two objects become one."""
+    camera = camera_over([ycb_meshes["mug"], ycb_meshes["banana"]])
+    first, second = camera.frame(view(20)), camera.frame(view(110))
+    recogniser = FailsLater(ycb.models.recogniser)
+    models = replace(ycb.models, recogniser=recogniser)
+    scene = nextview.Scene(replace(ycb, models=models))
+    scene.update(first)
+    state = scene._state
+    mug = next(track for track in state.tracks if track.result.answer == "mug")
+    scene._state = replace(state, tracks=(*state.tracks, replace(mug, number=7)))
+
+    def stands():
+        return [(thing.number, thing.name, *thing.pixels) for thing in scene.objects]
+
+    before = stands()
+    left = recogniser.left
+    look = copy(scene).update(second)
+    assert look.joined
+    calls = left - recogniser.left
+    assert calls > 2
+
+    for allowed in range(calls):
+        recogniser.left = allowed
+        with pytest.raises(RuntimeError, match="the recogniser fails"):
+            scene.update(second)
+        assert stands() == before
+        assert len(scene.frames) == 1
+    recogniser.left = calls
+    assert scene.update(second) == look
+
+
+def test_a_scene_can_be_pickled_and_goes_on_alike_and_apart(ycb, two_frames):
+    scene = nextview.Scene(ycb)
+    scene.update(two_frames[0])
+    other = pickle.loads(pickle.dumps(scene))
+    for one in (scene, other):
+        one.update(two_frames[1])
+    (ours,), (theirs,) = scene.objects, other.objects
+    assert (ours.name, ours.number) == (theirs.name, theirs.number)
+    np.testing.assert_allclose(ours.pose, theirs.pose)
+    scene.update(camera_over([]).frame(view(140)))
+    assert len(other.frames) == 2

@@ -1,0 +1,151 @@
+"""When a scene is empty, when it is done, and how much of a frame full of litter is verified."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from small_tables import camera_over, view
+
+import nextview
+from nextview.cli.look import print_scene
+from nextview.scene.state import MOST_VERIFIED
+from nextview.sensing.frame import Frame
+from nextview.sensing.object_frame import Box
+from nextview.simulation.sensor import SENSORS
+from nextview.simulation.tables import PlacedThing, SimulatedTable, TableCamera
+
+K = [[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]
+FROM_ABOVE = np.diag([1.0, -1, -1, 1])
+FROM_ABOVE[2, 3] = 0.8
+HOLE = (slice(160, 320), slice(240, 420))  # rows and columns of a bin in the plane
+
+
+def from_above(depth: np.ndarray) -> Frame:
+    """A frame of a camera that looks straight down on the plane z = 0 from 0.8 m."""
+    noise = np.random.default_rng(1).normal(0, 0.0008, depth.shape)
+    return Frame((depth + noise).astype(np.float32), K, FROM_ABOVE)
+
+
+def sunk_bin(parts: bool) -> Frame:
+    """A chute whose bottom slopes down below the plane around it, with or without parts in it."""
+    depth = np.full((480, 640), 0.8)
+    depth[HOLE] = np.linspace(0.84, 0.95, 180)
+    for row in (190, 250) if parts else ():
+        for column in (265, 330, 380):
+            depth[row : row + 30, column : column + 25] -= 0.02
+    return from_above(depth)
+
+
+def names(look) -> list[str]:
+    return [warning.name for warning in look.warnings]
+
+
+def around(depth: float) -> Box:
+    """The place of the bin, from a depth below the plane to a little above it."""
+    return Box([-0.12, -0.12, -depth], [0.15, 0.12, 0.03])
+
+
+@pytest.mark.parametrize("parts", [True, False])
+def test_a_bin_below_the_plane_is_not_empty(ycb, parts):
+    """What lies in the region, below what is taken for the ground, is no object yet."""
+    scene = nextview.Scene(ycb, region=around(0.15))
+    for _ in range(2):
+        frame = sunk_bin(parts)
+        depth = frame.depth + 1e-5 * len(scene.frames)
+        look = scene.update(Frame(depth, K, FROM_ABOVE))
+    assert "unexplained" in names(look)
+    assert "empty" not in names(look)
+    assert not scene.done
+    assert scene.target is not None
+
+
+def test_small_steps_side_by_side_are_not_empty(ycb):
+    rows, columns = np.mgrid[:480, :640]
+    higher = (rows // 12 + columns // 12) % 2 == 0
+    inner = (abs(rows - 240) < 200) & (abs(columns - 320) < 260)
+    scene = nextview.Scene(ycb)
+    look = scene.update(from_above(0.8 - 0.04 * (higher & inner)))
+    assert "empty" not in names(look)
+    assert not scene.done
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "said"),
+    [
+        ([-0.2, -0.2, -0.02], [0.2, 0.2, 0.3], "empty"),
+        ([-0.2, -0.2, 0.01], [0.2, 0.2, 0.3], "empty"),
+        ([0.3, -0.2, -0.02], [2.0, 0.2, 0.3], "ground unseen"),
+    ],
+)
+def test_a_region_is_empty_where_its_ground_is_seen(ycb, low, high, said):
+    scene = nextview.Scene(ycb, region=Box(low, high))
+    look = scene.update(from_above(np.full((480, 640), 0.8)))
+    assert names(look) == [said]
+    assert scene.done == (said == "empty")
+
+
+def test_the_report_says_what_is_empty_and_what_is_not(ycb, capsys):
+    scene = nextview.Scene(ycb)
+    scene.update(from_above(np.full((480, 640), 0.8)))
+    print_scene(scene, "table")
+    assert "nothing stands on the plane" in capsys.readouterr().out
+    scene = nextview.Scene(ycb, region=around(0.15))
+    scene.update(sunk_bin(parts=True))
+    print_scene(scene, "bin")
+    said = " ".join(capsys.readouterr().out.split())
+    assert "neither ground nor an object" in said
+    assert "nothing stands" not in said
+
+
+def test_what_lost_its_name_in_the_last_frame_is_not_settled(ycb, ycb_meshes):
+    camera = camera_over([ycb_meshes["mug"]])
+    scene = nextview.Scene(ycb)
+    scene.update(camera.frame(view(20)))
+    assert [thing.name for thing in scene.objects] == ["mug"]
+
+    stranger = replace(ycb, unknown=0.999999)  # nearly nothing is explained so well
+    scene._judge = type(scene._judge)(stranger, 1)
+    done = []
+    for degrees in (60, 100):
+        scene.update(camera.frame(view(degrees)))
+        assert [thing.name for thing in scene.objects] == ["unknown"]
+        done.append(scene.done)
+    assert done == [False, True]
+
+
+def litter(count: int) -> TableCamera:
+    """A camera over a table full of flat stones."""
+    rng = np.random.default_rng(3)
+    side = int(np.ceil(np.sqrt(count)))
+    ball = trimesh.creation.icosphere(2)
+    things = []
+    for k in range(count):
+        low = (0.012, 0.010, 0.007)
+        size = rng.uniform(low, (0.019, 0.016, 0.010))
+        pose = np.eye(4)
+        place = np.array([k % side, k // side]) - (side - 1) / 2
+        pose[:3, 3] = [*(0.05 * place + rng.uniform(-0.005, 0.005, 2)), size[2]]
+        stone = PlacedThing(f"{k}", ball.vertices * size, np.int32(ball.faces), pose)
+        things.append(stone)
+    return TableCamera(SimulatedTable(tuple(things)), SENSORS["stereo"], rng)
+
+
+def test_of_a_table_full_of_litter_a_part_is_verified(ycb, capsys):
+    scene = nextview.Scene(ycb)
+    look = scene.update(litter(100).frame(view(20)))
+    segments = scene.tops[0].segments()
+    assert len(segments) > MOST_VERIFIED + 10
+
+    verified = [mask for thing in scene.objects for mask in thing.pixels.values()]
+    assert MOST_VERIFIED / 2 < len(verified) <= 1.5 * MOST_VERIFIED
+    shown = np.any(verified, axis=0)
+    largest, others = segments[:MOST_VERIFIED], segments[MOST_VERIFIED:]
+    assert np.mean([(mask & shown).any() for mask in largest]) > 0.9
+    assert np.mean([(mask & shown).any() for mask in others]) < 0.1
+
+    left = f"{len(others)} small objects left unknown"
+    (told,) = [each for each in look.warnings if each.name == "left unknown"]
+    assert told.message.startswith(left)
+    print_scene(scene, "stones")
+    assert left in " ".join(capsys.readouterr().out.split())
