@@ -243,7 +243,7 @@ def learn(
         >>> nextview.learn("scans", "mine", unit="m")  # doctest: +SKIP
         >>> nextview.load(models="mine").recognise("scans/mug.ply", unit="m")  # doctest: +SKIP
     """
-    given: dict[str, Any] = {"track": in_lines} | options
+    given: dict[str, Any] = {"track": in_lines, **options}
     names = TeachingOptions.__dataclass_fields__
     how = {name: given.pop(name) for name in names if name in given}
     return learn_things(Path(folder), Path(out), TeachingOptions(**how), **given)
