@@ -35,9 +35,9 @@ from nextview.scene.tracks import Track, render_track
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import KnownFrames
 from nextview.sensing.object_frame import Box, upright_axes
-from nextview.sensing.plausibility import ViewWarning
 from nextview.sensing.support import GroundPlane
 from nextview.sensing.tabletop import TableTop
+from nextview.sensing.view_warning import ViewWarning
 from nextview.session.repeated import REPEATED
 from nextview.session.system import System, load
 from nextview.types import Float, Mask
