@@ -10,7 +10,7 @@ import numpy as np
 
 from nextview.recognition.poses import PoseCandidate, PoseUncertainty, place_in_words
 from nextview.scene.tracks import Track
-from nextview.sensing.plausibility import ViewWarning
+from nextview.sensing.view_warning import ViewWarning
 from nextview.session.result import Recognition
 from nextview.types import Float, Mask
 

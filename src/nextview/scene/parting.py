@@ -418,8 +418,8 @@ def _union(tracks: Sequence[Track], bench: Bench) -> Track:
         one = seen[number][0]
         if len(seen[number]) > 1:
             every = np.any([other.mask for other in seen[number]], axis=0)
-            union = sighting_of(one.frame, every, one.plane, one.noise)
-            one = replace(union, warnings=one.warnings)
+            both = sighting_of(one.frame, every, one.plane, one.noise)
+            one = replace(both, warnings=one.warnings)
         sightings.append(one)
 
     again = dict(pair for track in tracks for pair in track.again) | dict(first.again)

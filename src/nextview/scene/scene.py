@@ -35,9 +35,9 @@ from nextview.scene.tracks import Track, render_track
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import KnownFrames
 from nextview.sensing.object_frame import Box, upright_axes
-from nextview.sensing.plausibility import ViewWarning
 from nextview.sensing.support import GroundPlane
 from nextview.sensing.tabletop import TableTop
+from nextview.sensing.view_warning import ViewWarning
 from nextview.session.repeated import REPEATED
 from nextview.session.system import System, load
 from nextview.types import Float, Mask
@@ -52,7 +52,7 @@ WRONG_POSE = (
     "this frame does not fit the others and is left out: most objects are not where they were, so"
     " its pose is likely to be wrong"
 )
-ELSEWHERE = (
+NOTHING_AGAIN = (
     "this frame shows neither the plane that things stand on nor any object where they were: check"
     " its pose, or aim the camera at them"
 )
@@ -338,7 +338,7 @@ class Scene:
         seen_again = any(one.confirms for one in found)
         if before.tops and top.ground.wide and not (top.shows_ground or seen_again):
             self._top_of(top.frame, None, ())  # names a mistake in the pose
-            raise ObservationError(ELSEWHERE)
+            raise ObservationError(NOTHING_AGAIN)
 
         state, look = self._taken(before, top, found)
         if look.moved and not seen_again:

@@ -12,8 +12,8 @@ from nextview.scene.next_view import FEWEST_HIDDEN, TableGround, is_sure
 from nextview.scene.tracks import Track
 from nextview.scene.unexplained import UnexplainedPatch, ground_seen, unexplained
 from nextview.sensing.object_frame import Box
-from nextview.sensing.plausibility import ViewWarning
 from nextview.sensing.tabletop import TableTop
+from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float
 
 # objects that are verified in a frame at most, those with the most pixels first

@@ -13,7 +13,6 @@ from nextview.sensing.lean import lean_of
 from nextview.sensing.object_frame import upright_axes
 from nextview.sensing.planes import Plane
 from nextview.sensing.plausibility import (
-    ViewWarning,
     check_frame,
     check_lean,
     check_pose_moved,
@@ -21,6 +20,7 @@ from nextview.sensing.plausibility import (
     refuse_far,
     refuse_millimetres,
 )
+from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float
 
 

@@ -23,7 +23,6 @@ from nextview.sensing.known_frames import KnownFrames
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, ObjectFrame, three, upright_axes
 from nextview.sensing.planes import Plane, Samples, find_again, sample
-from nextview.sensing.plausibility import ViewWarning
 from nextview.sensing.resampling import observation_of
 from nextview.sensing.sighting import (
     FEWEST_OBJECT_PIXELS,
@@ -36,6 +35,7 @@ from nextview.sensing.support_plane import (
     base_below_view,
     find_support_plane,
 )
+from nextview.sensing.view_warning import ViewWarning
 from nextview.sensing.walls import before_walls, find_walls
 from nextview.types import Float, Index, Mask
 

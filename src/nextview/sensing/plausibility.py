@@ -1,7 +1,6 @@
 """Refuse what cannot be right in a frame, and name the likely mistake behind an observation."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.displacement import Displacement
 from nextview.sensing.frame import CAMERA_AXES, Frame
 from nextview.sensing.lean import Lean
+from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Index
 
 PIXELS_SAMPLED = 500  # pixels that are looked at
@@ -60,27 +60,6 @@ SAME_HEIGHT = 0.1  # part of a height up to which another one is the same
 SAME_STEPS = 0.03  # the same, of heights that tell the steps of the depth
 # factor from which a radius is nearer to ten times than to once
 ORDER_OF_SIZE = np.sqrt(10)
-
-
-@dataclass(frozen=True)
-class ViewWarning:
-    """Something that is likely to be wrong, in a sentence.
-
-    Names are "nothing seen", "opengl axes", "ros axes", "inverse pose", "scale", "outside",
-    "contradiction" and "repeated"; of a frame "intrinsics", "unit", "far origin", "outline",
-    "support", "point", "size", "stale pose", "displaced" and "lean". Those of scenes are on the
-    page on tables.
-
-    Attributes:
-        name: one of these.
-        message: a sentence for whoever set up the camera.
-        holds: whether no answer is confident by a view with it. It is not so where the mistake is
-            allowed for, or does not matter for the answer.
-    """
-
-    name: str
-    message: str
-    holds: bool = True
 
 
 def refuse_far(

@@ -16,7 +16,7 @@ from nextview.sensing.frame import Frame, within
 from nextview.sensing.object_frame import ObjectFrame, enclose
 from nextview.sensing.outliers import without_outliers
 from nextview.sensing.planes import Plane
-from nextview.sensing.plausibility import ViewWarning
+from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Mask
 
 FEWEST_OBJECT_PIXELS = 60  # pixels that an object has to have in a frame

@@ -18,7 +18,6 @@ from nextview.sensing.frame import Frame, within
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, upright_axes
 from nextview.sensing.planes import LEAST_SUPPORT, Plane, Samples, sample
-from nextview.sensing.plausibility import ViewWarning
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS, Sighting, sighting_of
 from nextview.sensing.support import GroundPlane
 from nextview.sensing.support_plane import (
@@ -26,6 +25,7 @@ from nextview.sensing.support_plane import (
     NO_SUPPORT,
     find_support_plane,
 )
+from nextview.sensing.view_warning import ViewWarning
 from nextview.sensing.walls import before_walls, find_walls
 from nextview.types import Float, Float32, Index, Mask
 

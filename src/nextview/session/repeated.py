@@ -9,7 +9,8 @@ import numpy as np
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import angle_between, direction_of
 from nextview.sensing.frame import Frame
-from nextview.sensing.plausibility import ViewWarning, check_views
+from nextview.sensing.plausibility import check_views
+from nextview.sensing.view_warning import ViewWarning
 from nextview.session.episode import VISITED_ANGLE
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from nextview.recognition.poses import (
     uncertainty_of,
 )
 from nextview.recognition.protocol import JointBelief
-from nextview.sensing.plausibility import ViewWarning
+from nextview.sensing.view_warning import ViewWarning
 from nextview.session.pose_frame import PoseFrame, PoseFrameName
 from nextview.session.view import View
 from nextview.types import Float

@@ -39,10 +39,10 @@ from nextview.recognition.poses import share_of_likeliest
 from nextview.recognition.protocol import JudgesTogether, LooksAhead
 from nextview.sensing.frame import Frame
 from nextview.sensing.plausibility import (
-    ViewWarning,
     check_last_view,
     check_observation,
 )
+from nextview.sensing.view_warning import ViewWarning
 from nextview.session.episode import Episodes, Step
 from nextview.session.limits import Limits, in_words
 from nextview.session.pose_frame import PoseFrame

@@ -9,7 +9,7 @@ from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, elevation_of
 from nextview.recognition.novelty import ViewScore, values_of
 from nextview.recognition.protocol import JointBelief
-from nextview.sensing.plausibility import ViewWarning
+from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Floats
 
 
