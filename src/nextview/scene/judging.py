@@ -159,7 +159,7 @@ class Judge:
     def _confident(self, result: Recognition, joint: JointBelief | None) -> bool:
         """Whether the belief is high enough, and the object fits what it is taken for."""
         system = self.system
-        if not result.seen or result.unknown:
+        if not result.seen or result.unknown or (joint is not None and joint.doubt):
             return False
         counted = np.cumsum([view.observation.seen for view in result.views])
         beliefs = np.stack([view.belief for view in result.views])
