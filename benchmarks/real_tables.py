@@ -1,4 +1,4 @@
-"""Real frames of things that no memory was taught: how many of them get a name, and a confident one.
+"""Real frames of things that a memory was not taught: how many get a name, how many confidently.
 
     python benchmarks/real_tables.py FOLDER [--models ycb] [--show]
 

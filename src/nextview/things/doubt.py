@@ -27,10 +27,10 @@ def doubt_of(found: Verified, poses: Sequence[PoseCandidate], pixels: int) -> st
     degrees = uncertainty_of(own).degrees
     if below:
         return f"its scan would reach {below:.0f} mm below the ground"
-    if behind >= MOST_SEEN_BEHIND:
-        return f"the camera sees past {100 * behind:.0f} % of its scan"
     if pixels < FEWEST_PIXELS:
         return f"only {pixels} pixels show it"
+    if behind >= MOST_SEEN_BEHIND:
+        return f"the camera sees past {100 * behind:.0f} % of its scan"
     if degrees >= UNKNOWN_TURN:
         return f"its orientation is known to ± {degrees:.0f}° only"
     return ""

@@ -39,8 +39,8 @@ def candidates_of(
         labels: class of each of the things, (T,).
 
     Returns:
-        Poses that a depth camera tells apart, of one or several things; and by how much errors of the cameras' places
-        displace them all, millimetres, one standard deviation.
+        Poses that a depth camera tells apart, of one or several things; and by how much errors of
+        the cameras' places displace them all, millimetres, one standard deviation.
     """
     shown = [depth_view(observation, FINE_SIDE) for observation in observations]
     views = [view for view in shown if view is not None]
