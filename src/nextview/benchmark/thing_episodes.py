@@ -169,9 +169,13 @@ class ThingEpisode:
         used = frozenset(self.seen(views))
         if used not in self._verified:
             name = "-".join(map(str, sorted(used)))
-            if f"{name}.seconds" not in self._kept:
+            needed = {f.name: f"{name}.{f.name}" for f in fields(Verified)}
+            # What an earlier version kept lacks parts, and was judged in another way.
+            if not all(
+                one in self._kept for one in (*needed.values(), f"{name}.seconds")
+            ):
                 self._verify(name, sorted(used))
-            parts = {f.name: self._kept[f"{name}.{f.name}"] for f in fields(Verified)}
+            parts = {part: self._kept[one] for part, one in needed.items()}
             self._verified[used] = (
                 Verified(**parts),
                 float(self._kept[f"{name}.seconds"]),

@@ -84,8 +84,8 @@ class _Runs:
         things: whose they are, (R,) int64.
         weight: of each: together 1 for each thing, (R,).
         right: after each view, (R, K) float64.
-        sure: whether it was ever confident, as a session is: it believes, and the residual is no
-            worse than that of known things, (R,) float64.
+        sure: whether it was ever confident, as a session without ``Recognition.doubt`` is: it
+            believes, and the residual is no worse than that of known things, (R,) float64.
         wrong: whether it was confident and wrong, (R,) float64.
         until: views until it was confident; all if it never was, (R,).
         travel: radians on the sphere up to each view, (R, K).

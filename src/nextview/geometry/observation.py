@@ -46,6 +46,7 @@ class SceneView:
         intrinsics: pinhole matrix, (3, 3), pixels; the first pixel's centre is at 0.5.
         background_free: whether nothing is there where nothing was measured, as in renders; a
             sensor may miss what is black or shiny.
+        step: every so many rows and columns of the frame were taken.
     """
 
     depth: Float32
@@ -53,6 +54,7 @@ class SceneView:
     pose: Float
     intrinsics: Float
     background_free: bool = False
+    step: int = 1
 
     def __post_init__(self) -> None:
         if self.depth.ndim != 2 or self.target.shape != self.depth.shape:

@@ -40,8 +40,32 @@ class _Pose:
     share: float = 0.0
 
 
+@dataclass(frozen=True, eq=False)
+class LikelyRests:
+    """The resting poses of an object that are looked at.
+
+    Attributes:
+        rotations: from the mesh's own axes into the poses, (P, 3, 3) float64, the likeliest first
+            after the identity.
+        shares: of all throws that end in each, (P,) float64. What they lack of 1 is the share of
+            the throws that end in other poses, or in rare ones that were not looked at.
+    """
+
+    rotations: Float
+    shares: Float
+
+
 def resting_poses(mesh: Mesh) -> Float:
-    """Rotate a mesh into each of its likely resting poses.
+    """The rotations of ``likely_rests``.
+
+    Args:
+        mesh: the object.
+    """
+    return likely_rests(mesh).rotations
+
+
+def likely_rests(mesh: Mesh) -> LikelyRests:
+    """Find the poses in which a mesh is likely to rest.
 
     A dropped object rests on a face of its convex hull, the likelier the larger it looks from the
     centre of mass (Goldberg et al., "Part pose statistics", IJRR 1999, as in trimesh). The mesh's
@@ -53,16 +77,18 @@ def resting_poses(mesh: Mesh) -> Float:
         mesh: the object.
 
     Returns:
-        Rotations from the mesh's own axes into the poses, (P, 3, 3) float64, the likeliest first
-        after the identity.
+        The poses, at most MOST_RESTING_POSES, each but its own of at least LIKELY_POSE of the
+        throws, and how likely they are.
     """
     ups, shares = _stable_poses(mesh)
     own, *others = _distinct_poses(mesh, ups, shares)
 
     likely = [pose for pose in others if pose.share >= LIKELY_POSE]
     likely.sort(key=lambda pose: -pose.share)
-    return np.stack(
-        [_upright(pose.up) for pose in [own, *likely[: MOST_RESTING_POSES - 1]]]
+    kept = [own, *likely[: MOST_RESTING_POSES - 1]]
+    return LikelyRests(
+        rotations=np.stack([_upright(pose.up) for pose in kept]),
+        shares=np.array([pose.share for pose in kept]),
     )
 
 

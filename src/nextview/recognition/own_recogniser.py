@@ -150,6 +150,11 @@ class OwnJointRecogniser(OwnRecogniser):
             raise ModelError(
                 f"recogniser {self.name}: {what}, not to {belief.sum():.4g}"
             )
+        if not isinstance(joint.doubt, str):
+            raise ModelError(
+                f'recogniser {self.name}: a doubt is a reason in words, or "", not'
+                f" {one_line(repr(joint.doubt))}"
+            )
         if joint.p_value is not None and not 0 <= joint.p_value <= 1:
             raise ModelError(
                 f"recogniser {self.name}: a p-value is 0 to 1, not {joint.p_value}"

@@ -14,6 +14,9 @@ from nextview.errors import ModelError
 from nextview.geometry.observation import RIGID
 from nextview.types import Float, Float32
 
+UNKNOWN_TURN = (
+    30.0  # degrees by which the orientation is off where the pose is not known
+)
 ALIKE_TURN = 5.0  # degrees between poses that are taken for one
 ALIKE_SHIFT = 0.005  # metres between the centres of poses that are taken for one
 SAME_AXIS = 0.1  # sine of the angle between axes that are one
@@ -153,7 +156,7 @@ def uncertainty_of(
     first = candidates[0]
     shares = np.array([candidate.probability for candidate in candidates])
     shares = shares / shares.sum()
-    turns = np.array([_turn_apart(first, other) for other in candidates])
+    turns = np.array([turn_apart(first, other) for other in candidates])
     shifts = np.array(
         [1000 * np.linalg.norm(other.place - first.place) for other in candidates]
     )
@@ -180,14 +183,19 @@ def share_of_likeliest(candidates: Sequence[PoseCandidate]) -> float:
     same = [
         candidate.probability
         for candidate in own
-        if _turn_apart(first, candidate) < ALIKE_TURN
+        if turn_apart(first, candidate) < ALIKE_TURN
         and float(np.linalg.norm(candidate.place - first.place)) < ALIKE_SHIFT
     ]
     return sum(same) / sum(candidate.probability for candidate in own)
 
 
-def _turn_apart(first: PoseCandidate, second: PoseCandidate) -> float:
-    """Angle between two poses of one thing, degrees, but for its symmetries."""
+def turn_apart(first: PoseCandidate, second: PoseCandidate) -> float:
+    """Angle between two poses of one thing, degrees, but for its symmetries.
+
+    Args:
+        first: the one.
+        second: the other.
+    """
     symmetries = first.symmetry or ()
     between = first.pose[:3, :3].T @ second.pose[:3, :3]  # in the axes of the scan file
     turns = _turns_of(tuple(symmetries))

@@ -62,6 +62,7 @@ class JointBelief:
         p_value: share of known objects that are explained as badly as this one, 0 to 1; None if
             that is not known.
         why_no_pose: why there is no pose, in words; "" if there is one, or none was to be expected.
+        doubt: why no answer is confident however high the belief, in words; "" for no such reason.
         found: what the recogniser goes by if it is asked for more; None if that is nothing.
     """
 
@@ -70,6 +71,7 @@ class JointBelief:
     camera_error: float = 0.0
     p_value: float | None = None
     why_no_pose: str = ""
+    doubt: str = ""
     found: Any = None
 
 

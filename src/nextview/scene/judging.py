@@ -168,7 +168,7 @@ class Judge:
     def _confident(self, result: Recognition, joint: JointBelief | None) -> bool:
         """Whether the belief is high enough, and the object fits what it is taken for."""
         system = self.system
-        if not result.seen or result.unknown:
+        if not result.seen or result.unknown or (joint is not None and joint.doubt):
             return False
         if is_doubtful([view.warnings for view in result.views]):
             return False

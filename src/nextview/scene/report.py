@@ -57,7 +57,9 @@ def doubts_of(scene: Scene) -> list[str]:
             continue
         beliefs = sorted(thing.result.beliefs.items(), key=lambda pair: -pair[1])
         rest = [f"{one} {belief:.2f}" for one, belief in beliefs[:MOST_CANDIDATES]]
-        said.append(f"{thing.number} is not confident: {', '.join(rest)}")
+        doubt = thing.result.doubt
+        why = f" ({doubt})" if doubt else ""
+        said.append(f"{thing.number} is not confident: {', '.join(rest)}{why}")
     return said
 
 

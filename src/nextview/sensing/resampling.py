@@ -181,4 +181,5 @@ def _scene(sighting: Sighting, pose: Float, radius: float) -> SceneView:
         sighting.mask[few],
         pose,
         k,
+        step=step,
     )

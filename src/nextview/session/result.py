@@ -39,7 +39,8 @@ class Recognition:
 
     It is confident where the threshold was reached in a view without warnings that hold it (see
     ``ViewWarning.holds``), by an object that is not suspiciously novel (see ``SUSPICIOUS``) and may
-    be of the class by its size, and fewer than half of the views contradict others.
+    be of the class by its size, fewer than half of the views contradict others, and there is no
+    ``doubt``.
 
     Attributes:
         views: in order.
@@ -284,6 +285,16 @@ class Recognition:
         return joint.why_no_pose if joint is not None and self.pose is None else ""
 
     @property
+    def doubt(self) -> str:
+        """Why the answer is not confident however high the belief in it, in words; "" if it may be.
+
+        A taught thing is confident as "this thing in this pose": its scan stands on the ground or
+        above, hides what is behind it, has its orientation known, and is seen in enough pixels.
+        """
+        joint = self._joint
+        return "" if joint is None or self.answer is None else joint.doubt
+
+    @property
     def _joint(self) -> JointBelief | None:
         """What all views say together; None if views are judged one by one."""
         return self.views[-1].joint if self.views else None
@@ -336,6 +347,8 @@ class Recognition:
             return f"{self.none_of_them}: {self.why_unknown} ({views})"
 
         sure = "confident" if self.confident else "not confident"
+        if self.doubt and not self.confident:
+            sure += f", {self.doubt}"
         if self.stranded:
             sure += ", no other view in reach"
             if self.why_stranded:

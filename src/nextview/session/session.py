@@ -770,6 +770,7 @@ class Session:
             constrain=lambda state: self._constrained(state, reach, object, here),
             hold=lambda step: (
                 doubtful
+                or _in_doubt(step)
                 or self._suspicious([*episodes.steps, step], observations)
                 or self._pose_in_doubt(step)
             ),
@@ -1043,6 +1044,12 @@ class Session:
         return tuple(
             name for name, off in zip(self.models.classes, wrong, strict=True) if off
         )
+
+
+def _in_doubt(step: Step) -> bool:
+    """Whether what all views say together is not to be acted on, however it is believed."""
+    joint = step.joint[0] if step.joint else None
+    return joint is not None and bool(joint.doubt)
 
 
 def _seen_anew(before: View, seen: View) -> View:

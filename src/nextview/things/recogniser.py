@@ -15,6 +15,7 @@ from nextview.geometry.observation import Observation
 from nextview.recognition.inference import NetworkRecogniser
 from nextview.recognition.model_card import find_card
 from nextview.recognition.protocol import JointBelief
+from nextview.things.doubt import doubt_of
 from nextview.things.expected_views import Outlook
 from nextview.things.memory import TaughtRecogniser, open_memory
 from nextview.things.pose_candidates import candidates_of
@@ -147,6 +148,7 @@ class VerifiedRecogniser(TaughtRecogniser):
             poses=poses,
             camera_error=camera_error,
             p_value=self.things.p_value(observations, found),
+            doubt=doubt_of(found, poses, _most_pixels(observations)),
             found=found,
         )
 
@@ -171,6 +173,17 @@ class VerifiedRecogniser(TaughtRecogniser):
     def _no_geometry(self, belief: Float) -> str:
         """Why there is no pose of the class believed most, in words."""
         return f"the geometry of {self.classes[int(belief.argmax())]} is not known in metres"
+
+
+def _most_pixels(observations: Sequence[Observation]) -> int:
+    """Pixels of a frame that show the thing, in the frame that shows most of it."""
+    counts = [
+        int(one.depth.astype(bool).sum()) for one in observations if one.scene is None
+    ]
+    for one in observations:
+        if one.scene is not None:
+            counts.append(int(one.scene.target.sum()) * one.scene.step**2)
+    return max(counts)
 
 
 def open_recogniser(model: str | Path, threads: int = 0) -> NetworkRecogniser:

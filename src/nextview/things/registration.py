@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, DepthView
 from nextview.things.surface import SurfaceCaster
-from nextview.types import Float, Float32, Index, Mask
+from nextview.types import Float, Float32, Floats, Index, Mask
 
 TURN = slice(0, 3)
 PLACE = slice(3, 6)
@@ -200,6 +200,11 @@ HIDING_NOISE = 4.0  # deviations of the noise by which it does
 NOISE_REACH = 2.0
 
 
+def scan_errors(radii: Float32 | float) -> Floats:
+    """Deviation of surfaces of these radii, metres, from the things themselves, metres."""
+    return np.hypot(SCAN_ERROR, RELATIVE_SCAN_ERROR * radii)
+
+
 @dataclass(frozen=True, eq=False)
 class Rendered:
     """What one view would see of H hypotheses, object frame, metres.
@@ -228,12 +233,22 @@ class Rendered:
     @property
     def errors(self) -> Float32:
         """Deviation of each surface from the thing itself, (H,) float32, metres."""
-        return np.hypot(SCAN_ERROR, RELATIVE_SCAN_ERROR * self.radii).astype(np.float32)
+        return scan_errors(self.radii).astype(np.float32)
 
     def hidden(self, view: DepthView) -> Mask:
         """Where something else stands before a hypothesis, (H, P) bool."""
-        before = np.hypot(HIDING, HIDING_NOISE * view.noise) + self.errors[:, None]
-        return (view.kind == ELSEWHERE) & (view.depth < self.depth - before)
+        before = self.depth - self._apart(view)
+        return (view.kind == ELSEWHERE) & (view.depth < before)
+
+    def seen_behind(self, view: DepthView) -> Mask:
+        """Where something is measured behind a hypothesis that should hide it, (H, P) bool."""
+        shows = np.isfinite(self.depth)
+        behind = np.where(shows, self.depth, 0) + self._apart(view)
+        return shows & (view.kind == ELSEWHERE) & (view.depth > behind)
+
+    def _apart(self, view: DepthView) -> Float32:
+        """Metres from which on depth is before or behind the hypotheses, (H, P)."""
+        return np.hypot(HIDING, HIDING_NOISE * view.noise) + self.errors[:, None]
 
 
 def render(

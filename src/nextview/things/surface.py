@@ -134,6 +134,13 @@ class Surface:
         edges = corners[:, 1:] - corners[:, :1]
         return np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
 
+    @cached_property
+    def vertex_shares(self) -> Float:
+        """Share of the surface that belongs to each vertex, (V,) float64: their sum is 1."""
+        corners = self.faces.ravel()
+        sums = np.bincount(corners, np.repeat(self._areas, 3), len(self.vertices))
+        return sums / sums.sum()
+
     @property
     def area(self) -> float:
         """Square metres."""

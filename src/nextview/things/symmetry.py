@@ -15,7 +15,7 @@ from scipy.spatial import QhullError, cKDTree
 
 from nextview.recognition.model_card import Symmetry
 from nextview.things.surface import Surface
-from nextview.types import Float
+from nextview.types import Float, Mask
 
 # metres: three deviations of edges that a stereo camera sees at arm's length
 LEAST_TOLERANCE = 0.005
@@ -50,7 +50,7 @@ def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
     whole -= centroid
     tree = cKDTree(whole)
     points = surface.sample(TURNED_POINTS, rng) - centroid
-    tolerance = max(LEAST_TOLERANCE, SYMMETRY_TOLERANCE * surface.diameter)
+    tolerance = _tolerance(surface)
 
     found = []
     for axis in _axes(surface, whole):
@@ -70,6 +70,31 @@ def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
             tolerance,
         )
     return tuple(symmetries)
+
+
+def coincide(surface: Surface, motions: Float) -> Mask:
+    """Whether a surface and its moved copies are the same to a depth camera.
+
+    Args:
+        surface: of a thing.
+        motions: of the copies, in the frame of the surface, (N, 4, 4), metres.
+
+    Returns:
+        (N,) bool.
+    """
+    rng = np.random.default_rng(0)
+    tree = cKDTree(surface.sample(SYMMETRY_POINTS, rng))
+    points = surface.sample(TURNED_POINTS, rng)
+    there = points @ motions[:, :3, :3].swapaxes(1, 2) + motions[:, None, :3, 3]
+    back = (points - motions[:, None, :3, 3]) @ motions[:, :3, :3]
+    apart = np.stack([tree.query(moved)[0] for moved in (there, back)])
+    worst = np.quantile(apart, COMPARED_SHARE, axis=2).max(0)
+    return np.asarray(worst < _tolerance(surface))
+
+
+def _tolerance(surface: Surface) -> float:
+    """Distance of two surfaces that a depth camera does not see, metres."""
+    return max(LEAST_TOLERANCE, SYMMETRY_TOLERANCE * surface.diameter)
 
 
 def _half_turn_across(

@@ -1,12 +1,12 @@
 """How likely a view is, pixel by pixel, if a surface stands where it was aligned."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, DepthView
 from nextview.things.registration import Rendered
-from nextview.types import Float
+from nextview.types import Float, Index
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,9 @@ class ViewLikelihood:
             float64, 0 for exactly: see ``likelihood``.
         noise_share: part of the noise of the camera in the variance of a depth that is measured on
             the hypothesis, beside the errors of its scan, (H,) float64.
+        visible: pixels where the hypothesis should show and depth was measured, (H,) float64; those
+            near the outline of the thing count less.
+        seen_behind: those of them in which something behind it was measured, (H,) float64.
     """
 
     total: Float
@@ -53,6 +56,13 @@ class ViewLikelihood:
     explained: Float
     misfit: Float
     noise_share: Float
+    visible: Float
+    seen_behind: Float
+
+    def select(self, rows: Index) -> "ViewLikelihood":
+        """Some of the hypotheses, by index."""
+        parts = {field.name: getattr(self, field.name) for field in fields(self)}
+        return ViewLikelihood(**{name: part[rows] for name, part in parts.items()})
 
     @property
     def mean(self) -> Float:
@@ -64,18 +74,21 @@ def likelihood(
     view: DepthView,
     rendered: Rendered,
     model: PixelModel = PixelModel(),
+    below: Float | float = 0.0,
 ) -> ViewLikelihood:
     """Judge every pixel of a view, given what it would show under each hypothesis.
 
     The depth on the thing is compared with the surface under the noise of the sensor, which grows
     where the surface is steep. Pixels of the thing without a surface are outliers; so are pixels
     where the surface should be visible and what is behind it was measured. What stands in front of
-    the surface is neutral, as are pixels where neither shows.
+    the surface is neutral, as are pixels where neither shows. What lies below the ground counts
+    like as large a share of the pixels that is seen through, whether it is visible or not.
 
     Args:
         view: the view.
         rendered: the hypotheses as the view would show them.
         model: of the pixels.
+        below: share of the surface of each hypothesis that lies below the ground, (H,).
 
     Returns:
         How well each hypothesis explains the view.
@@ -119,19 +132,24 @@ def likelihood(
     # Depths tell best whether a thing was taught. Outlines depend on how well it was segmented.
     missing = np.where(~shows & thing, deep, 0).sum(1) / max(1, int(thing.sum()))
     seen_through = np.where(through, deep, 0).sum(1) / np.maximum(shows.sum(1), 1)
+    impossible = np.minimum(seen_through + below, 1)
     # Real sensors round off edges.
     both = np.where(shows & thing, inner, 0)
     mismatch = -(both * match).sum(1) / np.maximum(both.sum(1), 1e-9)
     mismatch = np.where(both.any(1), mismatch, -model.outlier)
     misfit = mismatch - model.outlier * (
-        model.missing * missing + model.through * seen_through
+        model.missing * missing + model.through * impossible
     )
+    pixels = counted.sum(1).astype(np.float64)
+    visible = shows & ~hole & ~rendered.hidden(view)
     return ViewLikelihood(
-        total=judged.sum(1),
-        pixels=counted.sum(1).astype(np.float64),
+        total=judged.sum(1) + model.outlier * below * pixels,
+        pixels=pixels,
         explained=explained,
         misfit=misfit,
         noise_share=_noise_share(view, rendered),
+        visible=np.where(visible, deep, 0).sum(1),
+        seen_behind=np.where(rendered.seen_behind(view), deep, 0).sum(1),
     )
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from nextview.errors import ModelError, ObservationError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import rotation_z
+from nextview.things.below_ground import BelowGround, below_ground
 from nextview.things.depth_view import DepthView, MetricImage
 from nextview.things.ground import levelling
 from nextview.things.proposals import propose
@@ -110,6 +111,10 @@ class Verified:
         noise_share: see ``ViewLikelihood``, of each hypothesis in each view, (M, V) float64.
         against: what features hold against each thing, nats, (T,) float64; 0 for things in any
             orientation, whose outlines are judged by the geometry anyway.
+        seen_behind: share of what should be visible of each hypothesis that the cameras see past,
+            of all views together, (M,) float64.
+        below: by how much each hypothesis reaches below the ground, (M,) float64, metres; 0 where
+            noise, tilt and errors of the scan explain it.
     """
 
     belief: Float
@@ -126,6 +131,8 @@ class Verified:
     misfit: Float
     noise_share: Float
     against: Float
+    seen_behind: Float
+    below: Float
 
     def judged(self, truth: int) -> JudgedEpisode:
         """The same as an example of the thing of this number, to fit weights to."""
@@ -356,14 +363,14 @@ class Verifier:
                     np.concatenate([np.arange(len(rows)), source])
                 )
 
-        aligned = alignment.turned(level.T)
         return self._verified(
             proposed,
-            aligned,
+            alignment,
+            views,
             scores[rows],
             costs[rows],
-            judged,
-            rows,
+            [view.select(rows) for view in judged],
+            level,
         )
 
     def _around(
@@ -422,40 +429,55 @@ class Verifier:
         alignment: Alignment,
         views: Sequence[DepthView],
     ) -> list[ViewLikelihood]:
+        below = self._below(alignment, views).share
         return [
-            likelihood(view, render(self.caster, alignment, view, number), self.pixels)
+            likelihood(
+                view,
+                render(self.caster, alignment, view, number),
+                self.pixels,
+                below,
+            )
             for number, view in enumerate(views)
         ]
+
+    def _below(self, alignment: Alignment, views: Sequence[DepthView]) -> BelowGround:
+        return below_ground(self.caster, alignment, views, self.prior.tilt)
 
     def _verified(
         self,
         proposed: _Proposed,
         alignment: Alignment,
+        views: Sequence[DepthView],
         scores: Float,
         costs: Float,
         judged: Sequence[ViewLikelihood],
-        rows: Index,
+        level: Float,
     ) -> Verified:
         """The answer of the proposals that survived, sorted by their scores.
 
-        ``rows`` are theirs in what was judged.
+        ``alignment`` and ``views`` are in the frame that was turned to be level.
         """
+        visible = np.sum([view.visible for view in judged], axis=0)
+        behind = np.sum([view.seen_behind for view in judged], axis=0)
+        aligned = alignment.turned(level.T)
         shares = np.exp(scores - scores.max())
         return Verified(
             belief=self.weights.belief(scores, alignment.things, proposed.by_features),
             things=alignment.things,
             resting=proposed.resting,
             probabilities=shares / shares.sum(),
-            poses=alignment.poses(self.caster),
-            cameras=alignment.cameras,
-            mean=np.stack([view.mean[rows] for view in judged], 1),
+            poses=aligned.poses(self.caster),
+            cameras=aligned.cameras,
+            mean=np.stack([view.mean for view in judged], 1),
             camera_costs=costs,
             log_belief=proposed.log_belief,
             by_features=proposed.by_features,
-            explained=np.stack([view.explained[rows] for view in judged], 1),
-            misfit=np.stack([view.misfit[rows] for view in judged], 1),
-            noise_share=np.stack([view.noise_share[rows] for view in judged], 1),
+            explained=np.stack([view.explained for view in judged], 1),
+            misfit=np.stack([view.misfit for view in judged], 1),
+            noise_share=np.stack([view.noise_share for view in judged], 1),
             against=proposed.against,
+            seen_behind=behind / np.maximum(visible, 1),
+            below=self._below(alignment, views).depth,
         )
 
 
