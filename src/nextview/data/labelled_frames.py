@@ -54,8 +54,8 @@ SHAPES_PER_FRAME = 0.35
 TOYS_PER_FRAME = 0.15
 FURNITURE_PER_FRAME = 0.075
 FEWEST_SHAPES = 12
-FARTHEST_DEPTH = 6.5  # metres
-DEPTH_STEP = 1e-4  # metres, of the depth in files
+FARTHEST_LEARNED = 6.5  # metres
+STORED_DEPTH_STEP = 1e-4  # metres, of the depth in files
 UNKNOWN_CLASS = -1  # of a pixel without depth
 SMALLEST_TAUGHT = 8  # pixels of a thing whose middle is learned
 UP_NOISE = 0.03  # of a direction against gravity that an arm reports
@@ -261,8 +261,8 @@ class LabelledFrames:
     def of(cls, frames: Sequence[LabelledFrame]) -> LabelledFrames:
         """Round the depth of frames, and forget what is too far."""
         depth = np.stack([frame.depth for frame in frames])
-        depth = np.where(depth > FARTHEST_DEPTH, 0, depth)
-        steps = np.rint(depth / DEPTH_STEP).astype(np.uint16)
+        depth = np.where(depth > FARTHEST_LEARNED, 0, depth)
+        steps = np.rint(depth / STORED_DEPTH_STEP).astype(np.uint16)
         labels = np.stack([frame.labels for frame in frames])
         matrices = np.stack([frame.intrinsics for frame in frames])
         return cls(
@@ -297,7 +297,7 @@ class LabelledFrames:
             index: of the frame.
             rng: mirrors it or not, and tilts or hides gravity; None for the frame as it is.
         """
-        depth = self.depth[index].astype(np.float32) * np.float32(DEPTH_STEP)
+        depth = self.depth[index].astype(np.float32) * np.float32(STORED_DEPTH_STEP)
         labels = self.labels[index]
         camera = PinholeCamera(*self.pinhole[index], *depth.shape[::-1])
         x, y = camera.image_slopes

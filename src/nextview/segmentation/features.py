@@ -11,9 +11,8 @@ from nextview.types import Float, Float32, Mask
 
 LONG_SIDE = 160  # pixels of the longer side of the network's picture, about
 SIDE_MULTIPLE = 16  # its sides are padded to multiples of this
-SAME_SURFACE = (
-    0.015  # pixels of a block whose depths differ by less, relatively, are averaged
-)
+# pixels of a block whose depths differ by less, relatively, are averaged
+NEAR_IN_DEPTH = 0.015
 PLANES = 4  # largest planes of a frame that the network is told
 PLANE_TRIALS = (
     12  # along each side of the picture, a plane through its surface is tried
@@ -21,7 +20,7 @@ PLANE_TRIALS = (
 PLANE_SAMPLES = 40  # along each side, pixels that a plane is compared with
 PLANE_TOLERANCE = 0.012  # of the depth, within which a pixel lies on a plane
 HEIGHT_SCALE = 30.0  # heights of a thirtieth of the distance are told well from 0
-CHANNELS = 15
+PICTURE_CHANNELS = 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +66,7 @@ def shrink(depth: Float32, rays: tuple[Float32, Float32]) -> SmallPicture:
     middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[..., None] // 2, -1)
     known = np.isfinite(middle)
     middle = np.where(known, middle, 0)
-    near = (np.abs(blocks - middle) < SAME_SURFACE * middle) & (blocks > 0)
+    near = (np.abs(blocks - middle) < NEAR_IN_DEPTH * middle) & (blocks > 0)
     small = (blocks * near).sum(-1) / np.maximum(near.sum(-1), 1)
     small = np.where(4 * count >= factor**2, small, 0)  # a few pixels alone are flying
     return SmallPicture(
@@ -97,11 +96,11 @@ def features(picture: SmallPicture, up: Float | None) -> Float32:
         up: direction against gravity in the camera's axes, (3,); None where it is not known.
 
     Returns:
-        (CHANNELS, h, w) float32, 0 where nothing was measured.
+        (PICTURE_CHANNELS, h, w) float32, 0 where nothing was measured.
     """
     depth = picture.depth
     valid = depth > 0
-    found = np.zeros((CHANNELS, *depth.shape), np.float32)
+    found = np.zeros((PICTURE_CHANNELS, *depth.shape), np.float32)
     if not valid.any():
         return found
     scale = float(np.median(depth[valid]))
@@ -138,7 +137,7 @@ def surface_normals(picture: SmallPicture) -> Float32:
         weight, 1e-6
     )
     # no mean across an edge
-    q = np.where(np.abs(smooth - inverse) < SAME_SURFACE * inverse, smooth, inverse)
+    q = np.where(np.abs(smooth - inverse) < NEAR_IN_DEPTH * inverse, smooth, inverse)
     x, y = picture.rays
     step_x = float(np.mean(np.diff(x))) if len(x) > 1 else 1.0
     step_y = float(np.mean(np.diff(y))) if len(y) > 1 else 1.0

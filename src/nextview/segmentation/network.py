@@ -10,7 +10,7 @@ import numpy as np
 from nextview.errors import ModelError
 from nextview.files import HashText, read_record, write_record
 from nextview.runtime import check_end, open_onnx, run_onnx
-from nextview.segmentation.features import CHANNELS, SIDE_MULTIPLE
+from nextview.segmentation.features import PICTURE_CHANNELS, SIDE_MULTIPLE
 from nextview.types import Float32
 
 SEGMENTATION_CARD = Path(__file__).parent / "bundled" / "segmentation.json"
@@ -90,7 +90,7 @@ def new_card(name: str, sha256: str) -> SegmentationCard:
     return SegmentationCard(
         name,
         sha256,
-        CHANNELS,
+        PICTURE_CHANNELS,
         OUTPUT_CLASSES,
         OFFSET_FACTOR,
         AFFINITY_STEPS,
@@ -146,7 +146,7 @@ class SegmentationNetwork:
         self.path = card.with_suffix(".onnx")
         self._session = open_onnx(self.path, self.card.sha256, threads)
         for ends, name, size in (
-            (self._session.get_inputs(), PICTURE_INPUT, CHANNELS),
+            (self._session.get_inputs(), PICTURE_INPUT, PICTURE_CHANNELS),
             (self._session.get_outputs(), PICTURE_OUTPUT, OUTPUTS),
         ):
             if [end.name for end in ends] != [name]:

@@ -447,4 +447,4 @@ def bent_lump(rng: Generator) -> Solid:
     bend = rng.uniform(0.3, 3.5)
     path = np.c_[np.sin(bend * (at - 0.5)), np.cos(bend * (at - 0.5)), 0 * at] / bend
     taper = 1 - rng.uniform(0, 0.8) * np.abs(2 * at - 1) ** rng.integers(1, 6)
-    return tube(path, rng.uniform(0.04, 0.16) * taper)
+    return tube(path, (rng.uniform(0.04, 0.16) * taper).astype(float))

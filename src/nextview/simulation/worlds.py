@@ -1,4 +1,4 @@
-"""Random worlds for a depth camera: tables, floors, bins, shelves, belts, rooms, with things in them.
+"""Random worlds for a depth camera: tables, floors, bins, shelves, belts and rooms of things.
 
 Things are dropped on a height map: they stand side by side, lie on each other, and fill bins. What
 they rest on, what encloses them, and what is behind them are labelled, too. A segmentation learns
@@ -32,7 +32,7 @@ BACKGROUND = (
 HOLE = -3  # label of a pixel without depth
 
 MAP_CELLS = 160  # cells on each side of a height map
-PLACES_TRIED = 25
+DROPS_TRIED = 25
 STEPS_OUTWARDS = 60
 LEAST_STABLE = 0.03  # share of throws of a resting pose, at least
 LARGEST_SHAPE = 20_000  # triangles
@@ -156,8 +156,8 @@ class HeightMap:
         half = (high - low)[:2] / 2
         angle = rng.uniform(0, 2 * np.pi)
         start = self.centre + rng.normal(0, spread / 2, 2)
-        for attempt in range(PLACES_TRIED + STEPS_OUTWARDS):
-            if attempt < PLACES_TRIED and piled:
+        for attempt in range(DROPS_TRIED + STEPS_OUTWARDS):
+            if attempt < DROPS_TRIED and piled:
                 start = self.centre + rng.uniform(-1, 1, 2) * spread
             middle = start
             if not piled:
@@ -210,7 +210,7 @@ class HeightMap:
 
 
 def slab(
-    size: Sequence[float], centre: Sequence[float], top: float, yaw: float = 0.0
+    size: Sequence[float], centre: Sequence[float] | Float, top: float, yaw: float = 0.0
 ) -> Solid:
     """A box with its top at a height.
 
@@ -230,7 +230,8 @@ def slab(
         np.int32,
     )  # fmt: skip
     turn = Rotation.from_euler("z", yaw)
-    return turn.apply(vertices) + [*centre, top - size[2] / 2], faces
+    middle = np.array([*centre, top - size[2] / 2])
+    return turn.apply(vertices) + middle, faces
 
 
 def draw_shapes(
@@ -409,7 +410,8 @@ def _hands(world: World, rng: Generator) -> None:
     if rng.random() > 0.08:
         return
     size = max(world.scale, 0.04)
-    tip = world.focus + [*rng.normal(0, 1.5 * size, 2), rng.uniform(0.5, 2.5) * size]
+    beside = rng.normal(0, 1.5 * size, 2)
+    tip = world.focus + np.append(beside, rng.uniform(0.5, 2.5) * size)
     out = rng.normal(0, 1, 3)
     out[2] = abs(out[2]) + 0.5
     out /= np.linalg.norm(out)
@@ -581,13 +583,18 @@ class LabelledFrame:
         depth: (H, W) float32, metres; 0 where nothing was measured.
         labels: thing of each pixel, SURFACE, BACKGROUND or HOLE, (H, W) int16.
         intrinsics: pinhole matrix, (3, 3); the first pixel's centre is at 0.5.
-        up: direction against gravity in the camera's axes, (3,).
+        pose: of the camera in the world, (4, 4).
     """
 
     depth: Float32
     labels: Index
     intrinsics: Float
-    up: Float
+    pose: Float
+
+    @property
+    def up(self) -> Float:
+        """Direction against gravity in the camera's axes, (3,)."""
+        return self.pose[2, :3]
 
 
 def photograph(
@@ -603,7 +610,7 @@ def photograph(
     """
     caster = RayCaster(world.solids)
     label_of = np.array([*world.labels, HOLE])
-    frames = []
+    frames: list[LabelledFrame] = []
     while len(frames) < views:
         sensor = _sensor(rng, shape)
         pose = _camera_pose(world, rng, sensor)
@@ -619,8 +626,7 @@ def photograph(
         labels = np.where(source >= 0, labels[np.maximum(source, 0)], BACKGROUND)
         measured = _blind_spots(measured, labels, rng)
         labels = np.where(measured > 0, labels, HOLE)
-        up = pose[2, :3].copy()
-        frames.append(LabelledFrame(measured, labels, sensor.intrinsics, up))
+        frames.append(LabelledFrame(measured, labels, sensor.intrinsics, pose))
     return frames
 
 

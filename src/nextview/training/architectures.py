@@ -3,7 +3,7 @@
 from nextview.checks import extras
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.network_input import CHANNELS_OF
-from nextview.segmentation.features import CHANNELS
+from nextview.segmentation.features import PICTURE_CHANNELS
 from nextview.segmentation.network import OUTPUTS
 from nextview.training.recipes import MapRecipe, RecogniserRecipe
 
@@ -445,7 +445,7 @@ class SegmentationNet(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         twice = 2 * width
-        self.e1 = Convolutions(4 * CHANNELS, width)
+        self.e1 = Convolutions(4 * PICTURE_CHANNELS, width)
         self.e2 = Convolutions(width, twice)
         self.e3 = Convolutions(twice, twice)
         self.e4 = Convolutions(twice, twice)

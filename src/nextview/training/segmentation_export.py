@@ -34,7 +34,7 @@ with extras():
     from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 LARGEST_DIFFERENCE = 0.01  # between the outputs of torch and of the file
-COMPARED_FRAMES = 4
+FRAMES_COMPARED_WITH_TORCH = 4
 WEIGHT_BITS = (16, 32)  # the first that keep the outputs
 
 
@@ -140,7 +140,7 @@ def largest_difference(
         frames: to compare them on.
     """
     found = 0.0
-    for index in range(min(COMPARED_FRAMES, len(frames))):
+    for index in range(min(FRAMES_COMPARED_WITH_TORCH, len(frames))):
         picture = frames.example(index, None).features
         for size in (picture.shape[2], picture.shape[2] - SIDE_MULTIPLE):
             seen = np.ascontiguousarray(picture[..., :size])
