@@ -206,8 +206,10 @@ def draw_file(meshes: WorldMeshes, file: FrameFile) -> None:
         file: what to write.
     """
     rng = np.random.default_rng(file.seed)
-    toys = _solids(meshes.toys, round(TOYS_PER_FRAME * file.frames), rng)
-    furniture = _solids(meshes.furniture, round(FURNITURE_PER_FRAME * file.frames), rng)
+    toys = solids_of(meshes.toys, max(1, round(TOYS_PER_FRAME * file.frames)), rng)
+    furniture = solids_of(
+        meshes.furniture, max(1, round(FURNITURE_PER_FRAME * file.frames)), rng
+    )
     count = max(FEWEST_SHAPES, round(SHAPES_PER_FRAME * file.frames))
     shapes = draw_shapes(rng, count, toys)
 
@@ -219,16 +221,24 @@ def draw_file(meshes: WorldMeshes, file: FrameFile) -> None:
     LabelledFrames.of(frames[: file.frames]).save(file.path)
 
 
-def _solids(entries: Sequence[Entry], count: int, rng: Generator) -> list[Solid]:
-    """So many of some meshes, upright on z = 0; furniture as large as in life."""
+def solids_of(entries: Sequence[Entry], count: int, rng: Generator) -> list[Solid]:
+    """Load some meshes, upright on z = 0; furniture is as large as in life.
+
+    Those that are too fine or damaged are passed over.
+
+    Args:
+        entries: to draw from, each once.
+        count: how many, at most.
+        rng: draws them and their sizes.
+    """
     solids: list[Solid] = []
     for index in rng.permutation(len(entries)):
-        if len(solids) == max(count, 1):
+        if len(solids) == count:
             break
         entry = entries[index]
         try:
             mesh = load_mesh(entry.path, max_faces=LARGEST_SHAPE)
-        except MeshError:  # too fine, or damaged: another one takes its place
+        except MeshError:
             continue
         size = life_radius(mesh, entry.label, rng) if entry.label in LIFE_SIZES else 1.0
         vertices = mesh.vertices * size
@@ -317,8 +327,9 @@ class LabelledFrames:
 def _arrays(path: Path) -> list[NDArray]:
     """The arrays of a file, in the order of ``LabelledFrames``."""
     try:
-        with np.load(path) as file:
-            return [file[field.name] for field in fields(LabelledFrames)]
+        # opened here, as numpy would leave a damaged file open
+        with path.open("rb") as file, np.load(file) as arrays:
+            return [arrays[field.name] for field in fields(LabelledFrames)]
     except DAMAGED:
         raise DatasetError(
             f"{path}: is missing or damaged; delete it and give the command of the training again"
