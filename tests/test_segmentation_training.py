@@ -114,7 +114,7 @@ def test_what_is_learned_of_a_picture():
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory):
     """Two files of frames."""
-    files = frame_files(tmp_path_factory.mktemp("drawn"), 6, SEED, most=3)
+    files = frame_files(tmp_path_factory.mktemp("drawn"), 4, SEED, most=2)
     assert [done for done, _ in draw_frames(files, workers=0)] == [0, 1, 2]
     return files
 
@@ -122,9 +122,10 @@ def drawn(tmp_path_factory):
 def test_a_varied_frame_is_of_the_same_world(drawn):
     frames = LabelledFrames.load([file.path for file in drawn])
     mirrored = set()
+    told = 0
     for seed in range(6):
         plain, varied = (
-            frames.example(seed, rng) for rng in (None, np.random.default_rng(seed))
+            frames.example(seed % 4, rng) for rng in (None, np.random.default_rng(seed))
         )
         rows, columns = frames.labels.shape[1:]
         flips = [
@@ -138,16 +139,20 @@ def test_a_varied_frame_is_of_the_same_world(drawn):
         mirrored.add(flips[1])
         # where a pixel is and where the middle of its thing lies from it: one place for each thing
         place = (varied.features[1:4] + varied.offsets)[:, :rows, :columns]
-        labels = frames.labels[seed][:, ::-1] if flips[1] else frames.labels[seed]
+        labels = frames.labels[seed % 4]
+        labels = labels[:, ::-1] if flips[1] else labels
         for thing in np.unique(labels[labels >= 0]):
             own = (labels == thing) & (varied.offset_weights[:rows, :columns] > 0)
             assert not own.any() or np.ptp(place[:, own], axis=1).max() < 1e-4
-        # gravity points where it did, also in a mirror
+        # gravity points nearly where it did, also in a mirror
         if varied.features[13].any():
-            heights = plain.features[12][:rows, :columns]
-            seen = varied.features[12][:rows, :columns]
-            seen = seen[:, ::-1] if flips[1] else seen
-            assert np.corrcoef(heights.ravel(), seen.ravel())[0, 1] > 0.95
+            before, after = (
+                np.linalg.lstsq(x[1:4].reshape(3, -1).T, x[12].ravel())[0]
+                for x in (plain.features, varied.features)
+            )
+            told += 1
+            assert after @ (before * [-1 if flips[1] else 1, 1, 1]) > np.cos(0.2)
+    assert 0 < told < 6
     assert mirrored == {False, True}
 
 
@@ -162,14 +167,14 @@ def fatal(source, target):
         os._exit(9)
     finish(source, target)
 os.replace = fatal
-list(draw_frames(frame_files(Path(sys.argv[1]), 6, (5, 0), most=3), workers=0))
+list(draw_frames(frame_files(Path(sys.argv[1]), 4, (5, 0), most=2), workers=0))
 """
 
 
 def test_a_killed_drawing_goes_on_and_draws_the_same(tmp_path, drawn):
     command = [sys.executable, "-c", KILLED, str(tmp_path)]
     assert subprocess.run(command, check=False).returncode == 9
-    files = frame_files(tmp_path, 6, SEED, most=3)
+    files = frame_files(tmp_path, 4, SEED, most=2)
     assert [file.path.exists() for file in files] == [True, False]
 
     before = files[0].path.stat()
@@ -268,7 +273,7 @@ from nextview.training.runs import load_run
 from nextview.training.segmentation_training import fit_segmentation, train_segmentation
 
 RECIPE = SegmentationRecipe(
-    frames=8, width=4, epochs=4, batch=2, lr=0.01, validation_share=0.25, seed=3
+    frames=8, width=4, epochs=6, batch=2, lr=0.01, validation_share=0.25, seed=3
 )
 EXACT = Hardware(precision="32-true")
 
