@@ -27,7 +27,7 @@ from onnx import TensorProto, helper, shape_inference
 from nextview.cli.exit_status import orderly_end
 from nextview.recognition.inference import open_weights
 from nextview.recognition.model_card import ModelCard, bundled_cards, find_card
-from nextview.recognition.runtime import ort
+from nextview.runtime import ort
 
 SIDE = 2048
 """Of the matrices of the baselines."""

@@ -38,7 +38,7 @@ from nextview.data.folders import list_dataset
 from nextview.files import sha256_of
 from nextview.geometry.mesh import load_mesh, make_mesh
 from nextview.geometry.viewsphere import look_at_origin
-from nextview.recognition.inference import FEATURES_OUTPUT, OnnxFile, open_onnx
+from nextview.recognition.inference import FEATURES_OUTPUT
 from nextview.recognition.model_card import (
     BUNDLED_MODELS,
     RECOGNISER,
@@ -46,6 +46,7 @@ from nextview.recognition.model_card import (
     read_card,
 )
 from nextview.recognition.network_input import from_observations
+from nextview.runtime import OnnxFile, open_onnx
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.training.architectures import LiteNet

@@ -132,6 +132,7 @@ SMALL = {  # options that make a command quick
     "nextview scenes": "--scenes 4 --workers 1",
     "nextview train recogniser": "--epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4",
     "nextview train map": "--epochs 1 --views-per-object 2 --batch 8 --validation-share 0.4",
+    "nextview train segmentation": "--frames 8 --epochs 1 --batch 4 --width 4 --workers 1",
     "nextview train gain": "--folds 2 --epochs 1 --episodes 1 --networks-per-fold 1",
     "nextview fit calibration": "--delta 0.2",
     "nextview benchmark": "--runs 2 --samples 100",

@@ -90,6 +90,11 @@ COMMANDS = {  # by name, in the order in which they are listed
         "next: nextview export map {out} {store} MODELS",
         thesis=f"{THESIS}_MAP",
     ),
+    "train segmentation": Command(
+        f"{TRAINING}.segmentation_training:train_segmentation",
+        "train the network that parts a frame into things",
+        "next: nextview export segmentation {out} MODELS",
+    ),
     "train gain": Command(
         f"{TRAINING}.gain_training:train_gain",
         "train the policy that predicts the gain of a view",
@@ -102,6 +107,12 @@ COMMANDS = {  # by name, in the order in which they are listed
         f"{EXPORT}_recogniser",
         "export a trained recogniser as a model",
         EXPORTED,
+    ),
+    "export segmentation": Command(
+        f"{TRAINING}.segmentation_export:export_segmentation",
+        "export a trained segmentation network",
+        "{found.card}: largest difference between torch and ONNX on simulated frames"
+        " {found.difference:.2g}",
     ),
     "export map": Command(
         f"{EXPORT}_map",
@@ -168,6 +179,7 @@ RESUMES = (
     "predict",
     "train recogniser",
     "train map",
+    "train segmentation",
     "learn",
     "scenes",
     "benchmark-things",

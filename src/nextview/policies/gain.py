@@ -28,8 +28,8 @@ from nextview.policies.base import (
     visibility_of,
 )
 from nextview.policies.learned_tables import cells_from, cells_to
-from nextview.recognition.inference import OnnxFile, check_end, open_onnx, run_onnx
 from nextview.recognition.map_names import SPHERE_SUFFIX, in_order, maps_among
+from nextview.runtime import OnnxFile, check_end, open_onnx, run_onnx
 from nextview.types import Float, Float32, Floats, Index
 
 INPUTS = ("belief", "view", "place", "azimuth_bin")

@@ -1,8 +1,10 @@
-"""The networks: ResNet (torchvision's names), EfficientNet-Lite0, PointNet, map ResNet."""
+"""The networks: ResNet (torchvision's names), EfficientNet-Lite0, PointNet, map ResNet, U-Net."""
 
 from nextview.checks import extras
 from nextview.geometry.viewsphere import ViewSphere
 from nextview.recognition.network_input import CHANNELS_OF
+from nextview.segmentation.features import PICTURE_CHANNELS
+from nextview.segmentation.network import OUTPUTS
 from nextview.training.recipes import MapRecipe, RecogniserRecipe
 
 with extras():
@@ -415,3 +417,55 @@ def orthogonality(matrix: Tensor) -> Tensor:
         .norm(dim=1)
         .mean()
     )
+
+
+class Convolutions(nn.Module):
+    """Two convolutions with a shortcut around them."""
+
+    def __init__(self, inputs: int, width: int, dilation: int = 1) -> None:
+        super().__init__()
+        self.a = _normed(inputs, width, dilation)
+        self.b = _normed(width, width, dilation)
+        self.r = nn.Identity() if inputs == width else nn.Conv2d(inputs, width, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(self.b(F.relu(self.a(x))) + self.r(x))
+
+
+def _normed(inputs: int, width: int, dilation: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, width, 3, padding=dilation, dilation=dilation, bias=False),
+        nn.BatchNorm2d(width),
+    )
+
+
+class SegmentationNet(nn.Module):
+    """A U-Net that works at half the resolution of its input; see ``SegmentationCard``."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        twice = 2 * width
+        self.e1 = Convolutions(4 * PICTURE_CHANNELS, width)
+        self.e2 = Convolutions(width, twice)
+        self.e3 = Convolutions(twice, twice)
+        self.e4 = Convolutions(twice, twice)
+        self.e5 = Convolutions(twice, twice, 2)
+        self.d3 = Convolutions(2 * twice, twice)
+        self.d2 = Convolutions(2 * twice, twice)
+        self.d1 = Convolutions(width + twice, twice)
+        self.o = nn.Conv2d(twice, 4 * OUTPUTS, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        fine = self.e1(F.pixel_unshuffle(x, 2))
+        middle = self.e2(F.max_pool2d(fine, 2))
+        coarse = self.e3(F.max_pool2d(middle, 2))
+        deepest = self.e5(self.e4(F.max_pool2d(coarse, 2)))
+        coarse = self.d3(torch.cat([_twice(deepest), coarse], 1))
+        middle = self.d2(torch.cat([_twice(coarse), middle], 1))
+        fine = self.d1(torch.cat([_twice(middle), fine], 1))
+        return F.pixel_shuffle(self.o(fine), 2)
+
+
+def _twice(x: Tensor) -> Tensor:
+    """A picture of twice as many rows and columns."""
+    return F.interpolate(x, scale_factor=2, mode="nearest")

@@ -106,6 +106,7 @@ def export_onnx(
     outputs: list[str],
     path: Path,
     bits: int = 16,
+    sides: int | None = None,
 ) -> None:
     """Write a network as ONNX with any batch size.
 
@@ -118,7 +119,15 @@ def export_onnx(
         outputs: names of the outputs.
         path: of the file.
         bits: of each weight: 8, 16 or 32.
+        sides: multiple of which the last two sizes of the input may be any; None for those of the
+            example.
     """
+    free = {0: torch.export.Dim("batch")}
+    if sides is not None:
+        free |= {
+            axis: sides * torch.export.Dim(name)
+            for axis, name in ((2, "rows"), (3, "columns"))
+        }
     # it warns that torchvision is not installed
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
@@ -129,7 +138,7 @@ def export_onnx(
             dynamo=True,
             input_names=[inputs],
             output_names=outputs,
-            dynamic_shapes=({0: torch.export.Dim("batch")},),
+            dynamic_shapes=(free,),
             opset_version=OPSET,
             verbose=False,
         )

@@ -32,8 +32,8 @@ from nextview.policies.gain import (
 )
 from nextview.policies.learned_tables import cells_from
 from nextview.policies.policy_card import LearnedFrom, PolicyCard, write_policy_card
-from nextview.recognition.inference import open_onnx
 from nextview.recognition.map_names import in_order
+from nextview.runtime import open_onnx
 from nextview.training.export import export_onnx
 from nextview.training.fitting_set import hold_out, load_sensed
 from nextview.training.recipes import GainRecipe

@@ -254,3 +254,34 @@ class GainRecipe:
     def __post_init__(self) -> None:
         _check(self, ("hidden", "networks_per_fold", "epochs", "episodes", "batch"))
         whole(self.max_views, "--max-views", 2)
+
+
+@dataclass(frozen=True)
+class SegmentationRecipe:
+    """How the segmentation network is trained.
+
+    Attributes:
+        frames: simulated frames to learn from.
+        width: channels of the first layers; the others have twice as many.
+        epochs: passes over the frames.
+        batch: frames per step.
+        lr: peak learning rate of AdamW; it rises over the first steps and falls as a cosine.
+        weight_decay: weight decay of AdamW.
+        validation_share: share of the meshes that is held out for validation, and number of the
+            frames that are drawn for it, as a share of --frames.
+        seed: seed of all random draws, those of the frames too.
+        patience: stop after so many epochs without a lower loss on validation; 0 never stops early.
+    """
+
+    frames: int = 12_000
+    width: int = 32
+    epochs: int = 12
+    batch: int = 16
+    lr: float = 2e-3
+    weight_decay: float = 0.01
+    validation_share: float = 0.05
+    seed: int = 0
+    patience: int = 0
+
+    def __post_init__(self) -> None:
+        _check(self, ("frames", "width", "epochs", "batch"), ("validation_share",))

@@ -1,0 +1,694 @@
+"""Random worlds for a depth camera: tables, floors, bins, shelves, belts and rooms of things.
+
+Things are dropped on a height map: they stand side by side, lie on each other, and fill bins. What
+they rest on, what encloses them, and what is behind them are labelled, too. A segmentation learns
+from them (``training/segmentation_training.py``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.random import Generator
+from scipy import ndimage
+from scipy.spatial import QhullError
+from scipy.spatial.transform import Rotation
+
+from nextview.geometry.pinhole import PinholeCamera
+from nextview.geometry.ray_caster import RayCaster
+from nextview.geometry.viewsphere import look_at_origin
+from nextview.simulation.sensor import SENSORS, Sensor
+from nextview.simulation.solids import Solid, moved, random_solid, tube
+from nextview.types import Float, Float32, Index
+
+SURFACE = (
+    -1
+)  # label of what carries things: table tops, floors, boards, the bottoms of bins
+BACKGROUND = (
+    -2
+)  # label of all else that is no thing: walls, sides of bins, people, grippers
+HOLE = -3  # label of a pixel without depth
+
+MAP_CELLS = 160  # cells on each side of a height map
+DROPS_TRIED = 25
+STEPS_OUTWARDS = 60
+LEAST_STABLE = 0.03  # share of throws of a resting pose, at least
+LARGEST_SHAPE = 20_000  # triangles
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A solid with the poses in which it rests.
+
+    Attributes:
+        solid: vertices, (V, 3), metres, and triangles, (F, 3).
+        resting: rotations into its stable poses, (P, 3, 3), at least one.
+    """
+
+    solid: Solid
+    resting: Float
+
+    @classmethod
+    def of(cls, solid: Solid) -> Shape:
+        """Find the stable poses of a solid on a plane."""
+        from trimesh import Trimesh
+        from trimesh.poses import compute_stable_poses
+
+        try:
+            hull = Trimesh(*solid).convex_hull
+            poses, shares = compute_stable_poses(hull, n_samples=1)
+        except (QhullError, ValueError):  # flat or degenerate: as it is drawn
+            return cls(solid, np.eye(3)[None])
+        likely = shares > LEAST_STABLE
+        return cls(solid, poses[likely][:, :3, :3] if likely.any() else np.eye(3)[None])
+
+
+@dataclass(eq=False)
+class World:
+    """Solids in place, each with its label.
+
+    Attributes:
+        solids: in the world, metres, z up.
+        labels: of each: the number of a thing, SURFACE or BACKGROUND.
+        focus: what the camera looks at, (3,).
+        scale: metres, the size of a typical thing.
+        elevations: of the camera, degrees, least and greatest.
+        yaw: direction from which it may look, radians; None for any.
+    """
+
+    focus: Float
+    scale: float
+    elevations: tuple[float, float]
+    yaw: float | None = None
+    solids: list[Solid] = field(default_factory=list)
+    labels: list[int] = field(default_factory=list)
+
+    def add(self, solid: Solid, label: int) -> None:
+        """Put a solid where it is."""
+        self.solids.append(solid)
+        self.labels.append(label)
+
+    @property
+    def things(self) -> int:
+        """How many things there are."""
+        return max([0, *(label + 1 for label in self.labels)])
+
+
+class HeightMap:
+    """The heights of a level and of what lies on it, on a grid of square cells."""
+
+    def __init__(
+        self, side: float, centre: Float, level: float, inside: float | None = None
+    ) -> None:
+        """Begin with an empty level.
+
+        Args:
+            side: of the square, metres.
+            centre: of it, (2,).
+            level: its height, metres.
+            inside: half the width of the part in which things may lie; None for all.
+        """
+        self.cell = side / MAP_CELLS
+        self.low = np.asarray(centre, float) - side / 2
+        self.centre = np.asarray(centre, float)
+        self.level = level
+        self.reach = side / 2 if inside is None else inside
+        self.heights = np.full((MAP_CELLS, MAP_CELLS), level)
+
+    def drop(
+        self,
+        shape: Solid,
+        rng: Generator,
+        piled: bool,
+        gap: float,
+        spread: float,
+        ceiling: float = np.inf,
+    ) -> Solid | None:
+        """Lower a solid until it touches something.
+
+        Args:
+            shape: in its orientation; moved so that its place is free.
+            rng: draws the place.
+            piled: whether it may lie on others.
+            gap: metres kept from others where it may not.
+            spread: metres from the middle within which it is put.
+            ceiling: height that it must not reach, metres.
+
+        Returns:
+            The solid in place; None where there is no room.
+        """
+        vertices, faces = shape
+        low, high = vertices.min(0), vertices.max(0)
+        if np.ptp(vertices[:, :2], axis=0).max() > 2 * self.reach:
+            return None
+        bottom, top = self._profiles(shape)
+        there = np.isfinite(bottom)
+        if not there.any():
+            return None
+        grown = int(np.ceil(gap / self.cell)) if gap > 0 else 0
+        around = (
+            ndimage.binary_dilation(np.pad(there, grown), iterations=grown)
+            if grown
+            else there
+        )
+        half = (high - low)[:2] / 2
+        angle = rng.uniform(0, 2 * np.pi)
+        start = self.centre + rng.normal(0, spread / 2, 2)
+        for attempt in range(DROPS_TRIED + STEPS_OUTWARDS):
+            if attempt < DROPS_TRIED and piled:
+                start = self.centre + rng.uniform(-1, 1, 2) * spread
+            middle = start
+            if not piled:
+                middle = start + attempt * 1.5 * self.cell * np.array(
+                    [np.cos(angle), np.sin(angle)]
+                )
+            if (np.abs(middle - self.centre) + half > self.reach).any():
+                continue
+            at = np.floor((middle - half - self.low) / self.cell).astype(int)
+            rows = slice(at[0], at[0] + there.shape[0])
+            columns = slice(at[1], at[1] + there.shape[1])
+            here = self.heights[rows, columns]
+            if here.shape != there.shape or (at < 0).any():
+                continue
+            if not piled:
+                wide = self.heights[
+                    max(at[0] - grown, 0) : at[0] + there.shape[0] + grown,
+                    max(at[1] - grown, 0) : at[1] + there.shape[1] + grown,
+                ]
+                if (
+                    wide.shape != around.shape
+                    or (wide[around] > self.level + 1e-9).any()
+                ):
+                    continue
+            rise = float((here[there] - bottom[there]).max())
+            if rise + high[2] > ceiling:
+                continue
+            self.heights[rows, columns] = np.where(
+                there, np.maximum(here, rise + top), here
+            )
+            corner = self.low + at * self.cell
+            return vertices + np.append(corner - low[:2], rise), faces
+        return None
+
+    def _profiles(self, solid: Solid) -> tuple[Float, Float]:
+        """Heights of the lower and the upper side over the cells of a solid's outline."""
+        vertices, _ = solid
+        low, high = vertices.min(0), vertices.max(0)
+        count = np.maximum(np.ceil((high - low)[:2] / self.cell).astype(int), 1)
+        x = low[0] + (np.arange(count[0]) + 0.5) * self.cell
+        y = low[1] + (np.arange(count[1]) + 0.5) * self.cell
+        grid = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
+        caster = RayCaster([solid])
+        below = np.c_[grid, np.full(len(grid), low[2] - 1)]
+        above = np.c_[grid, np.full(len(grid), high[2] + 1)]
+        up = np.tile([0.0, 0.0, 1.0], (len(grid), 1))
+        lower = low[2] - 1 + caster.cast(below, up)[0]
+        upper = high[2] + 1 - caster.cast(above, -up)[0]
+        return lower.reshape(count), upper.reshape(count)
+
+
+def slab(
+    size: Sequence[float], centre: Sequence[float] | Float, top: float, yaw: float = 0.0
+) -> Solid:
+    """A box with its top at a height.
+
+    Args:
+        size: its sides, metres, (3,).
+        centre: x and y of its middle.
+        top: height of its top.
+        yaw: turned by so many radians.
+    """
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    vertices = signs * np.asarray(size) / 2
+    faces = np.array(
+        [
+            [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+            [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
+        ],
+        np.int32,
+    )  # fmt: skip
+    turn = Rotation.from_euler("z", yaw)
+    middle = np.array([*centre, top - size[2] / 2])
+    return turn.apply(vertices) + middle, faces
+
+
+def draw_shapes(
+    rng: Generator, count: int, others: Sequence[Solid] = ()
+) -> list[Shape]:
+    """Draw solids of unit size, and find how they rest.
+
+    Args:
+        rng: source of all random numbers.
+        count: how many.
+        others: solids of any size of which a third is taken, such as meshes of toys.
+    """
+    shapes = []
+    for _ in range(count):
+        if len(others) and rng.random() < 0.35:
+            vertices, faces = others[int(rng.integers(len(others)))]
+            stretch = rng.uniform(0.6, 1.4, 3) if rng.random() < 0.5 else np.ones(3)
+            extent = np.ptp(vertices, axis=0).max()
+            solid = vertices / extent * stretch, faces
+        else:
+            solid = random_solid(rng, 1.0)
+        shapes.append(Shape.of(solid))
+    return shapes
+
+
+def draw_world(
+    shapes: Sequence[Shape],
+    furniture: Sequence[Solid],
+    rng: Generator,
+) -> World:
+    """Draw a world.
+
+    Args:
+        shapes: of things, of unit size.
+        furniture: life-size, metres, z up, standing on z = 0; may be empty.
+        rng: source of all random numbers.
+    """
+    kind = rng.choice(
+        ["table", "floor", "bin", "shelf", "belt", "room"],
+        p=[0.44, 0.1, 0.2, 0.1, 0.06, 0.1],
+    )
+    if kind == "room" and len(furniture):
+        return _room(furniture, rng)
+    scale = float(np.exp(rng.uniform(np.log(0.03), np.log(0.17))))
+    if kind == "bin":
+        return _bin(shapes, furniture, rng, scale)
+    if kind == "shelf":
+        return _shelf(shapes, rng, scale)
+    return _level(shapes, furniture, rng, scale, str(kind))
+
+
+def _level(
+    shapes: Sequence[Shape],
+    furniture: Sequence[Solid],
+    rng: Generator,
+    scale: float,
+    kind: str,
+) -> World:
+    """Things on a table, a floor or a belt, beside and on each other."""
+    world = World(np.array([0, 0, scale / 3]), scale, (12.0, 88.0))
+    yaw = rng.uniform(0, np.pi)
+    if kind == "floor":
+        world.add(slab((12, 12, 0.1), (0, 0), 0), SURFACE)
+        reach = 20 * scale
+    else:
+        reach = _table_top(world, rng, yaw, kind == "belt", scale)
+    _behind(world, furniture, rng, kind != "floor", scale)
+
+    ground = HeightMap(
+        2 * min(reach, 14 * scale), np.zeros(2), 0.0, min(reach, 10 * scale)
+    )
+    gap = scale * float(rng.choice([0.0, 0.0, 0.1, 0.3, 1.0]))
+    _fill(
+        world,
+        ground,
+        shapes,
+        rng,
+        _number(rng),
+        gap,
+        float(rng.choice([0, 0, 0.15, 0.5])),
+    )
+    _hands(world, rng)
+    return world
+
+
+def _table_top(
+    world: World, rng: Generator, yaw: float, belt: bool, scale: float
+) -> float:
+    """Add a table, or a belt with rails, over a floor; return how far it reaches, metres."""
+    height = rng.uniform(0.35, 1.0)
+    length = max(rng.uniform(0.35, 1.8), 5 * scale)
+    width = max(length * rng.uniform(0.5, 1.0), 4 * scale)
+    if belt:
+        length, width = 3.0, max(rng.uniform(0.25, 0.7), 5 * scale)
+        for side in (-1, 1):
+            rail = rng.uniform(0.01, 0.06)
+            at = side * (width / 2 + 0.02) * np.array([-np.sin(yaw), np.cos(yaw)])
+            world.add(slab((length, 0.04, 0.08), at, rail, yaw), BACKGROUND)
+    if not belt and rng.random() < 0.25:
+        world.add((_disc(max(length, width) / 2)), SURFACE)
+        width = length = max(length, width)
+    else:
+        world.add(
+            slab((length, width, rng.uniform(0.015, 0.08)), (0, 0), 0, yaw), SURFACE
+        )
+    if rng.random() < 0.8:
+        world.add(slab((12, 12, 0.1), (0, 0), -height), SURFACE)
+    if rng.random() < 0.5:
+        for x, y in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+            corner = np.array([x * (length / 2 - 0.04), y * (width / 2 - 0.04)])
+            corner = Rotation.from_euler("z", yaw).apply([*corner, 0])[:2]
+            world.add(slab((0.05, 0.05, height), corner, -0.03, yaw), BACKGROUND)
+    return width / 2
+
+
+def _disc(radius: float) -> Solid:
+    """A round table top with its upper side at z = 0."""
+    from nextview.simulation.solids import extruded, ring_points
+
+    return moved(extruded([ring_points(radius, 40)], 0.03), by=(0, 0, -0.03))
+
+
+def _behind(
+    world: World,
+    furniture: Sequence[Solid],
+    rng: Generator,
+    raised: bool,
+    scale: float,
+) -> None:
+    """Add walls, furniture and people behind a working place."""
+    floor = -rng.uniform(0.5, 0.9) if raised else 0.0
+    for _ in range(int(rng.choice([0, 0, 1, 1, 2]))):
+        angle = rng.uniform(0, 2 * np.pi)
+        away = rng.uniform(0.5, 2.5) + 6 * scale
+        at = away * np.array([np.cos(angle), np.sin(angle)])
+        world.add(slab((0.1, 10, 4), at, 3.0, angle), BACKGROUND)
+    for _ in range(int(rng.choice([0, 0, 0, 1, 2, 4]))):
+        angle = rng.uniform(0, 2 * np.pi)
+        away = rng.uniform(0.8, 2.0) + 5 * scale
+        at = away * np.array([np.cos(angle), np.sin(angle)])
+        if rng.random() < 0.4 or not len(furniture):
+            world.add(moved(_person(rng), by=(*at, floor)), BACKGROUND)
+        else:
+            solid = furniture[int(rng.integers(len(furniture)))]
+            turn = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi))
+            world.add(moved(solid, turn, (*at, floor)), BACKGROUND)
+
+
+def _person(rng: Generator) -> Solid:
+    """A standing or sitting figure of capsules, on z = 0, metres."""
+    from nextview.simulation.solids import joined, lump
+
+    tall = rng.uniform(1.2, 1.9)
+    head = lump(rng)
+    parts = [
+        (head[0] * 0.25 / np.ptp(head[0], axis=0).max() + [0, 0, tall - 0.12], head[1])
+    ]
+    hip, neck = 0.5 * tall, tall - 0.28
+    spine = np.linspace(
+        [0, 0, hip], [rng.normal(0, 0.05), rng.normal(0, 0.05), neck], 8
+    )
+    parts.append(tube(spine, np.full(8, rng.uniform(0.11, 0.2)), 16))
+    for side in (-1, 1):
+        shoulder = np.array([0, side * 0.2, neck - 0.05])
+        elbow = shoulder + rng.normal(0, 0.12, 3) + [0.05, side * 0.08, -0.25]
+        hand = elbow + rng.normal(0, 0.12, 3) + [0.15, 0, -0.1]
+        parts.append(tube(np.linspace(shoulder, elbow, 5), np.full(5, 0.05)))
+        parts.append(tube(np.linspace(elbow, hand, 5), np.full(5, 0.04)))
+        foot = np.array([rng.normal(0, 0.1), side * 0.12, 0])
+        parts.append(tube(np.linspace([0, side * 0.1, hip], foot, 6), np.full(6, 0.08)))
+    return joined(parts)
+
+
+def _hands(world: World, rng: Generator) -> None:
+    """Now and then a hand or a gripper reaches in from above, with or without a thing."""
+    if rng.random() > 0.08:
+        return
+    size = max(world.scale, 0.04)
+    beside = rng.normal(0, 1.5 * size, 2)
+    tip = world.focus + np.append(beside, rng.uniform(0.5, 2.5) * size)
+    out = rng.normal(0, 1, 3)
+    out[2] = abs(out[2]) + 0.5
+    out /= np.linalg.norm(out)
+    aside = np.cross(out, [1.0, 0, 0])
+    aside /= np.linalg.norm(aside)
+    palm = tip + 0.09 * out
+    for side in (-1, 1):
+        finger = np.linspace(
+            palm + side * 0.04 * aside, tip + side * rng.uniform(0.01, 0.04) * aside, 5
+        )
+        world.add(tube(finger, np.full(5, rng.uniform(0.008, 0.014))), BACKGROUND)
+    arm = np.linspace(palm, palm + 0.8 * out, 6)
+    world.add(tube(arm, np.full(6, rng.uniform(0.03, 0.06))), BACKGROUND)
+
+
+def _number(rng: Generator) -> int:
+    """How many things there are: one, a few, or many."""
+    return int(rng.choice([1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24]))
+
+
+def _fill(
+    world: World,
+    ground: HeightMap,
+    shapes: Sequence[Shape],
+    rng: Generator,
+    count: int,
+    gap: float,
+    piled: float,
+    ceiling: float = np.inf,
+) -> None:
+    """Drop things on a level.
+
+    Args:
+        world: that they are added to.
+        ground: the level.
+        shapes: of unit size.
+        rng: source of all random numbers.
+        count: how many are tried.
+        gap: metres between neighbours.
+        piled: share of them that may lie on others.
+        ceiling: height below which they stay.
+    """
+    alike = rng.random() < 0.2  # of one kind: rows of boxes, a bin of one part
+    chosen = int(rng.integers(len(shapes)))
+    size = world.scale
+    free = rng.random() < 0.3
+    for _ in range(count):
+        if not alike:
+            chosen = int(rng.integers(len(shapes)))
+            size = world.scale * float(np.exp(np.clip(rng.normal(0, 0.45), -1.1, 0.9)))
+        shape = shapes[chosen]
+        turn = Rotation.from_matrix(
+            shape.resting[int(rng.integers(len(shape.resting)))]
+        )
+        if free and rng.random() < 0.5:
+            turn = Rotation.random(random_state=rng)
+        turn = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)) * turn
+        solid = turn.apply(shape.solid[0] * size), shape.solid[1]
+        spread = min(ground.reach, world.scale * rng.uniform(0.5, 2.5) * np.sqrt(count))
+        dropped = ground.drop(
+            solid, rng, bool(rng.random() < piled), gap, spread, ceiling
+        )
+        if dropped is not None:
+            world.add(dropped, world.things)
+
+
+def _bin(
+    shapes: Sequence[Shape],
+    furniture: Sequence[Solid],
+    rng: Generator,
+    scale: float,
+) -> World:
+    """Things poured into a bin or a tray that stands on a table or a floor."""
+    world = World(np.array([0, 0, scale / 2]), scale, (35.0, 88.0))
+    half = scale * rng.uniform(1.6, 5.0, 2)
+    if rng.random() < 0.4:
+        half = scale * rng.uniform(3.0, 7.0, 2)
+    wall = float(np.clip(0.06 * scale, 0.002, 0.015)) * rng.uniform(0.5, 2)
+    tall = scale * rng.uniform(0.3, 2.0)
+    bottom = wall
+    yaw = rng.uniform(0, 2 * np.pi)
+    table = max(2.2 * float(half.max()), rng.uniform(0.4, 1.5))
+    world.add(
+        slab((2 * table, 2 * table, 0.05), (0, 0), 0, rng.uniform(0, np.pi)), SURFACE
+    )
+    world.add(slab((2 * half[0], 2 * half[1], bottom), (0, 0), bottom, yaw), SURFACE)
+    for axis in (0, 1):
+        for side in (-1, 1):
+            size = [0.0, 0.0, tall]
+            size[axis] = wall
+            size[1 - axis] = 2 * half[1 - axis] + 2 * wall
+            at = np.zeros(3)
+            at[axis] = side * (half[axis] + wall / 2)
+            at = Rotation.from_euler("z", yaw).apply(at)
+            world.add(slab(size, at[:2], tall, yaw), BACKGROUND)
+    _behind(world, furniture, rng, True, scale)
+
+    inner = HeightMap(2 * float(half.max()) * 1.5, np.zeros(2), bottom)
+    x, y = np.meshgrid(
+        *(inner.low[k] + (np.arange(MAP_CELLS) + 0.5) * inner.cell for k in (0, 1)),
+        indexing="ij",
+    )
+    own = Rotation.from_euler("z", -yaw).apply(
+        np.stack([x, y, 0 * x], -1).reshape(-1, 3)
+    )
+    outside = (np.abs(own[:, :2]) > half - inner.cell).any(1).reshape(x.shape)
+    inner.heights[outside] = max(tall, 6 * scale)  # a thing stays within the walls
+    count = int(rng.choice([1, 2, 3, 5, 5, 8, 12, 20, 30]))
+    _fill(
+        world, inner, shapes, rng, count, 0.0, float(rng.choice([0.2, 1.0])), 5 * scale
+    )
+    _hands(world, rng)
+    return world
+
+
+def _shelf(shapes: Sequence[Shape], rng: Generator, scale: float) -> World:
+    """Things on the boards of a shelf, seen from the front."""
+    clear = scale * rng.uniform(1.6, 3.5)
+    width = scale * rng.uniform(6, 14)
+    deep = scale * rng.uniform(2.5, 5)
+    world = World(np.array([0.0, 0.0, clear / 2]), scale, (-8.0, 40.0), yaw=0.0)
+    levels = int(rng.integers(1, 4))
+    thick = 0.15 * scale
+    for level in range(-levels, levels + 1):
+        world.add(slab((deep, width, thick), (0, 0), level * clear), SURFACE)
+    tall = (2 * levels + 1) * clear
+    if rng.random() < 0.7:
+        world.add(slab((thick, width, tall), (-deep / 2, 0), tall / 2), BACKGROUND)
+    for side in (-1, 1):
+        if rng.random() < 0.7:
+            at = (0, side * width / 2)
+            world.add(slab((deep, thick, tall), at, tall / 2), BACKGROUND)
+    for level in range(-levels, levels):
+        if level not in (-1, 0) and rng.random() < 0.5:
+            continue
+        for column in np.linspace(-1, 1, 3) * width / 3:
+            ground = HeightMap(deep, np.array([0.0, column]), level * clear)
+            count = int(rng.integers(0, 5))
+            gap = scale * float(rng.choice([0.0, 0.05, 0.3]))
+            ceiling = (level + 1) * clear - thick
+            _fill(world, ground, shapes, rng, count, gap, 0.15, ceiling)
+    return world
+
+
+def _room(furniture: Sequence[Solid], rng: Generator) -> World:
+    """Life-size furniture on a floor, before walls."""
+    world = World(np.array([0, 0, 0.4]), 1.0, (5.0, 55.0))
+    world.add(slab((14, 14, 0.1), (0, 0), 0), SURFACE)
+    for angle in rng.uniform(0, 2 * np.pi, int(rng.integers(0, 3))):
+        away = rng.uniform(1.5, 4)
+        at = away * np.array([np.cos(angle), np.sin(angle)])
+        world.add(slab((0.1, 14, 6), at, 3.0, float(angle)), BACKGROUND)
+    ground = HeightMap(8.0, np.zeros(2), 0.0)
+    gap = float(rng.choice([0.02, 0.1, 0.4]))
+    for _ in range(int(rng.integers(1, 5))):
+        solid = furniture[int(rng.integers(len(furniture)))]
+        solid = moved(solid, Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)))
+        dropped = ground.drop(solid, rng, False, gap, 1.0)
+        if dropped is not None:
+            world.add(dropped, world.things)
+    return world
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledFrame:
+    """What a camera measures of a world, and what each pixel is.
+
+    Attributes:
+        depth: (H, W) float32, metres; 0 where nothing was measured.
+        labels: thing of each pixel, SURFACE, BACKGROUND or HOLE, (H, W) int16.
+        intrinsics: pinhole matrix, (3, 3); the first pixel's centre is at 0.5.
+        pose: of the camera in the world, (4, 4).
+    """
+
+    depth: Float32
+    labels: Index
+    intrinsics: Float
+    pose: Float
+
+    @property
+    def up(self) -> Float:
+        """Direction against gravity in the camera's axes, (3,)."""
+        return self.pose[2, :3]
+
+
+def photograph(
+    world: World, rng: Generator, shape: tuple[int, int], views: int
+) -> list[LabelledFrame]:
+    """Look at a world from some places, each time through another sensor.
+
+    Args:
+        world: what there is.
+        rng: source of all random numbers.
+        shape: rows and columns of the pictures.
+        views: how many.
+    """
+    caster = RayCaster(world.solids)
+    label_of = np.array([*world.labels, HOLE])
+    frames: list[LabelledFrame] = []
+    while len(frames) < views:
+        sensor = _sensor(rng, shape)
+        pose = _camera_pose(world, rng, sensor)
+        rays = PinholeCamera.of(sensor.intrinsics, shape).rays.reshape(-1, 3)
+        depth, owner = caster.cast(pose[:3, 3], rays @ pose[:3, :3].T)
+        clean = np.where(np.isfinite(depth), depth, 0).reshape(shape).astype(np.float32)
+        if (clean > 0).mean() < 0.2 or np.median(clean[clean > 0]) < 0.12:
+            views -= 1  # the camera stands behind or in something
+            continue
+        labels = label_of[owner]
+        clean *= _warp(rng, shape)
+        measured, source = sensor.measure(clean, rng)
+        labels = np.where(source >= 0, labels[np.maximum(source, 0)], BACKGROUND)
+        measured = _blind_spots(measured, labels, rng)
+        labels = np.where(measured > 0, labels, HOLE)
+        frames.append(LabelledFrame(measured, labels, sensor.intrinsics, pose))
+    return frames
+
+
+def _camera_pose(world: World, rng: Generator, sensor: Sensor) -> Float:
+    """A camera-to-world pose, (4, 4), that looks at the middle of a world."""
+    elevation = np.radians(rng.uniform(*world.elevations))
+    azimuth = rng.uniform(0, 2 * np.pi)
+    if world.yaw is not None:
+        azimuth = world.yaw + rng.uniform(-0.9, 0.9)
+    near = 3.0 if world.scale < 0.5 else 1.8
+    distance = float(np.clip(world.scale * rng.uniform(near, 4 * near), 0.22, 5.5))
+    pose = look_at_origin(np.array([elevation]), np.array([azimuth]), distance)[0]
+    aside = world.scale * np.array([1.2, 1.2, 0.3]) * rng.normal(0, 1, 3)
+    if world.scale > 0.5:
+        aside /= 3
+    pose[:3, 3] += world.focus + aside
+    roll = rng.normal(0, 4) if rng.random() < 0.9 else rng.uniform(0, 360)
+    pose[:3, :3] = (
+        pose[:3, :3] @ Rotation.from_euler("z", roll, degrees=True).as_matrix()
+    )
+    return pose
+
+
+def _sensor(rng: Generator, shape: tuple[int, int]) -> Sensor:
+    """A sensor whose pictures were made so much smaller, with its errors at that size."""
+    known = SENSORS[str(rng.choice(["none", "kinect", "stereo", "stereo"]))]
+    focal = known.focal / known.width * shape[1] * rng.uniform(0.8, 1.6)
+    smaller = shape[1] / known.width
+    strength = rng.uniform(0.3, 1.3)
+    return replace(
+        known.scaled(strength),
+        height=shape[0],
+        width=shape[1],
+        focal=float(focal),
+        disparity=known.disparity * strength * smaller,
+        step=known.step * smaller,
+        lateral=known.lateral * strength * smaller,
+        flying=known.flying * strength * 0.4,
+        grain=float(rng.uniform(0.0, 1.5)) if known.grain else 0.0,
+        holes=known.holes * strength * 0.5,
+        nearest=0.0,
+    )
+
+
+def _warp(rng: Generator, shape: tuple[int, int]) -> Float32:
+    """Factors of depth that change slowly over the picture, as of a badly calibrated camera."""
+    if rng.random() < 0.5:
+        return np.ones(shape, np.float32)
+    coarse = rng.normal(0, rng.uniform(0, 0.004), (4, 5))
+    return (1 + ndimage.zoom(coarse, np.divide(shape, coarse.shape), order=3)).astype(
+        np.float32
+    )
+
+
+def _blind_spots(depth: Float32, labels: Index, rng: Generator) -> Float32:
+    """Take away depth where a thing is dark or shines, and in patches."""
+    depth = depth.copy()
+    for thing in np.unique(labels[labels >= 0]):
+        if rng.random() < 0.04:
+            lost = ndimage.gaussian_filter(rng.normal(size=depth.shape), 3.0)
+            depth[(labels == thing) & (lost > rng.normal(0, 0.06))] = 0
+    if rng.random() < 0.15:
+        lost = ndimage.gaussian_filter(rng.normal(size=depth.shape), 4.0)
+        depth[lost > np.quantile(lost, rng.uniform(0.9, 0.99))] = 0
+    return depth
