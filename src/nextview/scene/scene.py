@@ -32,6 +32,7 @@ from nextview.scene.objects import SceneObject
 from nextview.scene.parting import GOOD_FIT, Bench, merged, new_track, part, taken_over
 from nextview.scene.state import MOST_VERIFIED, SceneState
 from nextview.scene.tracks import Track, render_track
+from nextview.segmentation.instances import Segmenter, masks_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import KnownFrames
 from nextview.sensing.object_frame import Box, upright_axes
@@ -107,6 +108,8 @@ class Scene:
         distance: of the camera from the middle of the scene in ``target``, metres; by default that
             of the last frame.
         reachable: says of a camera-to-world pose, (4, 4), whether the camera can be brought there.
+        segmentation: a segmentation of your own: from a frame to the pixels of each thing,
+            (N, H, W) bool, or to labels, (H, W) int, 0 for none. None for the one built in.
     """
 
     def __init__(
@@ -116,12 +119,14 @@ class Scene:
         region: Box | None = None,
         distance: float | None = None,
         reachable: Callable[[Float], bool] | None = None,
+        segmentation: Segmenter | None = None,
     ) -> None:
         self.distance = (
             None if distance is None else number(distance, "the distance", above=0)
         )
 
         self.reachable = reachable
+        self.segmentation = segmentation
         self.system = models if isinstance(models, System) else load(models)
         self.up = None if up is None else upright_axes(up)[2]
         self.region = region
@@ -277,10 +282,21 @@ class Scene:
         """What a frame shows on the ground, which is looked for if it is not known.
 
         Raises:
-            ObservationError: no support plane is seen.
+            ObservationError: no support plane is seen, or the segmentation returned no masks.
         """
         known = [_sphere(track) for track in tracks]
-        return TableTop.of(frame, self.up, ground, known, self.region, self._widest)
+        given = None
+        if self.segmentation is not None:
+            given = masks_of(self.segmentation, frame)
+        return TableTop.of(
+            frame,
+            self.up,
+            ground,
+            known,
+            self.region,
+            self._widest,
+            given,
+        )
 
     def _judged_anew(self, last: TableTop) -> tuple[SceneState, Look]:
         """Judge all frames anew, on the lower ground that a new one shows.

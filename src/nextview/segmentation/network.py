@@ -1,6 +1,5 @@
 """The network that parts a frame into things: its file, its card, and what its outputs mean."""
 
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from nextview.runtime import check_end, open_onnx, run_onnx
 from nextview.segmentation.features import PICTURE_CHANNELS, SIDE_MULTIPLE
 from nextview.types import Float32
 
-SEGMENTATION_CARD = Path(__file__).parent / "bundled" / "segmentation.json"
 PICTURE_INPUT = "features"
 PICTURE_OUTPUT = "output"
 OUTPUT_CLASSES = (
@@ -175,18 +173,13 @@ class SegmentationNetwork:
         return found[0][0, :, :height, :width]
 
 
-def load_network(path: str | Path | None = None) -> SegmentationNetwork:
+def load_network(path: str | Path) -> SegmentationNetwork:
     """Open a segmentation network.
 
     Args:
-        path: of its card; None for the bundled one, which is opened once.
+        path: of its card.
 
     Raises:
         ModelError: see ``SegmentationNetwork``.
     """
-    return _bundled_network() if path is None else SegmentationNetwork(Path(path))
-
-
-@cache
-def _bundled_network() -> SegmentationNetwork:
-    return SegmentationNetwork(SEGMENTATION_CARD)
+    return SegmentationNetwork(Path(path))

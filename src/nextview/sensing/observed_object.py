@@ -363,7 +363,7 @@ class ObservedObject:
         if frame.mask is not None and self.known is not None:
             mask = frame.mask  # its size does not hang on pixels at the edge
         elif frame.mask is not None:
-            mask = segmentation.inside_mask(frame, plane, noise)
+            mask = segmentation.inside_mask(frame, frame.mask, plane, noise)
         elif self.known is not None:
             mask = segmentation.inside_region(frame, self.known, self.box, plane, noise)
         elif not self.support:

@@ -103,20 +103,25 @@ def above_plane(frame: Frame, plane: Plane, noise: Noise, part: Part = WHOLE) ->
     return high
 
 
-def inside_mask(frame: Frame, plane: Plane | None, noise: Noise) -> Mask:
-    """The pixels of a frame's mask without the background at its edge and the support plane.
+def inside_mask(
+    frame: Frame,
+    given: Mask,
+    plane: Plane | None,
+    noise: Noise,
+) -> Mask:
+    """The pixels of a mask without the background at its edge and the support plane.
 
     Args:
-        frame: the frame, with a mask.
+        frame: the frame.
+        given: the mask, (H, W) bool.
         plane: that the object stands on; None if it is not seen.
         noise: of the frame.
     """
-    assert frame.mask is not None
     if plane is None:
-        return trimmed(frame.depth, frame.mask, noise)
+        return trimmed(frame.depth, given, noise)
 
     high = frame.along(plane.normal, plane.offset) > STANDS * frame.depth
-    mask = trimmed(frame.depth, frame.mask, noise, high)
+    mask = trimmed(frame.depth, given, noise, high)
     part = within(mask)
     above = mask.copy()
     above[part] &= above_plane(frame, plane, noise, part)

@@ -65,6 +65,8 @@ class TableTop:
         lower: whether the frame shows that the ground of earlier frames is none, and a lower one.
         shows_ground: whether the ground is in the picture.
         warnings: about the frame.
+        given: pixels of each thing by a segmentation of the user's own, (H, W) bool each; None
+            where there is none.
     """
 
     frame: Frame
@@ -78,6 +80,7 @@ class TableTop:
     lower: bool = False
     shows_ground: bool = True
     warnings: tuple[ViewWarning, ...] = ()
+    given: tuple[Mask, ...] | None = None
 
     @classmethod
     def of(
@@ -88,6 +91,7 @@ class TableTop:
         known: Sequence[tuple[Float, float]] = (),
         region: Box | None = None,
         widest: float | None = None,
+        given: Sequence[Mask] | None = None,
     ) -> TableTop:
         """Find the support plane of a frame, and what is above it.
 
@@ -99,6 +103,8 @@ class TableTop:
             region: what is outside of this upright box is left out.
             widest: diameter of the largest thing that is looked for, metres: a level plane that is
                 no larger may be a part of it. None: it is not known.
+            given: pixels of each thing by a segmentation of the user's own, (H, W) bool each; None
+                where there is none.
 
         Raises:
             ObservationError: no support plane is seen.
@@ -133,10 +139,10 @@ class TableTop:
         free = before_walls(frame, walls, noise) if walls else None
         if free is not None:
             above &= free
-        if frame.mask is not None:
-            above &= frame.mask
+        inside = frame.depth > 0 if frame.mask is None else frame.mask
         if region is not None:
-            above &= segmentation.inside_box(frame, region)
+            inside = inside & segmentation.inside_box(frame, region)
+        above &= inside
         height = frame.along(plane.normal, plane.offset)
         above &= height > UNEVEN_DEVIATIONS * _unevenness(frame, height)
         upwards = plane.normal if up is None or frame.pose is None else up
@@ -152,6 +158,7 @@ class TableTop:
             tuple(levels),
             lower,
             shows_ground,
+            given=None if given is None else tuple(mask & inside for mask in given),
         )
 
     @property
@@ -201,8 +208,11 @@ class TableTop:
 
         Returns:
             The pixels of each thing, (H, W) bool each, those with most pixels first. Stains and
-            scraps of edges are left out.
+            scraps of edges are left out. Where masks were given, the things are those, without the
+            background at their edges and the plane.
         """
+        if pixels is None and self.given is not None:
+            return self._given_segments()
         above = self.above if pixels is None else self.above & pixels
         if np.count_nonzero(above) < FEWEST_OBJECT_PIXELS:
             return []
@@ -233,6 +243,24 @@ class TableTop:
             )
             if self.is_thing(mask):
                 found.append(mask)
+        return sorted(found, key=lambda mask: -np.count_nonzero(mask))
+
+    def _given_segments(self) -> list[Mask]:
+        """The things of the masks that were given, those with most pixels first."""
+        assert self.given is not None
+        found = []
+        for mask in self.given:
+            inside = mask & (self.frame.depth > 0)
+            if np.count_nonzero(inside) < FEWEST_OBJECT_PIXELS:
+                continue
+            own = segmentation.inside_mask(
+                self.frame,
+                inside,
+                self.under(inside),
+                self.noise,
+            )
+            if np.count_nonzero(own) >= FEWEST_OBJECT_PIXELS:
+                found.append(own)
         return sorted(found, key=lambda mask: -np.count_nonzero(mask))
 
     def is_thing(self, mask: Mask) -> bool:

@@ -257,22 +257,34 @@ def draw_shapes(
     return shapes
 
 
+KINDS = {
+    "table": 0.44,
+    "bin": 0.2,
+    "floor": 0.1,
+    "shelf": 0.1,
+    "room": 0.1,
+    "belt": 0.06,
+}
+"""Kinds of worlds, and the share of each."""
+
+
 def draw_world(
     shapes: Sequence[Shape],
     furniture: Sequence[Solid],
     rng: Generator,
+    kind: str | None = None,
 ) -> World:
     """Draw a world.
 
     Args:
         shapes: of things, of unit size.
-        furniture: life-size, metres, z up, standing on z = 0; may be empty.
+        furniture: life-size, metres, z up, standing on z = 0; may be empty: then there are no
+            rooms.
         rng: source of all random numbers.
+        kind: one of ``KINDS``; None for any.
     """
-    kind = rng.choice(
-        ["table", "floor", "bin", "shelf", "belt", "room"],
-        p=[0.44, 0.1, 0.2, 0.1, 0.06, 0.1],
-    )
+    drawn = str(rng.choice(list(KINDS), p=list(KINDS.values())))
+    kind = drawn if kind is None else kind
     if kind == "room" and len(furniture):
         return _room(furniture, rng)
     scale = float(np.exp(rng.uniform(np.log(0.03), np.log(0.17))))
@@ -280,7 +292,7 @@ def draw_world(
         return _bin(shapes, furniture, rng, scale)
     if kind == "shelf":
         return _shelf(shapes, rng, scale)
-    return _level(shapes, furniture, rng, scale, str(kind))
+    return _level(shapes, furniture, rng, scale, kind)
 
 
 def _level(

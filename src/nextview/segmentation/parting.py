@@ -1,0 +1,182 @@
+"""From the network's output to instances: pixels that are likely to belong together are joined."""
+
+from __future__ import annotations
+
+import heapq
+
+import numpy as np
+from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from nextview.segmentation.features import SmallPicture
+from nextview.segmentation.network import (
+    AFFINITY_OUTPUTS,
+    AFFINITY_STEPS,
+    OUTPUT_CLASSES,
+)
+from nextview.types import Float32, Index, Mask
+
+THING_CLASS = OUTPUT_CLASSES.index("thing")
+LIMIT_OF_ODDS = 4.0  # log-odds of one pair beyond which it says no more
+EDGE_SHARPNESS = (
+    60.0  # steps of a sixtieth of the depth count as much as a pixel of the picture
+)
+CERTAIN_ODDS = 2.0  # of neighbours that are joined before all others
+
+
+def part(output: Float32, valid: Mask) -> Index:
+    """Join pixels of things to instances, those first whose pairs speak most for it.
+
+    Each pair of pixels that the network compares has log-odds of belonging to one thing. Regions
+    are joined as long as the sum over the pairs between two of them is positive (greedy additive
+    edge contraction: Keuper et al., ICCV 2015).
+
+    Args:
+        output: of the network, (12, h, w).
+        valid: pixels with depth, (h, w) bool.
+
+    Returns:
+        The instance of each pixel from 1 on, 0 for none, (h, w) int64.
+    """
+    thing = valid & (output[: len(OUTPUT_CLASSES)].argmax(0) == THING_CLASS)
+    size = thing.size
+    at = np.arange(size).reshape(thing.shape)
+    ends = []
+    odds = []
+    near = []
+    for values, (down, right) in zip(
+        output[AFFINITY_OUTPUTS], AFFINITY_STEPS, strict=True
+    ):
+        first = np.s_[: thing.shape[0] - down, : thing.shape[1] - right]
+        second = np.s_[down:, right:]
+        both = thing[first] & thing[second]
+        ends.append(np.stack([at[first][both], at[second][both]]))
+        odds.append(np.clip(values[first][both], -LIMIT_OF_ODDS, LIMIT_OF_ODDS))
+        near.append(np.full(np.count_nonzero(both), down + right == 1))
+    pairs = np.concatenate(ends, 1)
+    weight = np.concatenate(odds)
+    joined = np.concatenate(near) & (weight > CERTAIN_ODDS)
+
+    graph = coo_array((np.ones(joined.sum()), pairs[:, joined]), shape=(size, size))
+    _, region = connected_components(graph, directed=False)
+    used, region = np.unique(
+        np.where(thing.ravel(), region + 1, 0), return_inverse=True
+    )
+    if used[0] != 0:  # every pixel is of a thing
+        region = region + 1
+    label = _contracted(region[pairs], weight, int(region.max(initial=0)) + 1)
+    return label[region].reshape(thing.shape)
+
+
+def _contracted(
+    pairs: Index,
+    weight: Float32,
+    count: int,
+) -> Index:
+    """Join regions greedily by the sums of the weights between them.
+
+    Args:
+        pairs: regions of the two ends of each edge, (2, E); 0 is none.
+        weight: of each edge, (E,).
+        count: of regions, with 0.
+
+    Returns:
+        The label of each region, (count,).
+    """
+    low, high = np.minimum(*pairs), np.maximum(*pairs)
+    apart = low != high
+    keys, which = np.unique(low[apart] * count + high[apart], return_inverse=True)
+    sums = np.bincount(which, weight[apart], len(keys))
+    beside: list[dict[int, float]] = [{} for _ in range(count)]
+    for key, value in zip(keys.tolist(), sums.tolist(), strict=True):
+        one, other = divmod(key, count)
+        beside[one][other] = value
+        beside[other][one] = value
+
+    owner = np.arange(count)
+    heap = [
+        (-value, one, other)
+        for one in range(count)
+        for other, value in beside[one].items()
+        if one < other and value > 0
+    ]
+    heapq.heapify(heap)
+    while heap:
+        value, one, other = heapq.heappop(heap)
+        if beside[one].get(other) != -value:
+            continue  # one of the two was joined with a third since
+        if len(beside[one]) < len(beside[other]):
+            one, other = other, one
+        owner[other] = one
+        for third, sum_there in beside[other].items():
+            del beside[third][other]
+            if third == one:
+                continue
+            total = beside[one].get(third, 0.0) + sum_there
+            beside[one][third] = total
+            beside[third][one] = total
+            if total > 0:
+                heapq.heappush(heap, (-total, one, third))
+        beside[other] = {}
+
+    for region in range(count):  # follow who was joined to whom
+        root = region
+        while owner[root] != root:
+            root = int(owner[root])
+        owner[region] = root
+    roots = np.unique(owner[1:]) if count > 1 else np.zeros(0, int)
+    number = np.zeros(count, np.int64)
+    number[roots] = np.arange(1, len(roots) + 1)
+    return number[owner]
+
+
+def sharpen(
+    labels: Index,
+    picture: SmallPicture,
+    depth: Float32,
+) -> Index:
+    """Bring labels to the resolution of the frame.
+
+    A pixel of the frame at a border takes the label of that pixel of the small picture nearby
+    whose surface it continues.
+
+    Args:
+        labels: of the small picture, (h, w); 0 for none.
+        picture: the small picture.
+        depth: of the frame, (H, W), metres.
+
+    Returns:
+        Labels, (H, W) int64; 0 where nothing was measured.
+    """
+    factor = picture.factor
+    height, width = depth.shape
+    fine = np.repeat(np.repeat(labels, factor, 0), factor, 1)[:height, :width].copy()
+    fine[depth == 0] = 0
+    around = ndimage.maximum_filter(labels, 3) != ndimage.minimum_filter(labels, 3)
+    around |= (labels > 0) & (ndimage.minimum_filter(picture.depth, 3) == 0)
+    edge = np.repeat(np.repeat(around, factor, 0), factor, 1)[:height, :width] & (
+        depth > 0
+    )
+    rows, columns = np.nonzero(edge)
+    if not len(rows):
+        return fine
+
+    z = depth[rows, columns]
+    best = np.full(len(rows), np.inf, np.float32)
+    chosen = np.zeros(len(rows), np.int64)
+    row, column = rows // factor, columns // factor
+    middle = (factor - 1) / 2
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            r = np.clip(row + down, 0, labels.shape[0] - 1)
+            c = np.clip(column + right, 0, labels.shape[1] - 1)
+            there = picture.depth[r, c]
+            aside = np.hypot(rows - r * factor - middle, columns - c * factor - middle)
+            apart = np.abs(there - z) / z * EDGE_SHARPNESS + aside / factor
+            apart = np.where(there > 0, apart, np.inf).astype(np.float32)
+            nearer = apart < best
+            best[nearer] = apart[nearer]
+            chosen[nearer] = labels[r, c][nearer]
+    fine[rows, columns] = chosen
+    return fine

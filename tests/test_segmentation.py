@@ -1,0 +1,211 @@
+"""Which pixels are one thing: small pictures, planes, regions that are joined, edges, own masks."""
+
+import numpy as np
+import pytest
+from small_tables import camera_over, view
+
+from nextview.errors import ModelError, ObservationError
+from nextview.scene.scene import Scene
+from nextview.segmentation.features import (
+    PICTURE_CHANNELS,
+    features,
+    largest_planes,
+    shrink,
+    surface_normals,
+)
+from nextview.segmentation.instances import LearnedSegmenter, masks_of
+from nextview.segmentation.network import AFFINITY_STEPS as STEPS
+from nextview.segmentation.parting import part, sharpen
+from nextview.sensing.frame import Frame
+
+INTRINSICS = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+
+
+def level_frame(depth):
+    """A frame of a camera with the principal point in the middle."""
+    height, width = depth.shape
+    return Frame(
+        depth, np.array([[500.0, 0, width / 2], [0, 500, height / 2], [0, 0, 1]])
+    )
+
+
+def plane_frame(normal, distance):
+    """Depth of a plane ``normal @ p = -distance`` before a camera of 640 x 480 pixels."""
+    frame = Frame(np.ones((480, 640), np.float32), INTRINSICS)
+    x, y = frame.rays
+    normal = np.asarray(normal) / np.linalg.norm(normal)
+    towards = normal[0] * x[None, :] + normal[1] * y[:, None] + normal[2]
+    return frame.with_depth((-distance / towards).astype(np.float32)), normal
+
+
+def test_small_picture_lies_on_the_same_plane():
+    frame, normal = plane_frame([0.2, -0.8, -1], 0.7)
+    small = shrink(frame.depth, frame.rays)
+    assert small.depth.shape == (120, 160)
+    heights = small.points @ normal + 0.7
+    assert np.abs(heights).max() < 2e-3  # means of blocks of an inclined plane
+
+
+@pytest.mark.parametrize("shape", [(480, 640), (424, 512), (481, 643), (7, 5), (2, 2)])
+def test_small_picture_of_any_shape(shape):
+    frame = level_frame(np.full(shape, 0.8, np.float32))
+    small = shrink(frame.depth, frame.rays)
+    assert features(small, None).shape == (PICTURE_CHANNELS, *small.depth.shape)
+    np.testing.assert_allclose(small.depth[0, 0], 0.8, rtol=1e-6)
+
+
+def test_flying_pixels_are_no_mean():
+    depth = np.full((480, 640), 1.0, np.float32)
+    depth[::4, ::4] = 0.6  # one pixel of each block
+    frame = Frame(depth, INTRINSICS)
+    np.testing.assert_allclose(shrink(frame.depth, frame.rays).depth, 1.0, rtol=1e-6)
+
+
+def test_normals_are_those_of_the_plane():
+    frame, normal = plane_frame([0.1, -0.7, -1], 0.9)
+    small = shrink(frame.depth, frame.rays)
+    inside = surface_normals(small)[5:-5, 5:-5].reshape(-1, 3)
+    assert (inside @ normal).min() > np.cos(np.radians(1))
+
+
+def test_planes_of_two_levels_are_found():
+    floor, normal = plane_frame([0, -1, -1], 1.2)
+    table, _ = plane_frame([0, -1, -1], 0.7)
+    depth = floor.depth.copy()
+    depth[150:330, 200:500] = table.depth[150:330, 200:500]
+    small = shrink(depth, floor.rays)
+    found = largest_planes(small.points, surface_normals(small), small.depth > 0)
+    offsets = sorted(
+        offset for direction, offset in found[:2] if direction @ normal > 0.999
+    )
+    np.testing.assert_allclose(offsets, [0.7, 1.2], atol=0.01)
+
+
+def output_of(labels, strength=6.0):
+    """What a network without doubts would say of labelled pixels; 0 is a surface."""
+    output = np.zeros((6 + len(STEPS), *labels.shape), np.float32)
+    output[1] = np.where(labels == 0, strength, -strength)
+    output[2] = -output[1]
+    for channel, (down, right) in enumerate(STEPS):
+        first = labels[: labels.shape[0] - down, : labels.shape[1] - right]
+        same = (first == labels[down:, right:]) & (first > 0)
+        output[6 + channel][: first.shape[0], : first.shape[1]] = np.where(
+            same, strength, -strength
+        )
+    return output
+
+
+def same_partition(one, other):
+    """Whether two pictures part their pixels in the same way, whatever the numbers."""
+    pairs = set(zip(one.ravel().tolist(), other.ravel().tolist(), strict=True))
+    return len(pairs) == len(np.unique(one)) == len(np.unique(other))
+
+
+def test_touching_things_are_parted():
+    labels = np.zeros((40, 60), int)
+    labels[5:20, 5:20] = 1
+    labels[5:20, 20:40] = 2
+    labels[25:35, 10:50] = 3
+    found = part(output_of(labels), np.ones(labels.shape, bool))
+    assert same_partition(found, labels)
+
+
+def test_parts_of_one_thing_behind_another_are_joined():
+    labels = np.zeros((40, 60), int)
+    labels[10:30, 5:55] = 1
+    labels[5:38, 27:33] = (
+        2  # a bar of six columns before it: only far pairs reach over it
+    )
+    found = part(output_of(labels), np.ones(labels.shape, bool))
+    assert same_partition(found, labels)
+
+
+def test_noise_in_single_pairs_changes_nothing():
+    rng = np.random.default_rng(3)
+    labels = np.zeros((60, 80), int)
+    labels[10:40, 10:35] = 1
+    labels[10:40, 35:60] = 2
+    output = output_of(labels, 2.0)
+    output[6:] += rng.normal(0, 1.5, output[6:].shape).astype(np.float32)
+    found = part(output, np.ones(labels.shape, bool))
+    sizes = np.sort(np.bincount(found[labels > 0]))[::-1]
+    assert sizes[:2].min() > 0.95 * 30 * 25
+
+
+def test_edges_follow_the_depth():
+    depth = np.full((480, 640), 1.0, np.float32)
+    depth[101:303, 203:407] = 0.8  # no multiple of the factor
+    frame = Frame(depth, INTRINSICS)
+    small = shrink(frame.depth, frame.rays)
+    labels = (small.depth < 0.9).astype(np.int64)
+    found = sharpen(labels, small, frame.depth)
+    np.testing.assert_array_equal(found == 1, depth < 0.9)
+
+
+def test_masks_and_labels_say_the_same():
+    frame = level_frame(np.ones((48, 64), np.float32))
+    masks = np.zeros((2, 48, 64), bool)
+    masks[0, :10] = True
+    masks[1, 20:40, 5:60] = True
+    for given in (masks, list(masks), masks[0] + 2 * masks[1].astype(np.int32)):
+        np.testing.assert_array_equal(
+            masks_of(lambda frame, given=given: given, frame), masks
+        )
+
+
+@pytest.mark.parametrize(
+    "given", [[], np.zeros((0, 48, 64), bool), np.zeros((48, 64), int)]
+)
+def test_no_thing_is_no_mask(given):
+    frame = level_frame(np.ones((48, 64), np.float32))
+    assert masks_of(lambda frame: given, frame) == []
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        np.zeros((47, 64), int),
+        np.zeros((2, 64, 48), bool),
+        np.zeros((48, 64)),
+        None,
+        "cup",
+    ],
+)
+def test_own_segmentation_of_another_form_is_refused(given):
+    frame = level_frame(np.ones((48, 64), np.float32))
+    with pytest.raises(ObservationError, match=r"segmentation"):
+        masks_of(lambda frame: given, frame)
+
+
+def test_learned_segmenter_needs_its_card(tmp_path):
+    with pytest.raises(ModelError, match=r"none\.json"):
+        LearnedSegmenter(tmp_path / "none.json")
+
+
+def test_a_scene_takes_masks_of_your_own(ycb, ycb_meshes):
+    names = ["cracker_box", "tomato_soup_can"]
+    camera = camera_over([ycb_meshes[name] for name in names], gap=0.0)
+    asked = []
+
+    def true_masks(frame):
+        asked.append(frame)
+        return camera.owner + 1
+
+    scene = Scene(ycb, segmentation=true_masks)
+    frame = camera.frame(view(20))
+    scene.update(frame)
+    assert asked == [frame]
+    assert sorted(thing.name for thing in scene.objects) == names
+    for thing in scene.objects:
+        own = camera.owner == names.index(thing.name)
+        (mask,) = thing.pixels.values()
+        assert not (mask & ~own).any()  # nothing was joined with its neighbour
+        assert mask.sum() > 0.8 * own.sum()
+
+
+def test_a_scene_refuses_masks_of_another_frame(ycb, ycb_meshes):
+    camera = camera_over([ycb_meshes["mug"]])
+    scene = Scene(ycb, segmentation=lambda frame: np.zeros((4, 4), int))
+    with pytest.raises(ObservationError, match=r"segmentation"):
+        scene.update(camera.frame(view(20)))
+    assert scene.frames == ()
