@@ -212,7 +212,7 @@ def meshes(tmp_path):
 
 
 def test_furniture_is_as_large_as_in_life_and_stands_on_the_ground(meshes):
-    found = WorldMeshes.of([], [meshes / "furniture"])
+    found = WorldMeshes.of(None, meshes / "furniture")
     solids = solids_of(found.furniture, 5, np.random.default_rng(0))
     assert len(solids) == 2  # neither the damaged one nor that of the test split
     for vertices, _ in solids:
@@ -222,11 +222,11 @@ def test_furniture_is_as_large_as_in_life_and_stands_on_the_ground(meshes):
         )
 
     with pytest.raises(UsageError, match="toys: how large is a duck"):
-        WorldMeshes.of([], [meshes / "toys"])
+        WorldMeshes.of(None, meshes / "toys")
 
 
 def test_meshes_for_validation_are_not_learned_from(meshes):
-    found = WorldMeshes.of([meshes / "toys"], [meshes / "furniture"])
+    found = WorldMeshes.of(meshes / "toys", meshes / "furniture")
     kept, held_out = found.divided(0.25, seed=1)
     assert sorted(kept.names + held_out.names) == sorted(found.names)
     assert 4 <= len(held_out.names) <= 18
@@ -340,7 +340,7 @@ def test_a_folder_takes_only_the_recipe_and_the_meshes_of_its_run(run, meshes):
     with pytest.raises(ModelError, match=r"another recipe \(width was 4, not 8\)"):
         train_segmentation(run, recipe=replace(RECIPE, width=8))
     with pytest.raises(ModelError, match="other objects"):
-        train_segmentation(run, (meshes / "toys",), recipe=RECIPE)
+        train_segmentation(run, meshes / "toys", recipe=RECIPE)
 
 
 @pytest.fixture(scope="module")

@@ -79,28 +79,25 @@ class WorldMeshes:
     furniture: tuple[Entry, ...] = ()
 
     @classmethod
-    def of(cls, toys: Sequence[Path], furniture: Sequence[Path]) -> WorldMeshes:
+    def of(cls, toys: Path | None, furniture: Path | None) -> WorldMeshes:
         """List the meshes of folders, without those of other splits than that to train on.
 
         Args:
-            toys: folders of things of any size.
-            furniture: folders of furniture, of ModelNet10's classes.
+            toys: folder of things of any size; None for none.
+            furniture: folder of furniture, of ModelNet10's classes; None for none.
 
         Raises:
             DatasetError: a folder is missing or holds no mesh to train on.
             UsageError: furniture is of a class whose size is not known.
         """
-        large = [(folder, entry) for folder in furniture for entry in _entries(folder)]
-        for folder, entry in large:
+        large = _entries(furniture)
+        for entry in large:
             if entry.label not in LIFE_SIZES:
                 raise UsageError(
-                    f"{folder}: how large is a {one_line(entry.label)}? Furniture is of the classes"
-                    f" {', '.join(LIFE_SIZES)}; other meshes are for --meshes"
+                    f"{furniture}: how large is a {one_line(entry.label)}? Furniture is of the"
+                    f" classes {', '.join(LIFE_SIZES)}; other meshes are for --meshes"
                 )
-        return cls(
-            tuple(entry for folder in toys for entry in _entries(folder)),
-            tuple(entry for _, entry in large),
-        )
+        return cls(_entries(toys), large)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -123,12 +120,14 @@ class WorldMeshes:
         return WorldMeshes(toys[0], furniture[0]), WorldMeshes(toys[1], furniture[1])
 
 
-def _entries(folder: Path) -> list[Entry]:
+def _entries(folder: Path | None) -> tuple[Entry, ...]:
     """The meshes of a folder that are to train on."""
+    if folder is None:
+        return ()
     entries = [entry for entry in list_dataset(folder) if entry.split in ("train", "")]
     if not entries:
         raise DatasetError(f"{folder}: holds no mesh of a training split")
-    return entries
+    return tuple(entries)
 
 
 @dataclass(frozen=True)

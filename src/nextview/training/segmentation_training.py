@@ -223,8 +223,8 @@ def files_of(run: Path, recipe: SegmentationRecipe) -> list[list[FrameFile]]:
 
 def train_segmentation(
     out: Path,
-    meshes: tuple[Path, ...] = (),
-    furniture: tuple[Path, ...] = (),
+    meshes: Path | None = None,
+    furniture: Path | None = None,
     workers: int | None = None,
     recipe: SegmentationRecipe = SegmentationRecipe(),
     hardware: Hardware = Hardware(),
@@ -238,8 +238,8 @@ def train_segmentation(
     Args:
         out: folder for frames, checkpoints, logs and network.pt, the network of the epoch with the
             lowest loss on validation.
-        meshes: folders of further things, of any size; of those with splits, the training split.
-        furniture: folders of furniture, of ModelNet10's classes, for rooms and backgrounds.
+        meshes: folder of further things, of any size; if it has splits, the training split is used.
+        furniture: folder of furniture of ModelNet10's classes, for rooms and backgrounds.
         workers: number of processes that draw frames; by default one for each core.
 
     Raises:
