@@ -59,9 +59,9 @@ def part(output: Float32, valid: Mask) -> Index:
     joined = np.concatenate(near) & (weight > CERTAIN_ODDS)
 
     graph = coo_array((np.ones(joined.sum()), pairs[:, joined]), shape=(size, size))
-    _, region = connected_components(graph, directed=False)
+    component = connected_components(graph, directed=False)[1].astype(np.int64)
     used, region = np.unique(
-        np.where(thing.ravel(), region + 1, 0), return_inverse=True
+        np.where(thing.ravel(), component + 1, 0), return_inverse=True
     )
     if used[0] != 0:  # every pixel is of a thing
         region = region + 1
