@@ -161,12 +161,14 @@ def test_a_mistake_is_refused_or_told_whatever_takes_it_in(
 )
 def test_an_object_tells_what_is_wrong_with_its_frames_and_is_not_confident(
     ycb,
-    two_frames,
+    ycb_meshes,
     mistake,
 ):
+    camera = camera_over([ycb_meshes["cracker_box"]])
+    frames = camera.frame(view(20)), camera.frame(view(60))
     make, name = MISTAKES[mistake]
     scene = nextview.Scene(ycb)
-    for frame in make(*two_frames):
+    for frame in make(*frames):
         scene.update(frame)
     assert scene.objects
     for thing in scene.objects:
@@ -174,10 +176,10 @@ def test_an_object_tells_what_is_wrong_with_its_frames_and_is_not_confident(
         assert not thing.confident
 
     right = nextview.Scene(ycb)
-    for frame in two_frames:
+    for frame in frames:
         right.update(frame)
-    (mug,) = right.objects
-    assert (mug.name, mug.confident, mug.warnings) == ("mug", True, ())
+    (box,) = right.objects
+    assert (box.name, box.confident, box.warnings) == ("cracker_box", True, ())
 
 
 def test_a_frame_that_was_handed_in_before_counts_once(ycb, two_frames):

@@ -303,7 +303,9 @@ def recognised(p, unknown, camera=None):
 def test_an_object_more_novel_than_the_rate_allows_has_no_answer(capsys):
     usual, novel = recognised(0.3, 0.05), recognised(0.03, 0.05)
     print_episode(recognised(1.0, 0.05), "chair", "gain")
-    assert "known objects, 100 % look" in " ".join(capsys.readouterr().out.split())
+    assert "100 % of known objects fit as badly" in " ".join(
+        capsys.readouterr().out.split()
+    )
     assert (usual.answer, usual.unknown, usual.novelty) == ("chair", False, 0.3)
     assert (novel.answer, novel.unknown, novel.novelty) == (None, True, 0.03)
     assert novel.most_like == "chair"

@@ -25,7 +25,7 @@ from nextview.errors import (
 from nextview.types import Float
 
 EXTRAS = {  # packages by the optional part of the installation that brings them
-    "bags": ("rosbags",),
+    "bags": ("lz4", "rosbags"),
     "benchmark": ("jinja2", "pandas", "pyarrow"),
     "cluster": ("dask", "distributed"),
     "explore": ("viser", "websockets"),
