@@ -64,9 +64,21 @@ WRITES = {
     "train gain": ("train gain {training}", "g.json", f"{GAIN} --folds 2 --epochs 1"),
     "train recogniser": ("train recogniser {views}", "folder", SMALL),
     "train map": ("train map {views}", "folder", SMALL),
+    "train segmentation": (
+        "train segmentation",
+        "folder",
+        "--frames 16 --width 8 --epochs 1 --batch 4 --validation-share 0.3 --workers 0",
+    ),
 }
 """Arguments before the output, the name of the output, and arguments after it."""
-OWN_ONLY = {"scenes", "render", "train recogniser", "train map", "benchmark-things"}
+OWN_ONLY = {
+    "benchmark-things",
+    "render",
+    "scenes",
+    "train map",
+    "train recogniser",
+    "train segmentation",
+}
 """They go on with an unfinished output of their own, and replace no folder of anything else."""
 
 
@@ -120,6 +132,7 @@ def test_no_command_is_forgotten():
         "download",
         "export recogniser",
         "export map",
+        "export segmentation",
     }
     assert {
         name.partition(" --")[0] for name in WRITES
