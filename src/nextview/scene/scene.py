@@ -215,7 +215,7 @@ class Scene:
 
         Raises:
             ObservationError: no support plane is seen, this is no frame, or has no pose, or it
-                cannot be of the same world as what is known.
+                cannot be of the same world as what is known; or ``segmentation`` returned no masks.
         """
         with self._lock:
             known = self._known_frames
@@ -224,7 +224,10 @@ class Scene:
                 return Look(False, warnings=(REPEATED,))
             before = self._state
             ground = before.tops[0].ground if before.tops else None
-            top = self._top_of(frame, ground, before.tracks)
+            given = None
+            if self.segmentation is not None:
+                given = masks_of(self.segmentation, frame)
+            top = self._top_of(frame, ground, before.tracks, given)
             shown = top.plane if top.shows_ground else None
             top = replace(top, warnings=tuple(known.check(frame, shown)))
             if top.lower:
@@ -278,16 +281,14 @@ class Scene:
         frame: Frame,
         ground: GroundPlane | None,
         tracks: Sequence[Track],
+        given: Sequence[Mask] | None,
     ) -> TableTop:
         """What a frame shows on the ground, which is looked for if it is not known.
 
         Raises:
-            ObservationError: no support plane is seen, or the segmentation returned no masks.
+            ObservationError: no support plane is seen.
         """
         known = [_sphere(track) for track in tracks]
-        given = None
-        if self.segmentation is not None:
-            given = masks_of(self.segmentation, frame)
         return TableTop.of(
             frame,
             self.up,
@@ -308,7 +309,7 @@ class Scene:
         anew = SceneState(region=self.region)
         tops = [
             replace(
-                self._top_of(old.frame, last.ground, anew.tracks),
+                self._top_of(old.frame, last.ground, anew.tracks, old.given),
                 warnings=old.warnings,
             )
             for old in before.tops
@@ -353,7 +354,7 @@ class Scene:
             return before, Look(False, warnings=(ViewWarning("pose", WRONG_POSE),))
         seen_again = any(one.confirms for one in found)
         if before.tops and top.ground.wide and not (top.shows_ground or seen_again):
-            self._top_of(top.frame, None, ())  # names a mistake in the pose
+            self._top_of(top.frame, None, (), None)  # names a mistake in the pose
             raise ObservationError(NOTHING_AGAIN)
 
         state, look = self._taken(before, top, found)
@@ -379,18 +380,19 @@ class Scene:
         seen = {row: self._explained(there[row], own[row], top, number) for row in own}
         shown = [track for track in seen.values() if track is not None]
         doubtful = {row: own[row] for row, track in seen.items() if track is None}
-        chosen, left = _most_pixels([*doubtful.values(), *new])
-        for mask, row in zip(doubtful.values(), doubtful, strict=True):
+        verified = _most_pixels([*doubtful.values(), *new])
+        for (row, mask), chosen in zip(doubtful.items(), verified, strict=False):
             track = there[row]
-            if id(mask) not in chosen:
+            if not chosen:
                 hidden.append(replace(track, again=(*track.again, (number, mask))))
                 continue
             try:
                 shown.append(track.with_mask(number, mask, top))
             except ObservationError:  # too little of it shows to say anything
                 hidden.append(track)
-        for mask in new:
-            if id(mask) in chosen:
+        of_new = verified[len(doubtful) :]
+        for mask, chosen in zip(new, of_new, strict=True):
+            if chosen:
                 with suppress(ObservationError):
                     shown.append(new_track(mask, bench))
 
@@ -399,8 +401,7 @@ class Scene:
         tops = (*before.tops, top)
         benches = [Bench(one, k, self._judged) for k, one in enumerate(tops)]
         every = merged(taken_over([*hidden, *shown], benches), benches)
-        left_unknown = sum(id(mask) in left for mask in new)
-        state = replace(before, tops=tops, left_unknown=left_unknown)
+        state = replace(before, tops=tops, left_unknown=of_new.count(False))
         return _numbered(state, [_with_past(one, known, number) for one in every], lost)
 
     def _explained(
@@ -442,11 +443,11 @@ def _sphere(track: Track) -> tuple[Float, float]:
     return frame.centre, frame.radius
 
 
-def _most_pixels(masks: Sequence[Mask]) -> tuple[set[int], set[int]]:
-    """The ``id`` of each of the largest masks, that are verified, and of the others."""
-    order = sorted(masks, key=lambda mask: -np.count_nonzero(mask))
-    ids = [id(mask) for mask in order]
-    return set(ids[:MOST_VERIFIED]), set(ids[MOST_VERIFIED:])
+def _most_pixels(masks: Sequence[Mask]) -> list[bool]:
+    """Whether each mask, (H, W) bool, is one of the largest, which are verified in a frame."""
+    order = sorted(range(len(masks)), key=lambda row: -np.count_nonzero(masks[row]))
+    largest = set(order[:MOST_VERIFIED])
+    return [row in largest for row in range(len(masks))]
 
 
 def _with_past(track: Track, known: Mapping[int, Track], number: int) -> Track:
