@@ -72,7 +72,13 @@ def joined(parts: Sequence[Solid]) -> Solid:
 def moved(
     solid: Solid, turn: Rotation | None = None, by: Sequence[float] = (0, 0, 0)
 ) -> Solid:
-    """A solid turned about the origin, then displaced."""
+    """Turn a solid about the origin, then displace it.
+
+    Args:
+        solid: the solid.
+        turn: rotation; None for none.
+        by: displacement, metres.
+    """
     vertices = solid[0] if turn is None else turn.apply(solid[0])
     return vertices + np.asarray(by, float), solid[1]
 
@@ -132,7 +138,13 @@ def revolved(profile: Float, sections: int) -> Solid:
 
 
 def ring_points(radius: float, sides: int, centre: Sequence[float] = (0, 0)) -> Float:
-    """Corners of a regular polygon, (sides, 2)."""
+    """Return the corners of a regular polygon, (sides, 2).
+
+    Args:
+        radius: of its corners.
+        sides: how many.
+        centre: x and y of its middle.
+    """
     angles = np.arange(sides) / sides * 2 * np.pi
     return radius * np.c_[np.cos(angles), np.sin(angles)] + np.asarray(centre, float)
 
@@ -260,8 +272,11 @@ def compound(rng: Generator) -> Solid:
         part = simple[int(rng.integers(4))](rng)
         part = part[0] * rng.uniform(0.3, 0.9), part[1]
         under = parts[int(rng.integers(len(parts)))][0]
-        low, high = under.min(0), under.max(0)
-        own_low, own_high = part[0].min(0), part[0].max(0)
+        low = under.min(0)
+        high = under.max(0)
+        own_low = part[0].min(0)
+        own_high = part[0].max(0)
+
         shift = (low + high - own_low - own_high) / 2
         axis = int(rng.integers(3))
         side = rng.choice([-1, 1])
@@ -405,8 +420,9 @@ def tool(rng: Generator) -> Solid:
     grip[0][:, 2] *= rng.uniform(0.3, 1)
     kind = rng.random()
     if kind < 0.3:
-        head = lump(rng)[0] * rng.uniform(0.15, 0.35), lump(np.random.default_rng(0))[1]
-        head = head[0] * [1, 1, rng.uniform(0.2, 1)], head[1]
+        vertices, faces = lump(rng)
+        vertices = vertices * rng.uniform(0.15, 0.35)
+        head = vertices * [1, 1, rng.uniform(0.2, 1)], faces
     elif kind < 0.6:
         head = box(rng)
         head = (

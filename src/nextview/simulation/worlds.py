@@ -7,7 +7,7 @@ from them (``training/segmentation_training.py``).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.sensor import SENSORS, Sensor
 from nextview.simulation.solids import Solid, moved, random_solid, tube
-from nextview.types import Float, Float32, Index
+from nextview.types import Float, Float32, Index, Mask
 
 SURFACE = (
     -1
@@ -86,7 +86,12 @@ class World:
     labels: list[int] = field(default_factory=list)
 
     def add(self, solid: Solid, label: int) -> None:
-        """Put a solid where it is."""
+        """Put a solid where it is.
+
+        Args:
+            solid: in place, metres.
+            label: the number of a thing, SURFACE or BACKGROUND.
+        """
         self.solids.append(solid)
         self.labels.append(label)
 
@@ -140,62 +145,67 @@ class HeightMap:
             The solid in place; None where there is no room.
         """
         vertices, faces = shape
-        low, high = vertices.min(0), vertices.max(0)
-        if np.ptp(vertices[:, :2], axis=0).max() > 2 * self.reach:
+        low = vertices.min(0)
+        high = vertices.max(0)
+        half = (high - low)[:2] / 2
+        if 2 * half.max() > 2 * self.reach:
             return None
+
         bottom, top = self._profiles(shape)
         there = np.isfinite(bottom)
         if not there.any():
             return None
-        grown = int(np.ceil(gap / self.cell)) if gap > 0 else 0
-        around = (
-            ndimage.binary_dilation(np.pad(there, grown), iterations=grown)
-            if grown
-            else there
-        )
-        half = (high - low)[:2] / 2
-        angle = rng.uniform(0, 2 * np.pi)
-        start = self.centre + rng.normal(0, spread / 2, 2)
-        for attempt in range(DROPS_TRIED + STEPS_OUTWARDS):
-            if attempt < DROPS_TRIED and piled:
-                start = self.centre + rng.uniform(-1, 1, 2) * spread
-            middle = start
-            if not piled:
-                middle = start + attempt * 1.5 * self.cell * np.array(
-                    [np.cos(angle), np.sin(angle)]
-                )
+
+        margin = 0 if piled else int(np.ceil(gap / self.cell))
+        around = np.pad(there, margin)
+        if margin:
+            around = ndimage.binary_dilation(around, iterations=margin)
+
+        for middle in self._places(rng, piled, spread):
             if (np.abs(middle - self.centre) + half > self.reach).any():
                 continue
             at = np.floor((middle - half - self.low) / self.cell).astype(int)
-            rows = slice(at[0], at[0] + there.shape[0])
-            columns = slice(at[1], at[1] + there.shape[1])
-            here = self.heights[rows, columns]
-            if here.shape != there.shape or (at < 0).any():
+            here = self._cells(at, there.shape)
+            if here is None or not (piled or self._is_free(at - margin, around)):
                 continue
-            if not piled:
-                wide = self.heights[
-                    max(at[0] - grown, 0) : at[0] + there.shape[0] + grown,
-                    max(at[1] - grown, 0) : at[1] + there.shape[1] + grown,
-                ]
-                if (
-                    wide.shape != around.shape
-                    or (wide[around] > self.level + 1e-9).any()
-                ):
-                    continue
+
             rise = float((here[there] - bottom[there]).max())
             if rise + high[2] > ceiling:
                 continue
-            self.heights[rows, columns] = np.where(
-                there, np.maximum(here, rise + top), here
-            )
+            here[there] = np.maximum(here, rise + top)[there]
             corner = self.low + at * self.cell
             return vertices + np.append(corner - low[:2], rise), faces
         return None
 
+    def _places(self, rng: Generator, piled: bool, spread: float) -> Iterator[Float]:
+        """Places to try, (2,) each: at random, or from a place near the middle outwards."""
+        angle = rng.uniform(0, 2 * np.pi)
+        start = self.centre + rng.normal(0, spread / 2, 2)
+        if piled:
+            for _ in range(DROPS_TRIED):
+                yield self.centre + rng.uniform(-1, 1, 2) * spread
+            return
+
+        way = np.array([np.cos(angle), np.sin(angle)])
+        for step in range(DROPS_TRIED + STEPS_OUTWARDS):
+            yield start + step * 1.5 * self.cell * way
+
+    def _cells(self, at: Index, shape: tuple[int, ...]) -> Float | None:
+        """The heights of so many cells from one on, a view; None where they leave the map."""
+        if (at < 0).any() or (at + shape > MAP_CELLS).any():
+            return None
+        return self.heights[at[0] : at[0] + shape[0], at[1] : at[1] + shape[1]]
+
+    def _is_free(self, at: Index, outline: Mask) -> bool:
+        """Whether nothing lies in an outline, (h, w) bool, whose first cell is ``at``."""
+        here = self._cells(at, outline.shape)
+        return here is not None and not (here[outline] > self.level + 1e-9).any()
+
     def _profiles(self, solid: Solid) -> tuple[Float, Float]:
         """Heights of the lower and the upper side over the cells of a solid's outline."""
         vertices, _ = solid
-        low, high = vertices.min(0), vertices.max(0)
+        low = vertices.min(0)
+        high = vertices.max(0)
         count = np.maximum(np.ceil((high - low)[:2] / self.cell).astype(int), 1)
         x = low[0] + (np.arange(count[0]) + 0.5) * self.cell
         y = low[1] + (np.arange(count[1]) + 0.5) * self.cell
@@ -337,7 +347,8 @@ def _table_top(
     length = max(rng.uniform(0.35, 1.8), 5 * scale)
     width = max(length * rng.uniform(0.5, 1.0), 4 * scale)
     if belt:
-        length, width = 3.0, max(rng.uniform(0.25, 0.7), 5 * scale)
+        length = 3.0
+        width = max(rng.uniform(0.25, 0.7), 5 * scale)
         for side in (-1, 1):
             rail = rng.uniform(0.01, 0.06)
             at = side * (width / 2 + 0.02) * np.array([-np.sin(yaw), np.cos(yaw)])
@@ -401,7 +412,8 @@ def _person(rng: Generator) -> Solid:
     parts = [
         (head[0] * 0.25 / np.ptp(head[0], axis=0).max() + [0, 0, tall - 0.12], head[1])
     ]
-    hip, neck = 0.5 * tall, tall - 0.28
+    hip = 0.5 * tall
+    neck = tall - 0.28
     spine = np.linspace(
         [0, 0, hip], [rng.normal(0, 0.05), rng.normal(0, 0.05), neck], 8
     )
