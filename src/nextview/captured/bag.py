@@ -222,6 +222,7 @@ class Bag:
         """
         found = self._reader.messages(connections, start, stop)
         self._unread.add(found)
+
         try:
             while True:
                 with _damage_named(self.path):
@@ -595,6 +596,7 @@ def _recorded(bag: Bag, topic: "Connection", time: int, message: Any) -> Recorde
             size = int(message.width), int(message.height)
     except ObservationError as error:
         damage = str(error)
+
     return RecordedImage(
         bag,
         topic,
@@ -708,6 +710,7 @@ def _add_frames(
         else:
             scale = ENCODING_STEPS[image.encoding]
             views.frames.append(CapturedFrame(image.name, image, scale, k, pose))
+
     return lost
 
 

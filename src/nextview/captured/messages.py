@@ -44,6 +44,7 @@ def depth_of(image: Any) -> NDArray[Any]:
     height, width = int(image.height), int(image.width)
     if min(height, width) < 1:
         raise ObservationError(f"an image of {width} x {height} pixels shows nothing")
+
     step = int(image.step)
     data = np.frombuffer(bytes(image.data), np.uint8)
     if step < width * kind.itemsize or len(data) < step * height:
@@ -52,6 +53,7 @@ def depth_of(image: Any) -> NDArray[Any]:
             f" {width * kind.itemsize} bytes or more; this one has {len(data)} bytes in rows of"
             f" {step}"
         )
+
     rows = data[: step * height].reshape(height, step)[:, : width * kind.itemsize]
     return np.ascontiguousarray(rows).view(kind).astype(kind.newbyteorder("="))
 

@@ -222,6 +222,7 @@ class Scene:
             known.refuse(frame)
             if known.repeats(frame):
                 return Look(False, warnings=(REPEATED,))
+
             before = self._state
             ground = before.tops[0].ground if before.tops else None
             given = None
@@ -230,6 +231,7 @@ class Scene:
             top = self._top_of(frame, ground, before.tracks, given)
             shown = top.plane if top.shows_ground else None
             top = replace(top, warnings=tuple(known.check(frame, shown)))
+
             if top.lower:
                 state, look = self._judged_anew(top)
             else:

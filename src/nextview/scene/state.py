@@ -82,6 +82,7 @@ class SceneState:
             remarks.append(
                 ViewWarning("left unknown", f"{what}, the largest first", holds=False)
             )
+
         if self.unexplained:
             area = 1e4 * sum(patch.area for patch in self.unexplained)
             what = f"{area:.0f} square centimetres in view are neither ground nor an object"

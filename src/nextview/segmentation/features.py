@@ -55,8 +55,10 @@ def shrink(depth: Float32, rays: tuple[Float32, Float32]) -> SmallPicture:
         rays: slopes x/z of its columns, (W,), and y/z of its rows, (H,).
     """
     factor = max(1, round(max(depth.shape) / LONG_SIDE))
-    height, width = -(-depth.shape[0] // factor), -(-depth.shape[1] // factor)
-    down, right = height * factor - depth.shape[0], width * factor - depth.shape[1]
+    height = -(-depth.shape[0] // factor)
+    width = -(-depth.shape[1] // factor)
+    down = height * factor - depth.shape[0]
+    right = width * factor - depth.shape[1]
     blocks = np.pad(depth, ((0, down), (0, right)))
     blocks = blocks.reshape(height, factor, width, factor).swapaxes(1, 2)
     blocks = blocks.reshape(height, width, factor**2)
@@ -184,11 +186,13 @@ def largest_planes(
     seeds = _spread(points, valid, PLANE_TRIALS)
     directions = _spread(normals, valid, PLANE_TRIALS)
     found: list[tuple[Float, float]] = []
+
     while len(found) < PLANES and len(samples) >= 3 and len(seeds):
         offsets = -(directions * seeds).sum(1)
         apart = np.abs(samples @ directions.T + offsets)
         held = (apart < PLANE_TOLERANCE * samples[:, 2:]).sum(0)
         best = int(held.argmax())
+
         plane = directions[best].astype(float), float(offsets[best])
         for _ in range(3):
             near = (
@@ -198,6 +202,7 @@ def largest_planes(
                 break
             plane = _fitted(samples[near])
         found.append(plane)
+
         samples = samples[~_on(samples, plane)]
         left = ~_on(seeds, plane)
         seeds = seeds[left]

@@ -84,7 +84,8 @@ def _contracted(
     Returns:
         The label of each region, (count,).
     """
-    low, high = np.minimum(*pairs), np.maximum(*pairs)
+    low = np.minimum(*pairs)
+    high = np.maximum(*pairs)
     apart = low != high
     keys, which = np.unique(low[apart] * count + high[apart], return_inverse=True)
     sums = np.bincount(which, weight[apart], len(keys))
@@ -165,7 +166,8 @@ def sharpen(
     z = depth[rows, columns]
     best = np.full(len(rows), np.inf, np.float32)
     chosen = np.zeros(len(rows), np.int64)
-    row, column = rows // factor, columns // factor
+    row = rows // factor
+    column = columns // factor
     middle = (factor - 1) / 2
     for down in (-1, 0, 1):
         for right in (-1, 0, 1):
