@@ -111,32 +111,6 @@ def extruded(rings: Sequence[Float], height: float) -> Solid:
     return vertices, faces.astype(np.int32)
 
 
-def revolved(profile: Float, sections: int) -> Solid:
-    """A solid of revolution about z.
-
-    Args:
-        profile: radius and height of each point of the outline, (N, 2).
-        sections: sides of the round outline.
-    """
-    angles = np.arange(sections) / sections * 2 * np.pi
-    radius, height = profile.T
-    vertices = np.stack(
-        [
-            radius[None] * np.cos(angles)[:, None],
-            radius[None] * np.sin(angles)[:, None],
-            np.broadcast_to(height, (sections, len(height))),
-        ],
-        -1,
-    ).reshape(-1, 3)
-    count = len(profile)
-    at = (np.arange(sections)[:, None] * count + np.arange(count - 1)).ravel()
-    beside = (at + count) % (sections * count)
-    faces = np.concatenate(
-        [np.c_[at, beside, beside + 1], np.c_[at, beside + 1, at + 1]]
-    )
-    return vertices, faces.astype(np.int32)
-
-
 def ring_points(radius: float, sides: int, centre: Sequence[float] = (0, 0)) -> Float:
     """Return the corners of a regular polygon, (sides, 2).
 
@@ -226,6 +200,8 @@ def _outline(rng: Generator) -> tuple[Float, Float]:
 
 def container(rng: Generator) -> Solid:
     """A bottle, a bowl, a cup, a vase: full or hollow."""
+    from trimesh.creation import revolve
+
     radii, heights = _outline(rng)
     outside = np.c_[radii, heights]
     foot = [[0.0, 0.0]]
@@ -236,7 +212,9 @@ def container(rng: Generator) -> Solid:
         profile = np.concatenate([foot, outside, inside, [[0.0, floor]]])
     else:
         profile = np.concatenate([foot, outside, [[0.0, heights[-1]]]])
-    return revolved(profile, int(rng.choice([8, *ROUND_SECTIONS, *ROUND_SECTIONS])))
+    sections = int(rng.choice([8, *ROUND_SECTIONS, *ROUND_SECTIONS]))
+    vessel = revolve(profile, sections=sections, process=False)
+    return np.asarray(vessel.vertices), np.asarray(vessel.faces, np.int32)
 
 
 def handled_container(rng: Generator) -> Solid:

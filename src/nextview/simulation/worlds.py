@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.ray_caster import RayCaster
 from nextview.geometry.viewsphere import look_at_origin
+from nextview.simulation.scene import upright_boxes
 from nextview.simulation.sensor import SENSORS, Sensor
 from nextview.simulation.solids import Solid, moved, random_solid, tube
 from nextview.types import Float, Float32, Index, Mask
@@ -148,7 +149,7 @@ class HeightMap:
         low = vertices.min(0)
         high = vertices.max(0)
         half = (high - low)[:2] / 2
-        if 2 * half.max() > 2 * self.reach:
+        if half.max() > self.reach:
             return None
 
         bottom, top = self._profiles(shape)
@@ -230,18 +231,13 @@ def slab(
         top: height of its top.
         yaw: turned by so many radians.
     """
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    vertices = signs * np.asarray(size) / 2
-    faces = np.array(
-        [
-            [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-            [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-        ],
-        np.int32,
-    )  # fmt: skip
-    turn = Rotation.from_euler("z", yaw)
-    middle = np.array([*centre, top - size[2] / 2])
-    return turn.apply(vertices) + middle, faces
+    box = upright_boxes(
+        np.asarray(size, float)[None],
+        np.array([yaw]),
+        np.asarray(centre, float)[None, :2],
+        top - size[2],
+    )
+    return box.vertices, box.faces
 
 
 def draw_shapes(
