@@ -279,9 +279,14 @@ def _points_in(points: Float, frame: Frame) -> tuple[tuple[Index, Index], Float]
 
 
 def seen_through(points: Float, frame: Frame) -> float:
-    """Share of points, (N, 3), world, metres, through which a frame sees something behind them.
+    """Return the share of points through which a frame sees something behind them.
 
-    0 where the frame shows too few of them.
+    Args:
+        points: (N, 3), world, metres.
+        frame: that may show them.
+
+    Returns:
+        The share; 0 where the frame shows too few of them.
     """
     _, off = _points_in(points, frame)
     if len(off) < FEWEST_TESTED:

@@ -53,6 +53,7 @@ def random_solid(rng: Generator, size: float) -> Solid:
         bent_lump,
         plate,
     )
+
     vertices, faces = kinds[int(rng.integers(len(kinds)))](rng)
     extent = float(np.ptp(vertices, axis=0).max())
     vertices = vertices * (size * rng.uniform(0.75, 1.33) / extent)
@@ -137,16 +138,19 @@ def tube(path: Float, radii: Float, sides: int = 12) -> Solid:
     flat = np.linalg.norm(aside, axis=1) < 0.1
     aside[flat] = np.cross(along[flat], [1.0, 0.0, 0.0])
     aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+
     over = np.cross(along, aside)
     corners = ring_points(1.0, sides)
     vertices = path[:, None] + radii[:, None, None] * (
         corners[:, :1] * aside[:, None] + corners[:, 1:] * over[:, None]
     )
+
     count = len(path)
     vertices = np.concatenate([vertices.reshape(-1, 3), path[:1], path[-1:]])
     steps = np.arange(count - 1)[:, None] * sides
     at = (steps + np.arange(sides)).ravel()
     beside = (steps + (np.arange(sides) + 1) % sides).ravel()
+
     first = np.arange(sides)
     second = (first + 1) % sides
     last = (count - 1) * sides
@@ -283,6 +287,7 @@ def bracket(rng: Generator) -> Solid:
             (thick, 0, 0),
         ),
     ]
+
     kind = rng.random()
     if kind < 0.3:
         legs.append(moved(legs[1], by=(first - thick, 0, 0)))
@@ -363,6 +368,7 @@ def pipe(rng: Generator) -> Solid:
             np.linspace(0, rng.uniform(0.6, 2), TUBE_STEPS), np.zeros((TUBE_STEPS, 2))
         ]
     parts = [tube(path, np.full(TUBE_STEPS, radius), 20)]
+
     collar = radius * rng.uniform(1.15, 1.6)
     for end, inner in ((0, 2), (-1, -3)):
         if rng.random() < 0.7:

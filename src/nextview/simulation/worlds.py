@@ -356,6 +356,7 @@ def _table_top(
         world.add(
             slab((length, width, rng.uniform(0.015, 0.08)), (0, 0), 0, yaw), SURFACE
         )
+
     if rng.random() < 0.8:
         world.add(slab((12, 12, 0.1), (0, 0), -height), SURFACE)
     if rng.random() < 0.5:
@@ -387,6 +388,7 @@ def _behind(
         away = rng.uniform(0.5, 2.5) + 6 * scale
         at = away * np.array([np.cos(angle), np.sin(angle)])
         world.add(slab((0.1, 10, 4), at, 3.0, angle), BACKGROUND)
+
     for _ in range(int(rng.choice([0, 0, 0, 1, 2, 4]))):
         angle = rng.uniform(0, 2 * np.pi)
         away = rng.uniform(0.8, 2.0) + 5 * scale
@@ -437,6 +439,7 @@ def _hands(world: World, rng: Generator) -> None:
     out /= np.linalg.norm(out)
     aside = np.cross(out, [1.0, 0, 0])
     aside /= np.linalg.norm(aside)
+
     palm = tip + 0.09 * out
     for side in (-1, 1):
         finger = np.linspace(
@@ -557,6 +560,7 @@ def _shelf(shapes: Sequence[Shape], rng: Generator, scale: float) -> World:
     thick = 0.15 * scale
     for level in range(-levels, levels + 1):
         world.add(slab((deep, width, thick), (0, 0), level * clear), SURFACE)
+
     tall = (2 * levels + 1) * clear
     if rng.random() < 0.7:
         world.add(slab((thick, width, tall), (-deep / 2, 0), tall / 2), BACKGROUND)
@@ -564,6 +568,7 @@ def _shelf(shapes: Sequence[Shape], rng: Generator, scale: float) -> World:
         if rng.random() < 0.7:
             at = (0, side * width / 2)
             world.add(slab((deep, thick, tall), at, tall / 2), BACKGROUND)
+
     for level in range(-levels, levels):
         if level not in (-1, 0) and rng.random() < 0.5:
             continue
@@ -584,6 +589,7 @@ def _room(furniture: Sequence[Solid], rng: Generator) -> World:
         away = rng.uniform(1.5, 4)
         at = away * np.array([np.cos(angle), np.sin(angle)])
         world.add(slab((0.1, 14, 6), at, 3.0, float(angle)), BACKGROUND)
+
     ground = HeightMap(8.0, np.zeros(2), 0.0)
     gap = float(rng.choice([0.02, 0.1, 0.4]))
     for _ in range(int(rng.integers(1, 5))):
@@ -663,6 +669,7 @@ def _camera_pose(world: World, rng: Generator, sensor: Sensor) -> Float:
     if world.scale > 0.5:
         aside /= 3
     pose[:3, 3] += world.focus + aside
+
     roll = rng.normal(0, 4) if rng.random() < 0.9 else rng.uniform(0, 360)
     pose[:3, :3] = (
         pose[:3, :3] @ Rotation.from_euler("z", roll, degrees=True).as_matrix()
@@ -675,6 +682,7 @@ def _sensor(rng: Generator, shape: tuple[int, int]) -> Sensor:
     known = SENSORS[str(rng.choice(["none", "kinect", "stereo", "stereo"]))]
     focal = known.focal / known.width * shape[1] * rng.uniform(0.8, 1.6)
     smaller = shape[1] / known.width
+
     strength = rng.uniform(0.3, 1.3)
     return replace(
         known.scaled(strength),
