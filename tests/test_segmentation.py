@@ -15,7 +15,7 @@ from nextview.segmentation.features import (
 )
 from nextview.segmentation.instances import LearnedSegmenter, masks_of
 from nextview.segmentation.network import AFFINITY_STEPS as STEPS
-from nextview.segmentation.parting import part, sharpen
+from nextview.segmentation.parting import pair_slices, part, sharpen
 from nextview.sensing.frame import Frame
 
 INTRINSICS = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
@@ -83,15 +83,13 @@ def test_planes_of_two_levels_are_found():
 
 def output_of(labels, strength=6.0):
     """What a network without doubts would say of labelled pixels; 0 is a surface."""
-    output = np.zeros((6 + len(STEPS), *labels.shape), np.float32)
+    output = np.zeros((3 + len(STEPS), *labels.shape), np.float32)
     output[1] = np.where(labels == 0, strength, -strength)
     output[2] = -output[1]
-    for channel, (down, right) in enumerate(STEPS):
-        first = labels[: labels.shape[0] - down, : labels.shape[1] - right]
-        same = (first == labels[down:, right:]) & (first > 0)
-        output[6 + channel][: first.shape[0], : first.shape[1]] = np.where(
-            same, strength, -strength
-        )
+    for channel, step in zip(output[3:], STEPS, strict=True):
+        first, second = pair_slices(labels.shape, *step)
+        same = (labels[first] == labels[second]) & (labels[first] > 0)
+        channel[first] = np.where(same, strength, -strength)
     return output
 
 
@@ -126,10 +124,19 @@ def test_noise_in_single_pairs_changes_nothing():
     labels[10:40, 10:35] = 1
     labels[10:40, 35:60] = 2
     output = output_of(labels, 2.0)
-    output[6:] += rng.normal(0, 1.5, output[6:].shape).astype(np.float32)
+    output[3:] += rng.normal(0, 1.5, output[3:].shape).astype(np.float32)
     found = part(output, np.ones(labels.shape, bool))
     sizes = np.sort(np.bincount(found[labels > 0]))[::-1]
     assert sizes[:2].min() > 0.95 * 30 * 25
+
+
+@pytest.mark.parametrize("step", [(0, 1), (3, -3), (20, 0), (8, 8), (50, 0), (0, -70)])
+def test_pairs_are_a_step_apart(step):
+    rows, columns = np.indices((40, 60))
+    first, second = pair_slices((40, 60), *step)
+    assert rows[first].shape == (max(0, 40 - step[0]), max(0, 60 - abs(step[1])))
+    assert (rows[second] - rows[first] == step[0]).all()
+    assert (columns[second] - columns[first] == step[1]).all()
 
 
 def test_edges_follow_the_depth():

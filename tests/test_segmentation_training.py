@@ -31,7 +31,6 @@ from nextview.recognition.model_card import find_card
 from nextview.segmentation.features import SmallPicture
 from nextview.segmentation.network import (
     AFFINITY_STEPS,
-    OFFSET_FACTOR,
     load_network,
     new_card,
     read_segmentation_card,
@@ -91,7 +90,6 @@ def test_what_is_learned_of_a_picture():
     labels = np.full((20, 30), SURFACE, np.int16)
     labels[4:8, 5:11] = 0
     labels[4:8, 11:14] = 1
-    labels[15, 20] = 2  # too small to learn its middle
     slopes = [np.linspace(-0.3, 0.3, size, dtype=np.float32) for size in (30, 20)]
     picture = SmallPicture(np.full((20, 30), 2.0, np.float32), tuple(slopes), 1)
     example = Example.of(picture, labels, None)
@@ -99,16 +97,16 @@ def test_what_is_learned_of_a_picture():
     assert example.features.shape[1:] == example.classes.shape == (32, 32)
     assert (example.classes[20:] == -1).all()
     assert example.classes[[0, 4, 4], [0, 5, 11]].tolist() == [1, 2, 2]
-    middle = slopes[0][
-        5:11
-    ].mean()  # of x at z = 1; the median depth is 2, so offsets are halved
-    assert example.offsets[0, 5, 6] == pytest.approx(middle - slopes[0][6])
-    weighed = np.unique(labels[example.offset_weights[:20, :30] > 0])
-    assert weighed.tolist() == [0, 1]
-
-    right = AFFINITY_STEPS.index((0, 4))
-    assert example.same[right, 5, 5:11].tolist() == [1, 1, 0, 0, 0, 0]
-    assert example.compared[right, 5, [0, 1, 10, 13, 14]].tolist() == [0, 1, 1, 1, 0]
+    right = AFFINITY_STEPS.index((0, 3))
+    assert example.same[right, 5, 5:11].tolist() == [1, 1, 1, 0, 0, 0]
+    large, small = (
+        24**-0.5,
+        12**-0.5,
+    )  # by the pixels of a thing; the smaller one counts
+    np.testing.assert_allclose(
+        example.compared[right, 5, [0, 5, 9, 11, 13]],
+        [0, large, small, 0, 0],
+    )
 
 
 @pytest.fixture(scope="module")
@@ -137,13 +135,6 @@ def test_a_varied_frame_is_of_the_same_world(drawn):
         ]
         assert any(flips)
         mirrored.add(flips[1])
-        # where a pixel is and where the middle of its thing lies from it: one place for each thing
-        place = (varied.features[1:4] + varied.offsets)[:, :rows, :columns]
-        labels = frames.labels[seed % 4]
-        labels = labels[:, ::-1] if flips[1] else labels
-        for thing in np.unique(labels[labels >= 0]):
-            own = (labels == thing) & (varied.offset_weights[:rows, :columns] > 0)
-            assert not own.any() or np.ptp(place[:, own], axis=1).max() < 1e-4
         # gravity points nearly where it did, also in a mirror
         if varied.features[13].any():
             before, after = (
@@ -240,7 +231,6 @@ def test_scores_of_outputs_that_are_right_and_wrong(drawn):
     right = np.concatenate(
         [
             classes[:, None] == np.arange(3)[:, None, None],
-            OFFSET_FACTOR * np.stack([example.offsets for example in examples]),
             2 * np.stack([example.same for example in examples]) - 1,
         ],
         1,
@@ -248,17 +238,14 @@ def test_scores_of_outputs_that_are_right_and_wrong(drawn):
     assert output_scores(right, examples) == {
         "class_accuracy": 1,
         "thing_iou": 1,
-        "offset_error": 0,
         "pair_accuracy": 1,
     }
     wrong = right.copy()
     wrong[:, :3] = right[:, [1, 2, 0]]
-    wrong[:, 3] += 0.3 * OFFSET_FACTOR
-    wrong[:, 6:] *= -1
+    wrong[:, 3:] *= -1
     assert output_scores(wrong, examples) == {
         "class_accuracy": 0,
         "thing_iou": 0,
-        "offset_error": pytest.approx(0.3, abs=1e-3),
         "pair_accuracy": 0,
     }
 
@@ -358,7 +345,7 @@ def test_the_file_answers_as_the_network(run, exported, shape):
     with torch.no_grad():
         expected = network(torch.from_numpy(padded)[None])[0].numpy()
     answer = load_network(exported)(seen)
-    assert answer.shape == (12, *shape)
+    assert answer.shape == (15, *shape)
     assert answer.dtype == np.float32
     assert np.abs(answer - expected[:, : shape[0], : shape[1]]).max() < 0.01
 

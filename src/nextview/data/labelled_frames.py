@@ -29,10 +29,9 @@ from nextview.segmentation.features import SIDE_MULTIPLE, SmallPicture, features
 from nextview.segmentation.network import (
     AFFINITY_OUTPUTS,
     AFFINITY_STEPS,
-    OFFSET_FACTOR,
-    OFFSET_OUTPUTS,
     OUTPUT_CLASSES,
 )
+from nextview.segmentation.parting import pair_slices
 from nextview.simulation.solids import Solid
 from nextview.simulation.worlds import (
     BACKGROUND,
@@ -49,6 +48,8 @@ from nextview.types import Float, Float32, Index, Mask
 FRAME_SHAPE = (120, 160)  # rows and columns
 FRAMES_OF_A_FILE = 400  # at most
 VIEWS_OF_A_WORLD = 2
+FEW_PIXELS = 0.06  # of things; most frames with fewer teach little and are dropped
+FEW_KEPT = 0.35  # share of these that are kept
 # of each frame: solids that its file draws things from, and meshes among them
 SHAPES_PER_FRAME = 0.35
 TOYS_PER_FRAME = 0.15
@@ -57,7 +58,7 @@ FEWEST_SHAPES = 6
 FARTHEST_LEARNED = 6.5  # metres
 STORED_DEPTH_STEP = 1e-4  # metres, of the depth in files
 UNKNOWN_CLASS = -1  # of a pixel without depth
-SMALLEST_TAUGHT = 8  # pixels of a thing whose middle is learned
+SMALLEST_TAUGHT = 8  # pixels of a thing that weighs most for each of them
 UP_NOISE = 0.03  # of a direction against gravity that an arm reports
 CLASS_OF = {  # by label; things have labels from 0 on
     HOLE: UNKNOWN_CLASS,
@@ -216,7 +217,11 @@ def draw_file(meshes: WorldMeshes, file: FrameFile) -> None:
     while len(frames) < file.frames:
         world = draw_world(shapes, furniture, rng)
         if world.things:
-            frames += photograph(world, rng, FRAME_SHAPE, VIEWS_OF_A_WORLD)
+            frames += [
+                frame
+                for frame in photograph(world, rng, FRAME_SHAPE, VIEWS_OF_A_WORLD)
+                if (frame.labels >= 0).mean() > FEW_PIXELS or rng.random() < FEW_KEPT
+            ]
     LabelledFrames.of(frames[: file.frames]).save(file.path)
 
 
@@ -342,17 +347,14 @@ class Example:
     Attributes:
         features: input, see ``segmentation.features``, (C, h, w) float32.
         classes: index in OUTPUT_CLASSES, UNKNOWN_CLASS without depth, (h, w) int64.
-        offsets: to the middle of the pixel's thing, median depths, (3, h, w) float32.
-        offset_weights: of these; 0 where nothing is to be learned, (h, w) float32.
-        same: for each of AFFINITY_STEPS, whether the other pixel is of the same thing, (6, h, w)
+        same: for each of AFFINITY_STEPS, whether the other pixel is of the same thing, (12, h, w)
             float32.
-        compared: whether that is to be learned, (6, h, w) float32.
+        compared: weight of what is learned of each pair, 0 unless both are of things, (12, h, w)
+            float32.
     """
 
     features: Float32
     classes: Index
-    offsets: Float32
-    offset_weights: Float32
     same: Float32
     compared: Float32
 
@@ -368,10 +370,10 @@ class Example:
         classes = np.full(labels.shape, OUTPUT_CLASSES.index("thing"))
         for label, number in CLASS_OF.items():
             classes[labels == label] = number
-        offsets, weights = _offsets(picture, labels)
-        pairs = [_pairs(labels, *step) for step in AFFINITY_STEPS]
+        weights = pair_weights(labels)
+        pairs = [_pairs(labels, weights, *step) for step in AFFINITY_STEPS]
         same, compared = np.stack(pairs, 1).astype(np.float32)
-        whole = features(picture, up), classes, offsets, weights, same, compared
+        whole = features(picture, up), classes, same, compared
         return cls(
             *(
                 _padded(values, UNKNOWN_CLASS if values is classes else 0)
@@ -387,35 +389,30 @@ def _padded(values: NDArray, value: int) -> NDArray:
     return np.pad(values, sides, constant_values=value)
 
 
-def _offsets(picture: SmallPicture, labels: NDArray) -> tuple[Float32, Float32]:
-    """Offsets to the middles of things, (3, h, w), and their weights, (h, w).
+def pair_weights(labels: NDArray) -> Float32:
+    """Weights of the pixels of things, (h, w): a small thing's pixel weighs more than a large one's.
 
-    A thing of few pixels weighs less than a large one, but each of its pixels more.
+    Args:
+        labels: see ``simulation.worlds.LabelledFrame``, (h, w).
     """
-    offsets = np.zeros((3, *labels.shape), np.float32)
     weights = np.zeros(labels.shape, np.float32)
     inside = labels >= 0
     if inside.any():
         own = labels[inside]
-        points = picture.points[inside]
-        count = np.bincount(own)
-        sums = np.stack([np.bincount(own, values) for values in points.T], 1)
-        middles = sums / np.maximum(count, 1)[:, None]
-        scale = np.median(picture.depth[picture.depth > 0])
-        offsets[:, inside] = ((middles[own] - points) / scale).T
-        weights[inside] = np.where(count[own] >= SMALLEST_TAUGHT, count[own] ** -0.5, 0)
-    return offsets, weights
+        weights[inside] = np.maximum(np.bincount(own)[own], SMALLEST_TAUGHT) ** -0.5
+    return weights
 
 
-def _pairs(labels: NDArray, down: int, right: int) -> tuple[Mask, Mask]:
-    """Whether each pixel and one farther on are of one thing, and whether one of them is of one."""
-    height, width = labels.shape
-    here = np.s_[: height - down, : width - right]
-    first, second = labels[here], labels[down:, right:]
+def _pairs(
+    labels: NDArray, weights: Float32, down: int, right: int
+) -> tuple[Mask, Float32]:
+    """Whether each pixel and one farther on are of one thing, and how much that counts."""
+    first, second = pair_slices(labels.shape, down, right)
     same = np.zeros(labels.shape, bool)
-    compared = np.zeros(labels.shape, bool)
-    same[here] = (first == second) & (first >= 0)
-    compared[here] = ((first >= 0) | (second >= 0)) & (first > HOLE) & (second > HOLE)
+    compared = np.zeros(labels.shape, np.float32)
+    same[first] = (labels[first] == labels[second]) & (labels[first] >= 0)
+    both = (labels[first] >= 0) & (labels[second] >= 0)
+    compared[first] = np.where(both, np.maximum(weights[first], weights[second]), 0)
     return same, compared
 
 
@@ -423,14 +420,13 @@ def output_scores(outputs: Float32, examples: Sequence[Example]) -> dict[str, fl
     """Judge a network's outputs.
 
     Args:
-        outputs: for the frames, (N, 12, h, w).
+        outputs: for the frames, (N, 15, h, w).
         examples: the frames.
 
     Returns:
         ``class_accuracy``, the share of pixels whose class is right, mean of the classes;
-        ``thing_iou``, the intersection over union of the pixels of things; ``offset_error``, the
-        median length of the error of offsets, median depths; ``pair_accuracy``, the share of pairs
-        that are rightly called of one thing or not, mean of both and of the steps.
+        ``thing_iou``, the intersection over union of the pixels of things; ``pair_accuracy``, the
+        share of pairs that are rightly called of one thing or not, mean of both and of the steps.
     """
     classes = np.stack([example.classes for example in examples])
     taken = outputs[:, : len(OUTPUT_CLASSES)].argmax(1)
@@ -439,11 +435,6 @@ def output_scores(outputs: Float32, examples: Sequence[Example]) -> dict[str, fl
     thing = OUTPUT_CLASSES.index("thing")
     both = (taken == thing) & (classes == thing)
     either = ((taken == thing) & (classes != UNKNOWN_CLASS)) | (classes == thing)
-
-    wanted = np.stack([example.offsets for example in examples])
-    weights = np.stack([example.offset_weights for example in examples])
-    missed = outputs[:, OFFSET_OUTPUTS] / OFFSET_FACTOR - wanted
-    length = np.linalg.norm(missed, axis=1)[weights > 0]
 
     same = np.stack([example.same for example in examples]) > 0
     compared = np.stack([example.compared for example in examples]) > 0
@@ -456,6 +447,5 @@ def output_scores(outputs: Float32, examples: Sequence[Example]) -> dict[str, fl
     return {
         "class_accuracy": round(float(np.mean(right)), 4),
         "thing_iou": round(float(both.sum() / max(either.sum(), 1)), 4),
-        "offset_error": round(float(np.median(length)) if len(length) else 0.0, 4),
         "pair_accuracy": round(float(np.mean(pairs)) if pairs else 0.0, 4),
     }

@@ -19,12 +19,23 @@ OUTPUT_CLASSES = (
     "surface",
     "thing",
 )  # log-odds of each, the first outputs
-OFFSET_FACTOR = 10.0  # outputs in a median depth, of the offsets that follow
 # rows and columns from a pixel to those of which the last outputs say whether they are of its thing
-AFFINITY_STEPS = ((0, 1), (1, 0), (0, 4), (4, 0), (0, 10), (10, 0))
-OFFSET_OUTPUTS = slice(len(OUTPUT_CLASSES), len(OUTPUT_CLASSES) + 3)
-AFFINITY_OUTPUTS = slice(OFFSET_OUTPUTS.stop, OFFSET_OUTPUTS.stop + len(AFFINITY_STEPS))
-OUTPUTS = AFFINITY_OUTPUTS.stop
+AFFINITY_STEPS = (
+    (0, 1),
+    (1, 0),
+    (0, 3),
+    (3, 0),
+    (3, 3),
+    (3, -3),
+    (0, 8),
+    (8, 0),
+    (8, 8),
+    (8, -8),
+    (0, 20),
+    (20, 0),
+)
+OUTPUTS = len(OUTPUT_CLASSES) + len(AFFINITY_STEPS)
+AFFINITY_OUTPUTS = slice(len(OUTPUT_CLASSES), OUTPUTS)
 
 
 class SegmentationCard(
@@ -36,16 +47,14 @@ class SegmentationCard(
 ):
     """The card of a segmentation network: a JSON file beside its ONNX file.
 
-    The outputs are, in this order: the log-odds of each class; the offset to the middle of the
-    pixel's thing in the camera's axes, in median depths of the picture times ``offset_factor``; and
-    for each step the log-odds that the pixel so many rows and columns on is of the same thing.
+    The outputs are, in this order: the log-odds of each class; and for each step the log-odds that
+    the pixel so many rows and columns on is of the same thing, if both are of things.
 
     Attributes:
         name: of the network.
         sha256: of the ONNX file.
         channels: of its input, see ``features.features``.
         classes: in the order of the first outputs.
-        offset_factor: outputs in a median depth.
         affinity_steps: rows and columns to the other pixel of each pair.
         network: in words.
         data: what it was trained on, in words.
@@ -61,7 +70,6 @@ class SegmentationCard(
     sha256: HashText
     channels: int
     classes: tuple[str, ...]
-    offset_factor: float
     affinity_steps: tuple[tuple[int, int], ...]
     network: str = ""
     data: str = ""
@@ -75,7 +83,7 @@ class SegmentationCard(
     @property
     def meaning(self) -> tuple[Any, ...]:
         """What a network has to have in common with this version of the package."""
-        return self.channels, self.classes, self.offset_factor, self.affinity_steps
+        return self.channels, self.classes, self.affinity_steps
 
 
 def new_card(name: str, sha256: str) -> SegmentationCard:
@@ -90,7 +98,6 @@ def new_card(name: str, sha256: str) -> SegmentationCard:
         sha256,
         PICTURE_CHANNELS,
         OUTPUT_CLASSES,
-        OFFSET_FACTOR,
         AFFINITY_STEPS,
     )
 
@@ -124,7 +131,7 @@ def write_segmentation_card(path: Path, card: SegmentationCard) -> None:
 
 
 class SegmentationNetwork:
-    """Says of each pixel what it is, where the middle of its thing lies, and what belongs to it.
+    """Says of each pixel what it is, and which others are of the same thing.
 
     Attributes:
         card: what its card says.
@@ -161,7 +168,7 @@ class SegmentationNetwork:
             features: see ``features.features``, (C, h, w).
 
         Returns:
-            The outputs, (12, h, w) float32, see ``SegmentationCard``.
+            The outputs, (15, h, w) float32, see ``SegmentationCard``.
 
         Raises:
             ModelError: the network fails.

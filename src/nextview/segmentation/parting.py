@@ -22,7 +22,7 @@ LIMIT_OF_ODDS = 4.0  # log-odds of one pair beyond which it says no more
 EDGE_SHARPNESS = (
     60.0  # steps of a sixtieth of the depth count as much as a pixel of the picture
 )
-CERTAIN_ODDS = 2.0  # of neighbours that are joined before all others
+CERTAIN_ODDS = 2.0  # of all neighbours around a pixel, to be joined before all others
 
 
 def part(output: Float32, valid: Mask) -> Index:
@@ -33,7 +33,7 @@ def part(output: Float32, valid: Mask) -> Index:
     edge contraction: Keuper et al., ICCV 2015).
 
     Args:
-        output: of the network, (12, h, w).
+        output: of the network, (15, h, w).
         valid: pixels with depth, (h, w) bool.
 
     Returns:
@@ -42,21 +42,20 @@ def part(output: Float32, valid: Mask) -> Index:
     thing = valid & (output[: len(OUTPUT_CLASSES)].argmax(0) == THING_CLASS)
     size = thing.size
     at = np.arange(size).reshape(thing.shape)
+    certain = _certain(output[AFFINITY_OUTPUTS])
     ends = []
     odds = []
-    near = []
-    for values, (down, right) in zip(
-        output[AFFINITY_OUTPUTS], AFFINITY_STEPS, strict=True
-    ):
-        first = np.s_[: thing.shape[0] - down, : thing.shape[1] - right]
-        second = np.s_[down:, right:]
+    joining = []
+    for values, step in zip(output[AFFINITY_OUTPUTS], AFFINITY_STEPS, strict=True):
+        first, second = pair_slices(thing.shape, *step)
         both = thing[first] & thing[second]
         ends.append(np.stack([at[first][both], at[second][both]]))
         odds.append(np.clip(values[first][both], -LIMIT_OF_ODDS, LIMIT_OF_ODDS))
-        near.append(np.full(np.count_nonzero(both), down + right == 1))
+        near = (certain[first] & certain[second])[both]
+        joining.append(near if sum(map(abs, step)) == 1 else np.zeros_like(near))
     pairs = np.concatenate(ends, 1)
     weight = np.concatenate(odds)
-    joined = np.concatenate(near) & (weight > CERTAIN_ODDS)
+    joined = np.concatenate(joining)
 
     graph = coo_array((np.ones(joined.sum()), pairs[:, joined]), shape=(size, size))
     component = connected_components(graph, directed=False)[1].astype(np.int64)
@@ -67,6 +66,34 @@ def part(output: Float32, valid: Mask) -> Index:
         region = region + 1
     label = _contracted(region[pairs], weight, int(region.max(initial=0)) + 1)
     return label[region].reshape(thing.shape)
+
+
+def pair_slices(
+    shape: tuple[int, ...], down: int, right: int
+) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Where the first pixels of all pairs with a step lie in a picture, and the second ones.
+
+    Args:
+        shape: rows and columns of the picture.
+        down: rows of the step, not negative.
+        right: columns of the step.
+    """
+    height, width = shape
+    left = max(0, -right)
+    first = np.s_[: max(0, height - down), left : max(left, width - max(0, right))]
+    start = left + right
+    second = np.s_[down:, start : start + max(0, width - abs(right))]
+    return first, second
+
+
+def _certain(odds: Float32) -> Mask:
+    """Pixels around which all pairs of neighbours are clearly of one thing, (h, w) bool.
+
+    Args:
+        odds: log-odds of each of AFFINITY_STEPS, (S, h, w).
+    """
+    near = [k for k, step in enumerate(AFFINITY_STEPS) if sum(map(abs, step)) == 1]
+    return ndimage.minimum_filter(odds[near].min(0), 3) > CERTAIN_ODDS
 
 
 def _contracted(

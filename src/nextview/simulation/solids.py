@@ -49,6 +49,8 @@ def random_solid(rng: Generator, size: float) -> Solid:
         gear,
         tool,
         tool,
+        frame,
+        frame,
         lump,
         bent_lump,
         plate,
@@ -421,6 +423,30 @@ def tool(rng: Generator) -> Solid:
         head = moved(grip, Rotation.from_euler("z", rng.uniform(8, 35), degrees=True))
         head = head[0] - [length, 0, 0], head[1]
     return joined([grip, moved(head, by=(length, 0, 0))])
+
+
+def frame(rng: Generator) -> Solid:
+    """Something thin that goes round a hole: a ring, a clamp, a tray's rim, a coat hanger."""
+    kind = rng.random()
+    if kind < 0.3:  # flat: a washer, a picture frame
+        sides = int(rng.choice([4, 6, 32]))
+        inner = 0.5 * rng.uniform(0.5, 0.9)
+        rings = [ring_points(0.5, sides), ring_points(inner, sides)]
+        return extruded(rings, rng.uniform(0.02, 0.15))
+    sides = int(rng.choice([3, 4, TUBE_STEPS, 2 * TUBE_STEPS]))
+    whole = rng.random() < 0.5
+    angles = np.linspace(0, 2 * np.pi * (1 if whole else rng.uniform(0.4, 0.9)), sides)
+    corners = 0.5 * np.c_[np.cos(angles), np.sin(angles), 0 * angles]
+    corners[:, 1] *= rng.uniform(0.3, 1.0)
+    between = np.linspace(0, len(corners) - 1, 3 * TUBE_STEPS)
+    path = np.stack(
+        [np.interp(between, np.arange(len(corners)), axis) for axis in corners.T], 1
+    )
+    bow = tube(path, np.full(len(path), rng.uniform(0.015, 0.07)))
+    if kind < 0.6:
+        return bow
+    stem = np.linspace([0.5, 0, 0], [rng.uniform(0.8, 1.6), rng.normal(0, 0.1), 0], 6)
+    return joined([bow, tube(stem, np.full(6, rng.uniform(0.015, 0.06)))])
 
 
 def lump(rng: Generator) -> Solid:

@@ -34,6 +34,13 @@ HOLE = -3  # label of a pixel without depth
 
 MAP_CELLS = 160  # cells on each side of a height map
 DROPS_TRIED = 25
+CONTACT_RAYS = (
+    1500  # by which it is found how far a solid can be pushed, from each side
+)
+STACKED = 0.5  # share of piled things that are put on the last one
+ALIGNED = (
+    0.4  # share of levels whose things are turned by quarters, so that their sides meet
+)
 STEPS_OUTWARDS = 60
 LEAST_STABLE = 0.03  # share of throws of a resting pose, at least
 LARGEST_SHAPE = 20_000  # triangles
@@ -45,7 +52,8 @@ class Shape:
 
     Attributes:
         solid: vertices, (V, 3), metres, and triangles, (F, 3).
-        resting: rotations into its stable poses, (P, 3, 3), at least one.
+        resting: rotations into its stable poses, (P, 3, 3), at least one; their outlines' longest
+            rectangles lie along x and y.
     """
 
     solid: Solid
@@ -62,8 +70,25 @@ class Shape:
             poses, shares = compute_stable_poses(hull, n_samples=1)
         except (QhullError, ValueError):  # flat or degenerate: as it is drawn
             return cls(solid, np.eye(3)[None])
-        likely = shares > LEAST_STABLE
-        return cls(solid, poses[likely][:, :3, :3] if likely.any() else np.eye(3)[None])
+        likely = poses[shares > LEAST_STABLE][:, :3, :3]
+        if not len(likely):
+            return cls(solid, np.eye(3)[None])
+        corners = np.asarray(hull.vertices)
+        return cls(solid, np.stack([_squared(turn, corners) for turn in likely]))
+
+
+def _squared(turn: Float, corners: Float) -> Float:
+    """Turn on about z, so that the smallest rectangle around an outline lies along x and y.
+
+    Args:
+        turn: rotation, (3, 3).
+        corners: of a solid, (N, 3).
+    """
+    from trimesh.bounds import oriented_bounds_2D
+
+    on = np.eye(3)
+    on[:2, :2] = oriented_bounds_2D((corners @ turn.T)[:, :2])[0][:2, :2]
+    return on @ turn
 
 
 @dataclass(eq=False)
@@ -122,6 +147,7 @@ class HeightMap:
         self.level = level
         self.reach = side / 2 if inside is None else inside
         self.heights = np.full((MAP_CELLS, MAP_CELLS), level)
+        self.last = self.centre
 
     def drop(
         self,
@@ -131,6 +157,8 @@ class HeightMap:
         gap: float,
         spread: float,
         ceiling: float = np.inf,
+        beside: Sequence[Solid] = (),
+        axes: Float | None = None,
     ) -> Solid | None:
         """Lower a solid until it touches something.
 
@@ -141,6 +169,9 @@ class HeightMap:
             gap: metres kept from others where it may not.
             spread: metres from the middle within which it is put.
             ceiling: height that it must not reach, metres.
+            beside: others on the level, to one of which it is pushed until they touch; not where it
+                may lie on them.
+            axes: horizontal directions along which it is pushed, (A, 3); None for any.
 
         Returns:
             The solid in place; None where there is no room.
@@ -173,9 +204,18 @@ class HeightMap:
             rise = float((here[there] - bottom[there]).max())
             if rise + high[2] > ceiling:
                 continue
-            here[there] = np.maximum(here, rise + top)[there]
             corner = self.low + at * self.cell
-            return vertices + np.append(corner - low[:2], rise), faces
+            placed = vertices + np.append(corner - low[:2], rise), faces
+            if beside and not piled:
+                pushed = _pushed(placed, beside, axes)
+                moved_by = np.rint((pushed[0] - placed[0])[0, :2] / self.cell)
+                below = self._cells(at + moved_by.astype(int), there.shape)
+                if below is not None:
+                    here = below
+                    placed = pushed
+            here[there] = np.maximum(here, rise + top)[there]
+            self.last = placed[0].mean(0)[:2]
+            return placed
         return None
 
     def _places(self, rng: Generator, piled: bool, spread: float) -> Iterator[Float]:
@@ -183,6 +223,8 @@ class HeightMap:
         angle = rng.uniform(0, 2 * np.pi)
         start = self.centre + rng.normal(0, spread / 2, 2)
         if piled:
+            if rng.random() < STACKED:
+                yield self.last + rng.normal(0, 0.06, 2) * spread
             for _ in range(DROPS_TRIED):
                 yield self.centre + rng.uniform(-1, 1, 2) * spread
             return
@@ -218,6 +260,35 @@ class HeightMap:
         lower = low[2] - 1 + caster.cast(below, up)[0]
         upper = high[2] + 1 - caster.cast(above, -up)[0]
         return lower.reshape(count), upper.reshape(count)
+
+
+def _pushed(solid: Solid, others: Sequence[Solid], axes: Float | None) -> Solid:
+    """Push a solid horizontally until it touches one of some others.
+
+    Args:
+        solid: in place, apart from the others.
+        others: in place.
+        axes: directions along which it may be pushed, (A, 3); None for any.
+    """
+    vertices, faces = solid
+    middles = np.array([other[0].mean(0) for other in others])
+    ways = (middles - vertices.mean(0)) * [1, 1, 0]
+    way = ways[int(np.linalg.norm(ways, axis=1).argmin())]
+    if axes is not None:
+        way = axes[int((axes @ way).argmax())]
+    length = np.linalg.norm(way)
+    if length < 1e-6:
+        return solid
+
+    way = way / length
+    ends = vertices[:: max(1, len(vertices) // CONTACT_RAYS)]
+    back = np.concatenate([other[0] for other in others])
+    back = back[:: max(1, len(back) // CONTACT_RAYS)]
+    free = min(
+        float(RayCaster(others).cast(ends, np.tile(way, (len(ends), 1)))[0].min()),
+        float(RayCaster([solid]).cast(back, np.tile(-way, (len(back), 1)))[0].min()),
+    )
+    return (vertices + free * way, faces) if np.isfinite(free) else solid
 
 
 def slab(
@@ -321,7 +392,7 @@ def _level(
     ground = HeightMap(
         2 * min(reach, 14 * scale), np.zeros(2), 0.0, min(reach, 10 * scale)
     )
-    gap = scale * float(rng.choice([0.0, 0.0, 0.1, 0.3, 1.0]))
+    gap = scale * float(rng.choice([0.0, 0.0, 0.0, 0.1, 0.3, 1.0]))
     _fill(
         world,
         ground,
@@ -329,7 +400,7 @@ def _level(
         rng,
         _number(rng),
         gap,
-        float(rng.choice([0, 0, 0.15, 0.5])),
+        float(rng.choice([0, 0.2, 0.4, 0.7])),
     )
     _hands(world, rng)
     return world
@@ -478,6 +549,11 @@ def _fill(
         ceiling: height below which they stay.
     """
     alike = rng.random() < 0.2  # of one kind: rows of boxes, a bin of one part
+    base = rng.uniform(0, 2 * np.pi)
+    aligned = rng.random() < ALIGNED
+    quarters = base + np.arange(4) * np.pi / 2
+    axes = np.c_[np.cos(quarters), np.sin(quarters), np.zeros(4)]
+    beside: list[Solid] = []
     chosen = int(rng.integers(len(shapes)))
     size = world.scale
     free = rng.random() < 0.3
@@ -491,14 +567,26 @@ def _fill(
         )
         if free and rng.random() < 0.5:
             turn = Rotation.random(random_state=rng)
-        turn = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)) * turn
+        yaw = rng.choice(quarters) if aligned else rng.uniform(0, 2 * np.pi)
+        turn = Rotation.from_euler("z", yaw) * turn
         solid = turn.apply(shape.solid[0] * size), shape.solid[1]
-        spread = min(ground.reach, world.scale * rng.uniform(0.5, 2.5) * np.sqrt(count))
+        spread = min(ground.reach, world.scale * rng.uniform(0.3, 2.0) * np.sqrt(count))
+        on_others = bool(rng.random() < piled)
+        near = () if gap or rng.random() < 0.3 else beside
         dropped = ground.drop(
-            solid, rng, bool(rng.random() < piled), gap, spread, ceiling
+            solid,
+            rng,
+            on_others,
+            gap,
+            spread,
+            ceiling,
+            near,
+            axes if aligned else None,
         )
         if dropped is not None:
             world.add(dropped, world.things)
+            if not on_others:
+                beside.append(dropped)
 
 
 def _bin(
@@ -663,7 +751,7 @@ def _camera_pose(world: World, rng: Generator, sensor: Sensor) -> Float:
     if world.yaw is not None:
         azimuth = world.yaw + rng.uniform(-0.9, 0.9)
     near = 3.0 if world.scale < 0.5 else 1.8
-    distance = float(np.clip(world.scale * rng.uniform(near, 4 * near), 0.22, 5.5))
+    distance = float(np.clip(world.scale * near * 3.3 ** rng.random(), 0.22, 5.5))
     pose = look_at_origin(np.array([elevation]), np.array([azimuth]), distance)[0]
     aside = world.scale * np.array([1.2, 1.2, 0.3]) * rng.normal(0, 1, 3)
     if world.scale > 0.5:

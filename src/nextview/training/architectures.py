@@ -444,16 +444,15 @@ class SegmentationNet(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        twice = 2 * width
         self.e1 = Convolutions(4 * PICTURE_CHANNELS, width)
-        self.e2 = Convolutions(width, twice)
-        self.e3 = Convolutions(twice, twice)
-        self.e4 = Convolutions(twice, twice)
-        self.e5 = Convolutions(twice, twice, 2)
-        self.d3 = Convolutions(2 * twice, twice)
-        self.d2 = Convolutions(2 * twice, twice)
-        self.d1 = Convolutions(width + twice, twice)
-        self.o = nn.Conv2d(twice, 4 * OUTPUTS, 1)
+        self.e2 = Convolutions(width, 2 * width)
+        self.e3 = Convolutions(2 * width, 3 * width)
+        self.e4 = Convolutions(3 * width, 4 * width)
+        self.e5 = Convolutions(4 * width, 4 * width, 2)
+        self.d3 = Convolutions(7 * width, 3 * width)
+        self.d2 = Convolutions(5 * width, 2 * width)
+        self.d1 = Convolutions(3 * width, width)
+        self.o = nn.Conv2d(width, 4 * OUTPUTS, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         fine = self.e1(F.pixel_unshuffle(x, 2))

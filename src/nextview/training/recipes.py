@@ -262,7 +262,7 @@ class SegmentationRecipe:
 
     Attributes:
         frames: simulated frames to learn from.
-        width: channels of the first layers; the others have twice as many.
+        width: channels of the first layers; the deeper ones have up to four times as many.
         epochs: passes over the frames.
         batch: frames per step.
         lr: peak learning rate of AdamW; it rises over the first steps and falls as a cosine.

@@ -21,8 +21,6 @@ from nextview.data.labelled_frames import (
 from nextview.data.progress import TrackProgress, silently
 from nextview.segmentation.network import (
     AFFINITY_OUTPUTS,
-    OFFSET_FACTOR,
-    OFFSET_OUTPUTS,
     OUTPUT_CLASSES,
 )
 from nextview.training.architectures import SegmentationNet
@@ -38,10 +36,8 @@ with extras():
 FILES_AT_ONCE = 6  # that are in memory, and whose frames are mixed
 WARM_UP = 200  # steps in which the learning rate rises, at most a tenth of all
 LAST_RATE = 0.01  # of the peak
-CLASS_WEIGHT = 2.0  # of the losses, beside that of pairs
-OFFSET_WEIGHT = 0.5
-SMALL_OFFSET = 0.5  # outputs; errors beyond it count linearly
-BORDER_WEIGHT = 3.0  # of pairs of different things or of none
+CLASS_WEIGHT = 2.0  # of its loss, beside that of pairs
+BORDER_WEIGHT = 4.0  # of pairs of different things, which are few
 LARGEST_GRADIENT = 5.0
 
 
@@ -106,32 +102,29 @@ def batch_of(examples: Sequence[Example]) -> tuple[Tensor, ...]:
 
 
 def segmentation_losses(output: Tensor, batch: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """Compute the losses of classes, offsets and pairs.
+    """Compute the losses of classes and pairs.
 
     Args:
-        output: of the network, (B, 12, h, w).
+        output: of the network, (B, 15, h, w).
         batch: see ``batch_of``.
 
     Returns:
-        Three scalars.
+        Two scalars.
     """
-    _, classes, offsets, weights, same, compared = batch
+    _, classes, same, compared = batch
     of_classes = F.cross_entropy(
         output[:, : len(OUTPUT_CLASSES)], classes, ignore_index=UNKNOWN_CLASS
     )
-    missed = (output[:, OFFSET_OUTPUTS] - OFFSET_FACTOR * offsets) / SMALL_OFFSET
-    lost = F.smooth_l1_loss(missed, torch.zeros_like(missed), reduction="none").sum(1)
-    of_offsets = (lost * weights).sum() / weights.sum().clamp(min=1e-6)
     lost = F.binary_cross_entropy_with_logits(
         output[:, AFFINITY_OUTPUTS], same, reduction="none"
     )
     lost = lost * (BORDER_WEIGHT + (1 - BORDER_WEIGHT) * same)
-    of_pairs = (lost * compared).sum() / compared.sum().clamp(min=1)
-    return of_classes, of_offsets, of_pairs
+    of_pairs = (lost * compared).sum() / compared.sum().clamp(min=1e-6)
+    return of_classes, of_pairs
 
 
 class SegmentationModule(L.LightningModule):
-    """AdamW on the losses of classes, offsets and pairs; validates on their sum."""
+    """AdamW on the losses of classes and pairs; validates on their sum."""
 
     def __init__(self, recipe: SegmentationRecipe, steps: int) -> None:
         super().__init__()
@@ -142,8 +135,8 @@ class SegmentationModule(L.LightningModule):
     def _loss(self, batch: Sequence[Tensor], prefix: str) -> Tensor:
         output = self.net(batch[0].to(memory_format=torch.channels_last)).float()
         parts = segmentation_losses(output, batch)
-        loss = CLASS_WEIGHT * parts[0] + OFFSET_WEIGHT * parts[1] + parts[2]
-        names = ("loss", "class_loss", "offset_loss", "pair_loss")
+        loss = CLASS_WEIGHT * parts[0] + parts[1]
+        names = ("loss", "class_loss", "pair_loss")
         self.log_dict(
             {
                 f"{prefix}{name}": value
