@@ -390,7 +390,7 @@ def _padded(values: NDArray, value: int) -> NDArray:
 
 
 def pair_weights(labels: NDArray) -> Float32:
-    """Weights of the pixels of things, (h, w): a small thing's pixel weighs more than a large one's.
+    """Weights of the pixels of things, (h, w); those of a small thing weigh more.
 
     Args:
         labels: see ``simulation.worlds.LabelledFrame``, (h, w).
