@@ -1,14 +1,16 @@
 """Taught things recognised by features alone and verified by their geometry, at true size.
 
-    python benchmarks/verified_things.py SCANS [--models ycb] [--draws 0 1] [--every 3] [--resting]
-        [--clutter 5] [--any-orientation] [--known even] [--save FOLDER]
+    python benchmarks/verified_things.py SCANS [--models ycb] [--draws 0 1] [--every 3]
+        [--poses thrown] [--clutter 5] [--any-orientation] [--known even] [--save FOLDER]
 
 SCANS holds the scans of the things that the memory knows, in metres, by their names: they are what
 is looked at. Surfaces, weights and views are those of the memory. Each draw shows every thing once,
 with an azimuth, views and errors of the sensor of its own. The camera stands five object radii
-away, between 25 cm from the surface and 45 cm from the centre. Things stand as they were scanned,
-or with ``--resting`` in any pose that they can rest in; with ``--clutter`` so many boxes stand
-around each, which hide parts of it. With ``--any-orientation`` they hang in the middle of a round
+away, between 25 cm from the surface and 45 cm from the centre. Things stand as they were scanned
+(``--poses scanned``), as they fall (``thrown``: on any face of the convex hull, as often as throws
+end on it) or as people stand them up (``stood``: the pose with the highest centre in which at least
+a thousandth of the throws end). With ``--clutter`` so many boxes stand around each, which hide
+parts of it. With ``--any-orientation`` they hang in the middle of a round
 room, turned at random about all axes, and are recognised as such; the error of the rotation, modulo
 the symmetries of the thing, stands in the place of those of azimuth and resting pose.
 
@@ -48,7 +50,7 @@ from nextview.errors import ResultsError, UsageError
 from nextview.files import command, read_record, write_record
 from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.observation import Observation
-from nextview.geometry.resting import rotated
+from nextview.geometry.resting import rotated, stable_poses
 from nextview.geometry.viewsphere import ViewSphere, rotation_z
 from nextview.recognition.model_card import Symmetry
 from nextview.simulation.scene import boxes_around
@@ -63,6 +65,10 @@ from nextview.things.weighing import EvidenceWeights
 Float = NDArray[np.float64]
 
 SPHERE = ViewSphere((0.0, 18.0, 36.0, 54.0, 72.0), 8)
+Poses = Literal["scanned", "thrown", "stood"]
+STABLE = (
+    0.001  # share of the throws that end in a pose in which people can stand a thing
+)
 CONFIDENT = 0.97
 REJECTED = 0.02  # p-value below which a thing is called unknown
 POINTS = 1000  # of a surface, for symmetries and ADD-S
@@ -100,14 +106,14 @@ class Setting:
     Attributes:
         sensor: what the views are taken with.
         views: how many views are taken.
-        resting: whether they rest in any pose that they can, and not only as they were scanned.
+        poses: how they rest: as they were scanned, as they fall, or as people stand them up.
         clutter: how many boxes stand around a thing.
         any_orientation: whether they hang in a room, turned at random about all axes.
     """
 
     sensor: str
     views: int
-    resting: bool
+    poses: Poses
     clutter: int
     any_orientation: bool
 
@@ -256,11 +262,6 @@ class Taught:
             known.residuals,
         )
 
-    def resting_poses(self, thing: int) -> Float:
-        """How the thing of this number can rest, rotations from the scan's axes, (N, 3, 3)."""
-        memory = self.recogniser.memory
-        return memory.rotations[memory.thing == thing].astype(np.float64)
-
     def things(self, some: NDArray[np.int64]) -> TaughtThings:
         """A recogniser of some of the things, as if the others had been removed."""
         residuals = self.residuals
@@ -307,9 +308,10 @@ def shown(
     rng = np.random.default_rng([thing, draw])
     turn = rotation_z(rng.uniform(0, 2 * np.pi))
     mesh = taught.meshes[thing]
-    if setting.resting:
-        poses = np.random.default_rng([thing, draw, 1])
-        turn = turn @ poses.choice(taught.resting_poses(thing))
+    if setting.poses != "scanned":
+        turn = turn @ lying(
+            mesh, setting.poses, np.random.default_rng([thing, draw, 1])
+        )
     if setting.any_orientation:
         drawn = Rotation.random(rng=np.random.default_rng([thing, draw, 3])).as_matrix()
         turn = drawn if held is None else held
@@ -359,6 +361,15 @@ def shown(
         in_cameras,
         seconds,
     )
+
+
+def lying(mesh: Mesh, poses: Poses, rng: np.random.Generator) -> Float:
+    """A rotation into a pose in which a thing was thrown or stood up, (3, 3)."""
+    stable = stable_poses(mesh)
+    if poses == "thrown":
+        return stable.rotations[rng.choice(len(stable.shares), p=stable.shares)]
+    high = [-(mesh.vertices @ turn[2]).min() for turn in stable.rotations]
+    return stable.rotations[int(np.where(stable.shares >= STABLE, high, 0).argmax())]
 
 
 def room_around(mesh: Mesh) -> Mesh:
@@ -620,7 +631,7 @@ def main(
     sensor: str = "wrist",
     every: int = 1,
     known: Literal["all", "even", "odd"] = "all",
-    resting: bool = False,
+    poses: Poses = "scanned",
     clutter: int = 0,
     any_orientation: bool = False,
     save: Path | None = None,
@@ -635,13 +646,13 @@ def main(
         sensor: what the views are taken with.
         every: show every so many things only.
         known: which of the things are taught; all are shown.
-        resting: show things in any pose that they can rest in.
+        poses: show things as they were scanned, as they fall, or as people stand them up.
         clutter: number of boxes around each thing.
         any_orientation: show things that hang in a room, turned at random about all axes.
         save: folder in which the draws that are done are kept, and looked for.
     """
     taught = Taught.load(models, scans)
-    setting = Setting(sensor, max(views), resting, clutter, any_orientation)
+    setting = Setting(sensor, max(views), poses, clutter, any_orientation)
     everything = np.arange(len(taught.names))
     some = {"all": everything, "even": everything[::2], "odd": everything[1::2]}[known]
     things = taught.things(some)

@@ -5,7 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from test_verification import VIEWS, l_block, mesh_of, off_by, verifier_of
+from test_verification import (
+    VIEWS,
+    even_belief,
+    l_block,
+    mesh_of,
+    off_by,
+    standing_view,
+    verifier_of,
+)
 
 from nextview.errors import ObservationError
 from nextview.geometry.mesh import Mesh
@@ -17,7 +25,6 @@ from nextview.things.view_templates import (
     TEMPLATE_SIDE,
     TURNS,
     Pictures,
-    ViewTemplates,
     looking_from,
     mismatch,
     seen,
@@ -36,7 +43,7 @@ def verifier():
 
 @pytest.fixture(scope="module")
 def templates(verifier):
-    return ViewTemplates(verifier.caster)
+    return verifier.templates
 
 
 def turned_views(mesh: Mesh, turn: np.ndarray):
@@ -57,13 +64,12 @@ def turned_views(mesh: Mesh, turn: np.ndarray):
 @pytest.mark.parametrize("thing", range(len(THINGS)))
 def test_a_thing_that_is_turned_about_all_axes_is_named_and_placed(
     verifier,
-    templates,
     thing,
     seed,
 ):
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
     observations, true = turned_views(THINGS[thing], turn)
-    found = verifier.in_any_orientation(observations[:2], templates)
+    found = verifier.in_any_orientation(observations[:2])
     assert found.belief.argmax() == thing
     assert found.belief.max() > 0.9
     assert found.belief.sum() == pytest.approx(1)
@@ -149,4 +155,52 @@ def test_where_almost_nothing_is_seen_nothing_is_proposed(verifier, templates):
     speck = replace(observations[0], depth=depth, scene=None)
     assert not len(templates.propose(MetricImage.of(speck), 8).things)
     with pytest.raises(ObservationError, match="enough of the thing"):
-        verifier.in_any_orientation([speck], templates)
+        verifier.in_any_orientation([speck])
+
+
+def standing_in(mesh: Mesh, turn: np.ndarray):
+    """A view of a turned mesh on a level table, and its pose."""
+    shown = rotated(mesh, turn)
+    pose = np.eye(4)
+    pose[:3, :3] = turn
+    pose[:3, 3] = -(turn @ mesh.centre + shown.centre)
+    return standing_view(shown, np.eye(3), noise=0.002), pose
+
+
+# standing on their heads, on a side, and on an edge against nothing
+UNUSUAL_TURNS = (
+    Rotation.from_euler("x", 180, degrees=True),
+    Rotation.from_euler("xz", (90, 40), degrees=True),
+    Rotation.from_euler("yz", (-55, 100), degrees=True),
+)
+
+
+@pytest.mark.parametrize("turn", UNUSUAL_TURNS)
+@pytest.mark.parametrize("thing", [1, 2])
+def test_a_thing_that_stands_as_it_was_not_taught_is_found_by_the_whole_search(
+    verifier,
+    thing,
+    turn,
+):
+    mesh = THINGS[thing]
+    observation, true = standing_in(mesh, turn.as_matrix())
+    resting = verifier([observation], even_belief(len(THINGS)))
+    before = off_by(resting.poses[0], true, mesh.centre)[0]
+    assert before > 15 or resting.things[0] != thing
+
+    found = verifier.whole_search([observation], resting)
+    assert found.belief.argmax() == found.things[0] == thing
+    degrees, millimetres = off_by(found.poses[0], true, mesh.centre)
+    assert degrees < 3
+    assert millimetres < 3
+    np.testing.assert_allclose([found.belief.sum(), found.probabilities.sum()], 1)
+    assert (np.diff(found.probabilities) <= 0).all()
+
+
+def test_a_thing_that_rests_as_it_was_taught_stays_where_it_was_found(verifier):
+    observation, true = standing_in(THINGS[1], np.eye(3))
+    resting = verifier([observation], even_belief(len(THINGS)))
+    found = verifier.whole_search([observation], resting)
+    assert found.things[0] == 1
+    assert off_by(found.poses[0], true, THINGS[1].centre)[0] < 2
+    assert found.probabilities[0] > 0.5

@@ -55,6 +55,22 @@ class LikelyRests:
     shares: Float
 
 
+def stable_poses(mesh: Mesh) -> LikelyRests:
+    """Find all poses in which a mesh rests on a face of its convex hull, however rarely.
+
+    Args:
+        mesh: the object.
+
+    Returns:
+        The poses in no order, none among them left out or joined, and their shares of the throws.
+        Without a convex hull only the mesh's own pose.
+    """
+    ups, shares = _stable_poses(mesh)
+    if not len(ups):
+        return LikelyRests(np.eye(3)[None], np.ones(1))
+    return LikelyRests(np.stack([_upright(up) for up in ups]), shares / shares.sum())
+
+
 def resting_poses(mesh: Mesh) -> Float:
     """The rotations of ``likely_rests``.
 

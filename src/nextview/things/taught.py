@@ -15,13 +15,14 @@ from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
 from nextview.things.unknown import KnownResiduals
 from nextview.things.verifier import Verified, Verifier
-from nextview.things.view_templates import ViewTemplates
 from nextview.things.weighing import EvidenceWeights
 from nextview.types import Float, Floats
 
 # The radius of what is seen, of that of the whole thing: much may be hidden, or little taken in.
 SMALLEST_SHARE = 0.25
 LARGEST_SEEN_SHARE = 2.0
+# p-value of a thing in a known resting pose from which no other orientation is searched
+FOUND = 0.2
 
 
 class TaughtThings:
@@ -34,8 +35,7 @@ class TaughtThings:
         residuals: how badly known things are explained, in the same order; None if that was not
             fitted.
         symmetries: of each thing, in the same order.
-        templates: of the things from all around, where they may have any orientation; None where
-            they rest as they were taught.
+        anyhow: whether they need not rest: all orientations are equally likely.
         rows: hypotheses of the memory that are of these things, (R,) int64.
     """
 
@@ -79,7 +79,7 @@ class TaughtThings:
             about.things[known[name]].symmetries for name in self.names
         )
         self.verifier = Verifier(surfaces, owners, memory.rotations[self.rows], weights)
-        self.templates: ViewTemplates | None = None
+        self.anyhow = False
 
     @classmethod
     def of(cls, recogniser: TaughtRecogniser) -> "TaughtThings | None":
@@ -110,12 +110,9 @@ class TaughtThings:
         return cls(recogniser, some, weights, residuals_of(about.verification, known))
 
     def in_any_orientation(self) -> "TaughtThings":
-        """The same things, which may be held, lean or fly: they need not rest.
-
-        Each is rendered from all around, which takes some 50 ms a thing.
-        """
+        """The same things, which may be held, lean or fly: they need not rest."""
         tilted = copy(self)
-        tilted.templates = ViewTemplates(self.verifier.caster)
+        tilted.anyhow = True
         return tilted
 
     def __call__(self, observations: Sequence[Observation]) -> Verified:
@@ -178,10 +175,14 @@ class TaughtThings:
         Returns:
             The belief in each thing, and the poses.
         """
-        if self.templates is not None:
-            return self.verifier.in_any_orientation(observations, self.templates)
+        if self.anyhow:
+            return self.verifier.in_any_orientation(observations)
         known = joint[self.rows]
-        return self.verifier(observations, known / known.sum())
+        resting = self.verifier(observations, known / known.sum())
+        p_value = self.p_value(observations, resting)
+        if p_value is not None and p_value >= FOUND:
+            return resting
+        return self.verifier.whole_search(observations, resting)
 
     def p_value(
         self,

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +52,9 @@ AROUND_STEPS = 24  # azimuths: a small part of a round body shows at one of them
 AROUND_PEAKS = 2  # of these azimuths that are aligned, for each thing
 
 
+UNUSUAL = 0.01  # as likely beforehand as a known resting pose is any other orientation
+
+
 @dataclass(frozen=True)
 class Stage:
     """Hypotheses are aligned with few pixels first, and those that survive with more.
@@ -97,7 +101,8 @@ class Verified:
         belief: in each thing, (T,) float64, sums to 1.
         things: thing of each hypothesis that was judged, the likeliest hypothesis first, (M,)
             int64.
-        resting: which thing in which resting pose, index of the verifier's hypotheses, (M,) int64.
+        ups: direction in the scan file's axes that points up where each hypothesis rests or, if it
+            was proposed in any orientation, as it was proposed, (M, 3) float64.
         probabilities: of these hypotheses, (M,) float64, their sum is 1.
         poses: of the scan files' frames in the object frame, (M, 4, 4) float64, metres.
         cameras: by how much each view sees them displaced, (M, V, 3) float64, metres, object frame.
@@ -119,7 +124,7 @@ class Verified:
 
     belief: Float
     things: Index
-    resting: Index
+    ups: Float
     probabilities: Float
     poses: Float
     cameras: Float
@@ -133,6 +138,14 @@ class Verified:
     against: Float
     seen_behind: Float
     below: Float
+
+    def select(self, rows: NDArray) -> "Verified":
+        """Some of the hypotheses, by index or mask."""
+        kept = (*OF_HYPOTHESES, "probabilities", "log_belief")
+        some = replace(self, **{name: getattr(self, name)[rows] for name in kept})
+        return replace(
+            some, probabilities=some.probabilities / some.probabilities.sum()
+        )
 
     def judged(self, truth: int) -> JudgedEpisode:
         """The same as an example of the thing of this number, to fit weights to."""
@@ -157,7 +170,7 @@ class Verified:
         own_centres = verifier.caster.centres[things].astype(np.float64)
         return Alignment(
             things=things,
-            ups=verifier.rotations[self.resting[rows], 2],
+            ups=self.ups[rows],
             rotations=rotations,
             centres=np.einsum("hij,hj->hi", rotations, own_centres)
             + self.poses[rows, :3, 3],
@@ -174,19 +187,35 @@ class Verified:
         return float(self.misfit[0].mean() + AGAINST_FEATURES * against)
 
 
+OF_HYPOTHESES = (
+    "things",
+    "ups",
+    "poses",
+    "cameras",
+    "mean",
+    "camera_costs",
+    "explained",
+    "misfit",
+    "noise_share",
+    "seen_behind",
+    "below",
+)
+"""What ``Verified`` holds of each hypothesis, beside its probability and prior belief."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Proposed:
     """What is aligned, M hypotheses.
 
     Attributes:
-        resting: index of the verifier's hypotheses, (M,) int64.
+        things: number of the surface of each, (M,) int64.
         rotations: from the axes of the scan files to the object frame, (M, 3, 3) float64.
         log_belief: before the geometry is looked at, (M,) float64.
         by_features: belief in each thing before that, (T,) float64, sums to 1.
         against: see ``Verified``.
     """
 
-    resting: Index
+    things: Index
     rotations: Float
     log_belief: Float
     by_features: Float
@@ -196,7 +225,7 @@ class _Proposed:
         """Some of the hypotheses, by index."""
         return replace(
             self,
-            resting=self.resting[rows],
+            things=self.things[rows],
             rotations=self.rotations[rows],
             log_belief=self.log_belief[rows],
         )
@@ -272,7 +301,7 @@ class Verifier:
         np.add.at(by_features, self.owners, joint.sum(1))
         by_features /= by_features.sum()
         proposed = _Proposed(
-            resting=proposals.hypotheses,
+            things=self.owners[proposals.hypotheses],
             rotations=turns,
             log_belief=proposals.log_belief,
             by_features=by_features,
@@ -289,24 +318,58 @@ class Verifier:
     def in_any_orientation(
         self,
         observations: Sequence[Observation],
-        templates: ViewTemplates,
     ) -> Verified:
         """The same for a thing that need not rest on anything: held, leaning or thrown.
 
         Args:
             observations: views of one thing, all in one object frame.
-            templates: of the same surfaces.
 
         Returns:
-            The belief by size, outline and geometry, and the poses. ``resting`` is any resting
-            pose of the thing.
+            The belief by size, outline and geometry, and the poses.
 
         Raises:
             ObservationError: no view shows the thing, or its scale is not known.
         """
         images = [replace(image, ground=None) for image in _images(observations)]
+        return self._tilted(images, np.eye(3))
+
+    def whole_search(
+        self,
+        observations: Sequence[Observation],
+        resting: Verified,
+    ) -> Verified:
+        """Search on, in all orientations, where no thing in a known resting pose was found.
+
+        A thing may rest in a rare pose, lean, or stand as somebody put it. Such hypotheses compete
+        with those that rest, each ``UNUSUAL`` times as likely beforehand; the ground counts.
+
+        Args:
+            observations: views of one thing, all in one object frame.
+            resting: what was found of resting things.
+
+        Returns:
+            What is found of both kinds of hypotheses together.
+        """
+        images = _images(observations)
+        level = levelling(
+            [image.ground for image in images if image.ground is not None]
+        )
+        try:
+            images = [image.turned(level) for image in images]
+            unusual = self._tilted(images, level)
+        except ObservationError:  # too little is seen to be compared
+            return resting
+        return self._joined(resting, unusual)
+
+    @cached_property
+    def templates(self) -> ViewTemplates:
+        """Pictures of the things from all around, which propose orientations."""
+        return ViewTemplates(self.caster)
+
+    def _tilted(self, images: Sequence[MetricImage], level: Float) -> Verified:
+        """What is found in any orientation, in a frame that was turned to be level."""
         each = max(1, TILTED_PROPOSALS // len(images))
-        found = [templates.propose(image, each) for image in images]
+        found = [self.templates.propose(image, each) for image in images]
         things = np.concatenate([one.things for one in found])
         if not len(things):
             raise ObservationError(
@@ -315,16 +378,38 @@ class Verifier:
 
         by_outline = np.mean([one.log_belief for one in found], axis=0)
         belief = np.exp(by_outline - by_outline.max())
-        first = np.searchsorted(self.owners, np.arange(len(self.caster.surfaces)))
         proposed = _Proposed(
-            resting=first[things],
+            things=things,
             rotations=np.concatenate([one.rotations for one in found]),
-            log_belief=by_outline[things],
+            log_belief=by_outline[things] - by_outline.max(),
             by_features=belief / belief.sum(),
             against=np.zeros(len(belief)),
         )
         prior = replace(self.prior, tilt=ANY_TILT)
-        return self._settled(proposed, images, TILTED_STAGES, prior, np.eye(3))
+        return self._settled(proposed, images, TILTED_STAGES, prior, level)
+
+    def _joined(self, resting: Verified, unusual: Verified) -> Verified:
+        """Hypotheses of resting things and of others, the likeliest first."""
+        logs = [resting.log_belief, unusual.log_belief + np.log(UNUSUAL)]
+        log_belief = np.concatenate(logs)
+        both = {
+            name: np.concatenate([getattr(resting, name), getattr(unusual, name)])
+            for name in OF_HYPOTHESES
+        }
+        scores = self.weights.scores(both["mean"], both["camera_costs"], log_belief)
+        order = np.argsort(-scores, kind="stable")
+        shares = np.exp(scores - scores.max())
+        whole = replace(
+            resting,
+            belief=self.weights.belief(scores, both["things"], resting.by_features),
+            probabilities=(shares / shares.sum())[order],
+            log_belief=log_belief[order],
+            **{name: values[order] for name, values in both.items()},
+        )
+        alike = different_poses(
+            self.caster, whole.alignment(np.arange(len(order)), self)
+        )
+        return whole.select(alike)
 
     def _settled(
         self,
@@ -338,7 +423,7 @@ class Verifier:
         level.
         """
         views = [image.view(stages[0].side) for image in images]
-        alignment = start(self.owners[proposed.resting], proposed.rotations, len(views))
+        alignment = start(proposed.things, proposed.rotations, len(views))
         alignment = centred(self.caster, alignment, views)
 
         for stage in stages:
@@ -464,7 +549,7 @@ class Verifier:
         return Verified(
             belief=self.weights.belief(scores, alignment.things, proposed.by_features),
             things=alignment.things,
-            resting=proposed.resting,
+            ups=alignment.ups,
             probabilities=shares / shares.sum(),
             poses=aligned.poses(self.caster),
             cameras=aligned.cameras,
