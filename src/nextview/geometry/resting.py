@@ -41,21 +41,19 @@ class _Pose:
 
 
 @dataclass(frozen=True, eq=False)
-class LikelyRests:
-    """The resting poses of an object that are looked at.
+class StablePoses:
+    """All poses in which an object can rest on a plane.
 
     Attributes:
-        rotations: from the mesh's own axes into the poses, (P, 3, 3) float64, the likeliest first
-            after the identity.
-        shares: of all throws that end in each, (P,) float64. What they lack of 1 is the share of
-            the throws that end in other poses, or in rare ones that were not looked at.
+        rotations: from the mesh's own axes into the poses, (P, 3, 3) float64.
+        shares: of all throws that end in each, (P,) float64, their sum is 1.
     """
 
     rotations: Float
     shares: Float
 
 
-def stable_poses(mesh: Mesh) -> LikelyRests:
+def stable_poses(mesh: Mesh) -> StablePoses:
     """Find all poses in which a mesh rests on a face of its convex hull, however rarely.
 
     Args:
@@ -67,20 +65,11 @@ def stable_poses(mesh: Mesh) -> LikelyRests:
     """
     ups, shares = _stable_poses(mesh)
     if not len(ups):
-        return LikelyRests(np.eye(3)[None], np.ones(1))
-    return LikelyRests(np.stack([_upright(up) for up in ups]), shares / shares.sum())
+        return StablePoses(np.eye(3)[None], np.ones(1))
+    return StablePoses(np.stack([_upright(up) for up in ups]), shares / shares.sum())
 
 
 def resting_poses(mesh: Mesh) -> Float:
-    """The rotations of ``likely_rests``.
-
-    Args:
-        mesh: the object.
-    """
-    return likely_rests(mesh).rotations
-
-
-def likely_rests(mesh: Mesh) -> LikelyRests:
     """Find the poses in which a mesh is likely to rest.
 
     A dropped object rests on a face of its convex hull, the likelier the larger it looks from the
@@ -93,8 +82,9 @@ def likely_rests(mesh: Mesh) -> LikelyRests:
         mesh: the object.
 
     Returns:
-        The poses, at most MOST_RESTING_POSES, each but its own of at least LIKELY_POSE of the
-        throws, and how likely they are.
+        Rotations from the mesh's own axes, (P, 3, 3) float64, the likeliest first after the
+        identity: at most MOST_RESTING_POSES, each but the first of at least LIKELY_POSE of the
+        throws. ``stable_poses`` has all others.
     """
     ups, shares = _stable_poses(mesh)
     own, *others = _distinct_poses(mesh, ups, shares)
@@ -102,10 +92,7 @@ def likely_rests(mesh: Mesh) -> LikelyRests:
     likely = [pose for pose in others if pose.share >= LIKELY_POSE]
     likely.sort(key=lambda pose: -pose.share)
     kept = [own, *likely[: MOST_RESTING_POSES - 1]]
-    return LikelyRests(
-        rotations=np.stack([_upright(pose.up) for pose in kept]),
-        shares=np.array([pose.share for pose in kept]),
-    )
+    return np.stack([_upright(pose.up) for pose in kept])
 
 
 def _stable_poses(mesh: Mesh) -> tuple[Float, Float]:

@@ -52,7 +52,6 @@ from nextview.teaching.thing_sources import Found, ThingSource, find_things
 from nextview.teaching.thing_views import (
     FACES,
     LEFT_OUT,
-    OTHER_RESTS,
     SYMMETRIES,
     VERTICES,
     Arrays,
@@ -88,9 +87,6 @@ MEMORY_FILE = f"{MEMORY_NAME}{MEMORY_SUFFIX}"
 LEARNED_PICTURE = "learned.png"
 # folder beside these things, of the memory that things are shown to before it is finished
 JUDGED = "judged"
-MANY_OTHER_RESTS = (
-    0.1  # share of throws into poses that are not taught, from which it is told
-)
 # the key of the things that a run that was stopped has taught, see ``files.unfinished``
 PARTS = "things"
 Pair = tuple[ThingSource, Arrays]  # a thing, and what is remembered of it
@@ -872,7 +868,6 @@ def _notes(taught: Sequence[Pair]) -> tuple[str, ...]:
             f"{source.name}: {doubt}"
             for doubt in doubts.tobytes().decode().splitlines()
         )
-    notes += _on_other_rests(taught)
     for source, arrays in taught:
         if not arrays["held_out"].any():
             notes.append(
@@ -887,22 +882,3 @@ def _notes(taught: Sequence[Pair]) -> tuple[str, ...]:
             " count"
         )
     return tuple(notes)
-
-
-def _on_other_rests(taught: Sequence[Pair]) -> list[str]:
-    """A sentence on the poses that things may rest in and were not taught; none if it is rare."""
-    shares = {
-        source.name: float(arrays[OTHER_RESTS][0])
-        for source, arrays in taught
-        if OTHER_RESTS in arrays  # of what was taught now, from a mesh file
-    }
-    often = sorted(shares, key=lambda name: -shares[name])
-    often = [name for name in often if shares[name] >= MANY_OTHER_RESTS]
-    if not often:
-        return []
-    worst = ", ".join(f"{100 * shares[name]:.0f} % of {name}" for name in often[:3])
-    mean = 100 * np.mean(list(shares.values()))
-    return [
-        f"{mean:.0f} % of all throws end in resting poses that are not taught, in which a thing is"
-        f" not found; most often {worst}"
-    ]

@@ -22,7 +22,7 @@ from nextview.checks import one_of, whole
 from nextview.errors import DatasetError, ObservationError
 from nextview.geometry.mesh import UNITS, Y_UP, Mesh, is_y_up, load_mesh, mesh_warnings
 from nextview.geometry.observation import Camera, Observation
-from nextview.geometry.resting import likely_rests, rotated
+from nextview.geometry.resting import resting_poses, rotated
 from nextview.geometry.viewsphere import (
     ViewSphere,
     angle_between,
@@ -58,7 +58,6 @@ SENSED = MEMORY_GRID.poses.reshape(len(RINGS), AZIMUTHS, 4, 4)[::2, ::2].reshape
 # of a thing's arrays: a phrase about the frames that were not used; it is not remembered
 LEFT_OUT = "left_out"
 # of a thing's arrays: the share of its throws that end in poses that are not taught, (1,) float64
-OTHER_RESTS = "other_rests"
 # of a thing's arrays: its surface, if its size is known
 VERTICES = "vertices"
 FACES = "faces"
@@ -139,8 +138,7 @@ def teach(path: Path, name: str, how: TeachingOptions, threads: int = 1) -> Arra
     if path.is_dir() or is_bag(path):
         return _of_capture(_captured(path, how), name)
     mesh = load_mesh(path, how.up, how.unit, largest_part=how.largest_part)
-    rests = None if how.upright else likely_rests(mesh)
-    rotations = np.eye(3)[None] if rests is None else rests.rotations
+    rotations = np.eye(3)[None] if how.upright else resting_poses(mesh)
     lying = [mesh, *(rotated(mesh, rotation) for rotation in rotations[1:])]
     directions = (
         np.arcsin(rng.uniform(0, np.sin(np.radians(RINGS[-1])), HELD_OUT)),
@@ -168,7 +166,6 @@ def teach(path: Path, name: str, how: TeachingOptions, threads: int = 1) -> Arra
         "held_out": shown.astype(np.float16),
         "held_out_views": np.stack(directions, 1).astype(np.float32),
         "radii": np.array([np.nan if mesh.metres is None else mesh.metres], np.float32),
-        OTHER_RESTS: np.array([0.0 if rests is None else 1 - rests.shares.sum()]),
         "doubts": np.frombuffer(
             "\n".join([*mesh_warnings(mesh), *_flatness(lying)]).encode(),
             np.uint8,

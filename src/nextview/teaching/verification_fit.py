@@ -11,6 +11,7 @@ from numpy.random import Generator
 from nextview.errors import ObservationError
 from nextview.geometry.mesh import make_mesh
 from nextview.geometry.observation import Observation
+from nextview.geometry.resting import rotated, stable_poses
 from nextview.geometry.viewsphere import look_at_origin, rotation_z
 from nextview.recognition.model_card import Verification
 from nextview.simulation.sensed_camera import SensedCamera
@@ -99,7 +100,7 @@ def to_be_shown(
 
 
 def show(card: Path, sensor: str, seed: int, item: tuple[int, int]) -> list[Shown]:
-    """Show a thing through a sensor, in any of its resting poses, and recognise it by its geometry.
+    """Show a thing through a sensor, as it falls, and recognise it by its geometry.
 
     A thing that has others of its class is recognised by these alone: whoever teaches a class will
     meet other things of it.
@@ -177,19 +178,25 @@ def _views(
     sensor: str,
     rng: Generator,
 ) -> list[Observation]:
-    """Some random views of a thing that show it."""
+    """Some random views of a thing that show it.
+
+    It lies as it falls, in any stable pose by its share of the throws; if it was taught in one
+    pose alone, in that one.
+    """
     surface = known.verifier.caster.surfaces[thing]
-    resting = known.verifier.rotations[
-        rng.choice(np.flatnonzero(known.verifier.owners == thing))
-    ]
-    turn = rotation_z(rng.uniform(0, 2 * np.pi)) @ resting
     mesh = make_mesh(
-        surface.vertices.astype(np.float64) @ turn.T,
+        surface.vertices.astype(np.float64),
         surface.faces,
         surface.name,
         "m",
     )
-    camera = SensedCamera(mesh, sensor, rng.spawn(1)[0])
+    lies = known.verifier.rotations[known.verifier.owners == thing]
+    shares = np.ones(1)
+    if len(lies) > 1:
+        stable = stable_poses(mesh)
+        lies, shares = stable.rotations, stable.shares
+    turn = rotation_z(rng.uniform(0, 2 * np.pi)) @ lies[rng.choice(len(lies), p=shares)]
+    camera = SensedCamera(rotated(mesh, turn), sensor, rng.spawn(1)[0])
 
     elevations = np.arcsin(
         rng.uniform(0, np.sin(np.radians(RINGS[-1])), SHOWING_VIEWS_TRIED)
