@@ -1,4 +1,4 @@
-"""SurfaceLevel surfaces that a segmentation tells: floors, tables, boards, and what each of them carries.
+"""Level surfaces that a segmentation tells: floors, tables, boards, and what each of them carries.
 
 A segmentation says which pixels are surfaces. The planes through these pixels are found here, and
 for each instance the one that it stands on. A plane carries things only where it is seen or hidden

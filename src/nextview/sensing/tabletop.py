@@ -15,7 +15,7 @@ from nextview.sensing.clusters import Joins
 from nextview.sensing.convex_pieces import STANDS, Pieces, cut
 from nextview.sensing.facets import Noise, noise_of
 from nextview.sensing.frame import Frame, within
-from nextview.sensing.levels import SurfaceLevel, Supports
+from nextview.sensing.levels import Supports, SurfaceLevel
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, upright_axes
 from nextview.sensing.planes import LEAST_SUPPORT, Plane, Samples, sample
