@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nextview.checks import one_line
 from nextview.errors import ObservationError
@@ -16,6 +17,7 @@ from nextview.segmentation.features import features, shrink
 from nextview.segmentation.network import load_network
 from nextview.segmentation.parting import part, sharpen, surface_of
 from nextview.sensing.frame import Frame
+from nextview.sensing.object_frame import upright_axes
 from nextview.types import Index, Mask
 
 
@@ -59,27 +61,36 @@ class LearnedSegmenter:
 
     Args:
         card: path of the network's card.
+        up: direction against gravity in the world of the frames, (3,); None: it is not known, as
+            always for frames without a pose.
 
     Raises:
         ModelError: card or network are missing or damaged.
     """
 
-    def __init__(self, card: str | Path) -> None:
+    def __init__(
+        self,
+        card: str | Path,
+        up: ArrayLike | None = (0.0, 0.0, 1.0),
+    ) -> None:
         self.card = card
+        self.up = None if up is None else upright_axes(up)[2]
         self.network = load_network(card)
 
-    def __reduce__(self) -> tuple[type[LearnedSegmenter], tuple[str | Path]]:
+    def __reduce__(self) -> tuple[type[LearnedSegmenter], tuple[Any, ...]]:
         """It is pickled as the path of its card."""
-        return LearnedSegmenter, (self.card,)
+        return LearnedSegmenter, (self.card, self.up)
 
     def __call__(self, frame: Frame) -> Segmentation:
         """Return the thing that each pixel shows, and the surfaces.
 
         Args:
-            frame: of a depth camera. With a pose, gravity points along -z of the world.
+            frame: of a depth camera.
         """
         picture = shrink(frame.depth, frame.rays)
-        up = None if frame.pose is None else frame.camera_to_world[2, :3]
+        up = None
+        if frame.pose is not None and self.up is not None:
+            up = self.up @ frame.camera_to_world[:3, :3]
         output = self.network(features(picture, up))
         valid = picture.depth > 0
         labels = part(output, valid)
