@@ -189,6 +189,21 @@ def test_learned_segmenter_needs_its_card(tmp_path):
         LearnedSegmenter(tmp_path / "none.json")
 
 
+def test_a_learned_segmenter_tells_things_and_surfaces(monkeypatch):
+    depth = np.full((480, 640), 1.0, np.float32)
+    depth[101:303, 203:407] = 0.8  # no multiple of the factor
+    frame = Frame(depth, INTRINSICS)
+    thing = shrink(frame.depth, frame.rays).depth < 0.9
+    output = np.full((3 + len(STEPS), *thing.shape), 3.0, np.float32)
+    output[:3] = [np.zeros(thing.shape), ~thing, thing]
+
+    name = "nextview.segmentation.instances.load_network"
+    monkeypatch.setattr(name, lambda card: lambda features: output)
+    found = LearnedSegmenter("any.json")(frame)
+    np.testing.assert_array_equal(found.labels > 0, depth < 0.9)
+    np.testing.assert_array_equal(found.surface, depth > 0.9)
+
+
 def test_a_scene_takes_masks_of_your_own(ycb, ycb_meshes):
     names = ["cracker_box", "tomato_soup_can"]
     camera = camera_over([ycb_meshes[name] for name in names], gap=0.0)
