@@ -1,6 +1,6 @@
 """Real frames of things on a table, one view each: what they are called, and where their scans lie.
 
-    python benchmarks/real_frames.py FOLDER SCANS [--models ycb]
+    python benchmarks/real_frames.py FOLDER SCANS [--models ycb] [--network CARD]
 
 FOLDER holds frames: NAME.depth.png (uint16, millimetres), NAME.labels.png (uint8, what each pixel
 shows) and names.txt, a line a label, the first of what is none. No pose of the camera is known: up
@@ -24,9 +24,13 @@ import tyro
 from numpy.typing import NDArray
 from PIL import Image
 
+import nextview
 from nextview.errors import ObservationError, UsageError
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.observation import Observation
+from nextview.scene.objects import UNKNOWN_NAME
+from nextview.segmentation.choosing import choose_instance
+from nextview.segmentation.instances import LearnedSegmenter, Segmenter
 from nextview.sensing import Frame, ObservedObject
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
@@ -126,7 +130,8 @@ def name_one(
     name: str,
     label: Mask,
     frame: Frame,
-    given: dict[str, Frame | str],
+    given: dict[str, str],
+    segmentation: Segmenter | None = None,
 ) -> Named | None:
     """Name the thing of a label, which is given by a point or by a mask; None where it is not
     found.
@@ -139,15 +144,13 @@ def name_one(
         if by == "point"
         else ObservedObject(up=None)
     )
-    masked = Frame(
-        frame.depth,
-        frame.intrinsics,
-        np.eye(4),
-        mask=label,
-        pixel_centre=0.5,
-    )
+    masked = frame.with_mask(shown)
+    seen = frame if by == "point" else masked
     try:
-        view = thing.add(frame if by == "point" else masked)
+        if segmentation is None:
+            view = thing.add(seen)
+        else:
+            view = thing.add(*choose_instance(segmentation, seen, thing))
     except ObservationError as error:
         print(f"{given['name']} {name} by {by}: {error}")
         return None
@@ -180,13 +183,11 @@ def named_in(
     path: Path,
     names: list[str],
     intrinsics: NDArray[np.float64],
+    segmentation: Segmenter | None = None,
 ) -> Iterator[Named]:
     """All things of one frame, by a point and by a mask."""
-    depth = np.asarray(Image.open(path))
-    labels = np.asarray(
-        Image.open(path.with_name(path.name.replace("depth", "labels")))
-    )
-    frame = Frame(depth, intrinsics, np.eye(4))
+    frame = Frame(np.asarray(Image.open(path)), intrinsics)
+    labels = labels_of(path)
     for number, name in enumerate(names[1:], 1):
         label = labels == number
         if (label & (frame.depth > 0)).sum() < LEAST_PIXELS or name not in things.names:
@@ -198,9 +199,59 @@ def named_in(
                 label,
                 frame,
                 {"name": path.name.split(".")[0], "by": by},
+                segmentation,
             )
             if found is not None:
                 yield found
+
+
+def labels_of(path: Path) -> NDArray[np.uint8]:
+    """What each pixel of a depth image shows, (H, W), by the image of labels beside it."""
+    labels = path.with_name(path.name.replace("depth", "labels"))
+    return np.asarray(Image.open(labels))
+
+
+def print_scenes(
+    system: nextview.System,
+    paths: list[Path],
+    names: list[str],
+    intrinsics: NDArray[np.float64],
+    segmentation: Segmenter | None,
+) -> None:
+    """Print how many things are named right and wrong by a scene of each frame.
+
+    Args:
+        system: that knows the things.
+        paths: of the depth images.
+        names: of the labels, the first of what is none.
+        intrinsics: of the camera, (3, 3).
+        segmentation: that tells the things; None for the one by edges.
+    """
+    things = right = sure_right = wrong = sure_wrong = 0
+    for path in paths:
+        labels = labels_of(path)
+        frame = Frame(np.asarray(Image.open(path)), intrinsics)
+        shown = np.bincount(labels[frame.depth > 0], minlength=len(names))[1:]
+        things += int(np.count_nonzero(shown >= LEAST_PIXELS))
+
+        scene = nextview.Scene(system, up=None, segmentation=segmentation)
+        scene.update(frame)
+        taken = set()
+        for found in scene.objects:
+            (mask,) = found.pixels.values()
+            true = names[int(np.bincount(labels[mask]).argmax())]
+            if found.name == UNKNOWN_NAME:
+                continue
+            good = found.name == true and true not in taken
+            taken.add(found.name)
+            right += good
+            wrong += not good
+            sure_right += good and found.confident
+            sure_wrong += not good and found.confident
+    print(
+        f"scenes: of {things} things {right} named right, {sure_right} of them confidently; {wrong}"
+        f" wrong names, {sure_wrong} of them confident"
+    )
 
 
 def main(
@@ -208,6 +259,7 @@ def main(
     scans: tyro.conf.Positional[Path],
     models: str = "ycb",
     intrinsics: tuple[float, float, float, float] = INTRINSICS,
+    network: Path | None = None,
 ) -> None:
     """Name the things in all frames of a folder, and print what was found.
 
@@ -216,19 +268,23 @@ def main(
         scans: folder of the scans.
         models: memory of the things.
         intrinsics: of the camera: fx, fy, cx, cy, pixels.
+        network: card of a network that tells things and surfaces; None for the segmentation by
+            edges.
     """
     things = memory_with_surfaces(models, scans)
     names = (folder / "names.txt").read_text().split()
     fx, fy, cx, cy = intrinsics
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
+    learned = None if network is None else LearnedSegmenter(network)
     found: list[Named] = []
+    paths = sorted(folder.glob("*.depth.png"))
     print(
         "| frame | thing | given by | features | verified | belief | residual | overlap |"
     )
     print("|---|---|---|---|---|---|---|---|")
-    for path in sorted(folder.glob("*.depth.png")):
-        for each in named_in(things, path, names, matrix):
+    for path in paths:
+        for each in named_in(things, path, names, matrix, learned):
             found.append(each)
             said = f"{each.by_features} | {each.answer} | {each.confidence:.2f}"
             print(
@@ -249,6 +305,7 @@ def main(
             f" geometry, {three} among the first three; mean overlap {overlap:.2f}; at most"
             f" {slowest:.0f} ms of CPU for the geometry"
         )
+    print_scenes(nextview.load(models), paths, names, matrix, learned)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,14 @@
 """Real frames of things that a memory was not taught: how many get a name, how many confidently.
 
-    python benchmarks/real_tables.py FOLDER [--models ycb] [--show]
+    python benchmarks/real_tables.py FOLDER [--models ycb] [--show] [--network CARD]
 
 FOLDER holds a folder a frame: depth.png (uint16, millimetres) and K.json (fx, fy, cx, cy, the
 middle of the first pixel at 0). No pose of a camera is known: up is the normal of the table. Each
 frame is given to a scene of its own. Every name is wrong, so none of them should be confident.
 Printed are the objects that were found, those with a name, and those with a confident one; with
 ``--show`` each confident name, its pixels and how sure its pose is. Nothing is drawn at random.
+``--network`` names the card of a network of ``nextview train segmentation``: it tells things and
+surfaces in place of the segmentation by edges that scenes use.
 """
 
 import json
@@ -21,6 +23,7 @@ from rich.progress import track
 import nextview
 from nextview.errors import ObservationError, UsageError
 from nextview.scene.objects import UNKNOWN_NAME, SceneObject
+from nextview.segmentation.instances import LearnedSegmenter
 from nextview.sensing.frame import Frame
 
 
@@ -60,6 +63,7 @@ def main(
     folder: tyro.conf.Positional[Path],
     models: str = "ycb",
     show: bool = False,
+    network: Path | None = None,
 ) -> None:
     """Count what is found in the frames of a folder, and what gets a name.
 
@@ -67,15 +71,18 @@ def main(
         folder: of the frames.
         models: memory of things, none of which is in the frames.
         show: whether each confident name is printed.
+        network: card of a network that tells things and surfaces; None for the segmentation by
+            edges that scenes use.
     """
     frames = sorted(path.parent for path in folder.glob("*/depth.png"))
     if not frames:
         raise UsageError(f"{folder}: holds no folder with a depth.png")
     system = nextview.load(models=models)
+    learned = None if network is None else LearnedSegmenter(network)
     counts = Counts()
     rows = []
     for path in track(frames, f"frames of {folder.name}"):
-        scene = nextview.Scene(system, up=None)
+        scene = nextview.Scene(system, up=None, segmentation=learned)
         try:
             scene.update(frame_in(path))
         except ObservationError as error:

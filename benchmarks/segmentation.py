@@ -237,7 +237,9 @@ def main(
     rows = []
     for truth in track(every, f"frames of {kind}"):
         begun = time.perf_counter()
-        found = by_edges(truth.frame) if learned is None else learned(truth.frame)
+        found = (
+            by_edges(truth.frame) if learned is None else learned(truth.frame).labels
+        )
         counts.seconds += time.perf_counter() - begun
         rows.append((counts.add(truth.labels, found), truth, found))
     counts.print_out()

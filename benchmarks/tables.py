@@ -1,7 +1,7 @@
 """Tables with several things each: what is found and named after one, two and four frames.
 
     python benchmarks/tables.py OUT.jsonl SCANS STRANGERS [--tables 100] [--seed 0]
-        [--by target fixed random]
+        [--by target fixed random] [--network CARD]
 
 SCANS holds the scans of the things that the memory knows, in metres, by their names; STRANGERS a
 folder of meshes, a folder a class, none of which it knows. On each simulated table stand 6 to 10
@@ -12,6 +12,9 @@ and of the vertical. The first view is drawn; the others are chosen by ``--by``:
 - fixed: a quarter of a circle on, at the same elevation;
 - random: any candidate view;
 - target: ``Scene.target``.
+
+``--network`` names the card of a network of ``nextview train segmentation``: it tells things and
+surfaces in place of the segmentation by edges that scenes use.
 
 OUT gets a line a table, and the tables that it holds already are not looked at again: a run that
 was stopped goes on. Printed is, after 1, 2 and 4 frames, the share of the things that were found
@@ -48,6 +51,7 @@ from nextview.geometry.mesh import Mesh, load_mesh
 from nextview.geometry.resting import resting_poses
 from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Scene
+from nextview.segmentation.instances import LearnedSegmenter, Segmenter
 from nextview.sensing.frame import Frame
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.tables import SimulatedTable, TableCamera, poses_around
@@ -142,8 +146,13 @@ def draw_table(
 class Looking:
     """A table under way: the frames so far, and what each of their pixels truly shows."""
 
-    def __init__(self, system: nextview.System, camera: TableCamera) -> None:
-        self.scene = Scene(system)
+    def __init__(
+        self,
+        system: nextview.System,
+        camera: TableCamera,
+        segmentation: Segmenter | None = None,
+    ) -> None:
+        self.scene = Scene(system, segmentation=segmentation)
         self.camera = camera
         self.owners: list[NDArray[np.int64]] = []
         self.cameras: list[tuple[Float, Float]] = []
@@ -223,6 +232,7 @@ def look_at_table(
     table: SimulatedTable,
     seed: tuple[int, int],
     by: By,
+    segmentation: Segmenter | None = None,
 ) -> tuple[dict[str, Counts], int]:
     """Look at a table from four views.
 
@@ -231,13 +241,15 @@ def look_at_table(
         table: with the things.
         seed: of the errors and of the views.
         by: how views are chosen.
+        segmentation: that tells the things; None for the one by edges.
 
     Returns:
         What was found after each number of frames that is counted; and after how many frames the
         scene was done, one more than were taken where it was not.
     """
     rng = np.random.default_rng([*seed, 1])
-    looking = Looking(system, TableCamera(table, SENSORS["wrist"], rng))
+    camera = TableCamera(table, SENSORS["wrist"], rng)
+    looking = Looking(system, camera, segmentation)
     choose = np.random.default_rng([*seed, 2])
     azimuth = choose.uniform(0, 2 * np.pi)
     elevation = np.radians(choose.uniform(*ELEVATIONS))
@@ -349,6 +361,7 @@ def main(
     seed: int = 0,
     by: tuple[By, ...] = ("fixed",),
     models: str = "ycb",
+    network: Path | None = None,
 ) -> None:
     """Look at tables, and print what was found.
 
@@ -360,6 +373,8 @@ def main(
         seed: of the draw of tables.
         by: ways in which views are chosen, each on every table.
         models: memory of the things.
+        network: card of a network that tells things and surfaces; None for the segmentation by
+            edges that scenes use.
     """
     lines = (
         [json.loads(line) for line in out.read_text().splitlines()]
@@ -372,6 +387,9 @@ def main(
         raise UsageError(f"{strangers if of_scans else scans}: holds no mesh")
 
     system = nextview.load(models, threads=2)
+    learned = None if network is None else LearnedSegmenter(network)
+    told_by = None if network is None else str(network)
+    lines = [line for line in lines if line.get("network") == told_by]
     done = {(line["seed"], line["table"], line["by"]) for line in lines}
     with out.open("a") as written:
         for number in track(range(tables), description="Tables"):
@@ -381,8 +399,10 @@ def main(
             drawn = np.random.default_rng([seed, number])
             table = draw_table(of_scans, of_strangers, drawn)
             for one in left:
-                counts, after = look_at_table(system, table, (seed, number), one)
+                seeds = (seed, number)
+                counts, after = look_at_table(system, table, seeds, one, learned)
                 line = {"seed": seed, "table": number, "by": one, "done": after}
+                line["network"] = told_by
                 line["counts"] = {
                     frames: asdict(found) for frames, found in counts.items()
                 }

@@ -269,10 +269,10 @@ def test_a_thing_floats_unless_it_stands_on_the_plane_or_on_another_object(
     judged = judged_by(ycb)
     mug = judged([new_track(whole, Bench(top, 0, judged))])[0]
     assert mug.result.answer == "mug"
-    assert floating([mug], top.plane) == [False]
+    assert floating([mug], [top.plane]) == [False]
 
     lower = replace(top.plane, offset=top.plane.offset + 0.05)
-    assert floating([mug], lower) == [True]
+    assert floating([mug], [lower]) == [True]
     assert replace(mug, result=replace(mug.result, confident=True)).confident
     assert not replace(
         mug,
@@ -287,4 +287,4 @@ def test_a_thing_floats_unless_it_stands_on_the_plane_or_on_another_object(
     for place, floats in ((middle, False), (middle + np.array([0.5, 0, 0]), True)):
         hull = SimpleNamespace(hull=corners + place)
         box = SimpleNamespace(posed=None, thing=SimpleNamespace(sightings=[hull]))
-        assert floating([mug, box], lower) == [floats, False]
+        assert floating([mug, box], [lower, lower]) == [floats, False]

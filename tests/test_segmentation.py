@@ -13,7 +13,7 @@ from nextview.segmentation.features import (
     shrink,
     surface_normals,
 )
-from nextview.segmentation.instances import LearnedSegmenter, masks_of
+from nextview.segmentation.instances import LearnedSegmenter, instances_of
 from nextview.segmentation.network import AFFINITY_STEPS as STEPS
 from nextview.segmentation.parting import pair_slices, part, sharpen
 from nextview.sensing.frame import Frame
@@ -156,7 +156,7 @@ def test_masks_and_labels_say_the_same():
     masks[1, 20:40, 5:60] = True
     for given in (masks, list(masks), masks[0] + 2 * masks[1].astype(np.int32)):
         np.testing.assert_array_equal(
-            masks_of(lambda frame, given=given: given, frame), masks
+            instances_of(lambda frame, given=given: given, frame).masks, masks
         )
 
 
@@ -165,7 +165,7 @@ def test_masks_and_labels_say_the_same():
 )
 def test_no_thing_is_no_mask(given):
     frame = level_frame(np.ones((48, 64), np.float32))
-    assert masks_of(lambda frame: given, frame) == []
+    assert instances_of(lambda frame: given, frame).masks == ()
 
 
 @pytest.mark.parametrize(
@@ -181,12 +181,27 @@ def test_no_thing_is_no_mask(given):
 def test_own_segmentation_of_another_form_is_refused(given):
     frame = level_frame(np.ones((48, 64), np.float32))
     with pytest.raises(ObservationError, match=r"segmentation"):
-        masks_of(lambda frame: given, frame)
+        instances_of(lambda frame: given, frame)
 
 
 def test_learned_segmenter_needs_its_card(tmp_path):
     with pytest.raises(ModelError, match=r"none\.json"):
         LearnedSegmenter(tmp_path / "none.json")
+
+
+def test_a_learned_segmenter_tells_things_and_surfaces(monkeypatch):
+    depth = np.full((480, 640), 1.0, np.float32)
+    depth[101:303, 203:407] = 0.8  # no multiple of the factor
+    frame = Frame(depth, INTRINSICS)
+    thing = shrink(frame.depth, frame.rays).depth < 0.9
+    output = np.full((3 + len(STEPS), *thing.shape), 3.0, np.float32)
+    output[:3] = [np.zeros(thing.shape), ~thing, thing]
+
+    name = "nextview.segmentation.instances.load_network"
+    monkeypatch.setattr(name, lambda card: lambda features: output)
+    found = LearnedSegmenter("any.json")(frame)
+    np.testing.assert_array_equal(found.labels > 0, depth < 0.9)
+    np.testing.assert_array_equal(found.surface, depth > 0.9)
 
 
 def test_a_scene_takes_masks_of_your_own(ycb, ycb_meshes):

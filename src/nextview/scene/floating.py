@@ -15,23 +15,24 @@ from nextview.types import Float, Mask
 FLOATING_HEIGHT = 0.02
 
 
-def floating(tracks: Sequence[Track], plane: Plane) -> list[bool]:
-    """Find the objects whose scans stand neither on the plane nor on another object.
+def floating(tracks: Sequence[Track], planes: Sequence[Plane]) -> list[bool]:
+    """Find the objects whose scans stand neither on their plane nor on another object.
 
     The top of a toy table may look like a sponge. But a sponge does not float.
 
     Args:
         tracks: all objects, judged.
-        plane: that they stand on.
+        planes: that each of them stands on.
 
     Returns:
         Whether each floats; never one that has no scan.
     """
-    axes = np.linalg.svd(plane.normal[None])[2][1:]
-    return [
-        _floats(track, [other for other in tracks if other is not track], plane, axes)
-        for track in tracks
-    ]
+    found = []
+    for track, plane in zip(tracks, planes, strict=True):
+        axes = np.linalg.svd(plane.normal[None])[2][1:]
+        others = [other for other in tracks if other is not track]
+        found.append(_floats(track, others, plane, axes))
+    return found
 
 
 def _floats(track: Track, others: Sequence[Track], plane: Plane, axes: Float) -> bool:

@@ -32,10 +32,11 @@ from nextview.scene.objects import SceneObject
 from nextview.scene.parting import GOOD_FIT, Bench, merged, new_track, part, taken_over
 from nextview.scene.state import MOST_VERIFIED, SceneState
 from nextview.scene.tracks import Track, render_track
-from nextview.segmentation.instances import Segmenter, masks_of
+from nextview.segmentation.instances import Instances, Segmenter, instances_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import KnownFrames
 from nextview.sensing.object_frame import Box, upright_axes
+from nextview.sensing.planes import Plane
 from nextview.sensing.support import GroundPlane
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
@@ -109,7 +110,9 @@ class Scene:
             of the last frame.
         reachable: says of a camera-to-world pose, (4, 4), whether the camera can be brought there.
         segmentation: a segmentation of your own: from a frame to the pixels of each thing,
-            (N, H, W) bool, or to labels, (H, W) int, 0 for none. None for the one built in.
+            (N, H, W) bool, to labels, (H, W) int, 0 for none, or to a ``Segmentation``. Where it
+            tells surfaces, things stand on these, and what stands on none is left out. None for the
+            one built in.
     """
 
     def __init__(
@@ -227,7 +230,7 @@ class Scene:
             ground = before.tops[0].ground if before.tops else None
             given = None
             if self.segmentation is not None:
-                given = masks_of(self.segmentation, frame)
+                given = instances_of(self.segmentation, frame)
             top = self._top_of(frame, ground, before.tracks, given)
             shown = top.plane if top.shows_ground else None
             top = replace(top, warnings=tuple(known.check(frame, shown)))
@@ -283,7 +286,7 @@ class Scene:
         frame: Frame,
         ground: GroundPlane | None,
         tracks: Sequence[Track],
-        given: Sequence[Mask] | None,
+        given: Instances | None,
     ) -> TableTop:
         """What a frame shows on the ground, which is looked for if it is not known.
 
@@ -291,6 +294,7 @@ class Scene:
             ObservationError: no support plane is seen.
         """
         known = [_sphere(track) for track in tracks]
+        before = self._state.tops[-1].supports if self._state.tops else None
         return TableTop.of(
             frame,
             self.up,
@@ -298,7 +302,9 @@ class Scene:
             known,
             self.region,
             self._widest,
-            given,
+            None if given is None else given.masks,
+            None if given is None else given.surface,
+            () if before is None or ground is None else before.levels,
         )
 
     def _judged_anew(self, last: TableTop) -> tuple[SceneState, Look]:
@@ -311,7 +317,7 @@ class Scene:
         anew = SceneState(region=self.region)
         tops = [
             replace(
-                self._top_of(old.frame, last.ground, anew.tracks, old.given),
+                self._top_of(old.frame, last.ground, anew.tracks, _instances(old)),
                 warnings=old.warnings,
             )
             for old in before.tops
@@ -445,6 +451,19 @@ def _sphere(track: Track) -> tuple[Float, float]:
     return frame.centre, frame.radius
 
 
+def _instances(top: TableTop) -> Instances | None:
+    """What a segmentation said of a frame; None where none was asked."""
+    if top.given is None:
+        return None
+    return Instances(top.given, None if top.supports is None else top.supports.surface)
+
+
+def _stands_on(track: Track, top: TableTop) -> Plane:
+    """The plane that an object stands on: the ground, or the surface that carries it."""
+    plane = track.thing.sightings[-1].plane
+    return top.plane if top.supports is None or plane is None else plane
+
+
 def _most_pixels(masks: Sequence[Mask]) -> list[bool]:
     """Whether each mask, (H, W) bool, is one of the largest, which are verified in a frame."""
     order = sorted(range(len(masks)), key=lambda row: -np.count_nonzero(masks[row]))
@@ -498,7 +517,7 @@ def _numbered(
     changed = {*gone, *moved, *(ended for ended, _ in joined)}
     touching = {pair for pair in state.touching if not set(pair) & changed}
     touching |= _touching(kept, state.tops[-1], len(state.tops) - 1)
-    in_the_air = floating(kept, state.tops[-1].plane)
+    in_the_air = floating(kept, [_stands_on(track, state.tops[-1]) for track in kept])
     small = fragments(kept, touching)
     after = replace(
         state,

@@ -83,6 +83,11 @@ class SceneState:
                 ViewWarning("left unknown", f"{what}, the largest first", holds=False)
             )
 
+        if self.tops and (left_out := len(self.tops[-1].carried_by_none)):
+            things = number_of(left_out, "thing")
+            what = f"{things} in the last frame left out: no surface that is seen carries them"
+            remarks.append(ViewWarning("left out", what, holds=False))
+
         if self.unexplained:
             area = 1e4 * sum(patch.area for patch in self.unexplained)
             what = f"{area:.0f} square centimetres in view are neither ground nor an object"

@@ -119,6 +119,8 @@ def _patches(
             left &= top.free
     if frame.mask is not None:
         left &= frame.mask
+    for mask in top.carried_by_none:
+        left &= ~mask
     for track in tracks:
         own = track.mask_in(number)
         if own is not None:
@@ -152,6 +154,7 @@ def _patches(
 
 def _ground_of(top: TableTop) -> Float:
     """Some points of the ground that a frame shows, (N, 3), world, metres."""
-    rows, columns = np.nonzero(_near_ground(top) & (top.frame.depth > 0))
+    shown = _near_ground(top) & (top.frame.depth > 0) & ~top.other_surfaces
+    rows, columns = np.nonzero(shown)
     few = slice(None, None, max(1, len(rows) // GROUND_POINTS))
     return top.frame.positions(rows[few], columns[few])

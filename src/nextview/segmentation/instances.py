@@ -3,23 +3,54 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nextview.checks import one_line
 from nextview.errors import ObservationError
 from nextview.geometry.observation import array_of
 from nextview.segmentation.features import features, shrink
 from nextview.segmentation.network import load_network
-from nextview.segmentation.parting import part, sharpen
+from nextview.segmentation.parting import part, sharpen, surface_of
 from nextview.sensing.frame import Frame
+from nextview.sensing.object_frame import upright_axes
 from nextview.types import Index, Mask
 
+
+@dataclass(frozen=True, eq=False)
+class Segmentation:
+    """What a segmentation says of a frame.
+
+    Attributes:
+        labels: number of the thing that each pixel shows, (H, W) int; 0 for none.
+        surface: pixels of what carries things, such as floors, tables and the bottoms of bins,
+            (H, W) bool; None where the segmentation does not tell them.
+    """
+
+    labels: Index
+    surface: Mask | None = None
+
+
 Segmenter = Callable[[Frame], Any]
-"""From a frame to the pixels of each thing, (N, H, W) bool, or to the number of the thing that each
-pixel shows, (H, W) int, 0 for none."""
+"""From a frame to a ``Segmentation``, or only to the pixels of each thing, (N, H, W) bool, or to
+the number of the thing that each pixel shows, (H, W) int, 0 for none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Instances:
+    """The things in a frame.
+
+    Attributes:
+        masks: pixels of each thing, (H, W) bool each.
+        surface: pixels of what carries things, (H, W) bool; None where that is not told.
+    """
+
+    masks: tuple[Mask, ...]
+    surface: Mask | None = None
 
 
 class LearnedSegmenter:
@@ -30,28 +61,48 @@ class LearnedSegmenter:
 
     Args:
         card: path of the network's card.
+        up: direction against gravity in the world of the frames, (3,); None: it is not known, as
+            always for frames without a pose.
 
     Raises:
         ModelError: card or network are missing or damaged.
     """
 
-    def __init__(self, card: str | Path) -> None:
+    def __init__(
+        self,
+        card: str | Path,
+        up: ArrayLike | None = (0.0, 0.0, 1.0),
+    ) -> None:
+        self.card = card
+        self.up = None if up is None else upright_axes(up)[2]
         self.network = load_network(card)
 
-    def __call__(self, frame: Frame) -> Index:
-        """Return the thing of each pixel from 1 on, 0 for none, (H, W) int64.
+    def __reduce__(self) -> tuple[type[LearnedSegmenter], tuple[Any, ...]]:
+        """It is pickled as the path of its card."""
+        return LearnedSegmenter, (self.card, self.up)
+
+    def __call__(self, frame: Frame) -> Segmentation:
+        """Return the thing that each pixel shows, and the surfaces.
 
         Args:
-            frame: of a depth camera. With a pose, gravity points along -z of the world.
+            frame: of a depth camera.
         """
         picture = shrink(frame.depth, frame.rays)
-        up = None if frame.pose is None else frame.camera_to_world[2, :3]
+        up = None
+        if frame.pose is not None and self.up is not None:
+            up = self.up @ frame.camera_to_world[:3, :3]
         output = self.network(features(picture, up))
-        labels = part(output, picture.depth > 0)
-        return sharpen(labels, picture, frame.depth)
+        valid = picture.depth > 0
+        labels = part(output, valid)
+
+        surface_label = int(labels.max(initial=0)) + 1
+        labels[surface_of(output, valid) & (labels == 0)] = surface_label
+        sharp = sharpen(labels, picture, frame.depth)
+        surface = sharp == surface_label
+        return Segmentation(np.where(surface, 0, sharp), surface)
 
 
-def masks_of(segmentation: Segmenter, frame: Frame) -> list[Mask]:
+def instances_of(segmentation: Segmenter, frame: Frame) -> Instances:
     """Ask a segmentation for the things in a frame.
 
     Args:
@@ -59,21 +110,44 @@ def masks_of(segmentation: Segmenter, frame: Frame) -> list[Mask]:
         frame: of a depth camera.
 
     Returns:
-        The pixels of each thing, (H, W) bool each.
+        The pixels of each thing, and of the surfaces if they are told.
 
     Raises:
         ObservationError: what it returned are no masks or labels of the frame.
     """
     given = segmentation(frame)
+    if not isinstance(given, Segmentation):
+        return Instances(_masks(given, frame))
+
+    masks = _masks(given.labels, frame)
+    if given.surface is None:
+        return Instances(masks)
+    surface = array_of(given.surface, "the surface of a segmentation")
+    if surface.dtype != bool or surface.shape != frame.shape:
+        raise ObservationError(
+            f"the surface of a segmentation is (H, W) bool, {frame.shape}, not"
+            f" {one_line(f'{surface.shape} {surface.dtype}')}"
+        )
+    for mask in masks:
+        surface = surface & ~mask
+    return Instances(masks, surface)
+
+
+def _masks(given: Any, frame: Frame) -> tuple[Mask, ...]:
+    """The pixels of each thing, by masks or labels.
+
+    Raises:
+        ObservationError: these are neither.
+    """
     if isinstance(given, Sequence) and not isinstance(given, str) and len(given):
         given = np.stack([array_of(mask, "a mask") for mask in given])
     values = array_of(given, "a segmentation")
     if values.size == 0:
-        return []
+        return ()
     if values.dtype == bool and values.shape[1:] == frame.shape:
-        return list(values)
+        return tuple(values)
     if np.issubdtype(values.dtype, np.integer) and values.shape == frame.shape:
-        return [values == number for number in np.unique(values[values > 0])]
+        return tuple(values == number for number in np.unique(values[values > 0]))
     raise ObservationError(
         "a segmentation returns masks, (N, H, W) bool, or labels, (H, W) int, of the frame,"
         f" {frame.shape}, not {one_line(f'{values.shape} {values.dtype}')}"

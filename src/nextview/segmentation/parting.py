@@ -18,6 +18,7 @@ from nextview.segmentation.network import (
 from nextview.types import Float32, Index, Mask
 
 THING_CLASS = OUTPUT_CLASSES.index("thing")
+SURFACE_CLASS = OUTPUT_CLASSES.index("surface")
 LIMIT_OF_ODDS = 4.0  # log-odds of one pair beyond which it says no more
 EDGE_SHARPNESS = (
     60.0  # steps of a sixtieth of the depth count as much as a pixel of the picture
@@ -66,6 +67,16 @@ def part(output: Float32, valid: Mask) -> Index:
         region = region + 1
     label = _contracted(region[pairs], weight, int(region.max(initial=0)) + 1)
     return label[region].reshape(thing.shape)
+
+
+def surface_of(output: Float32, valid: Mask) -> Mask:
+    """Return the pixels of what carries things, (h, w) bool.
+
+    Args:
+        output: of the network, (15, h, w).
+        valid: pixels with depth, (h, w) bool.
+    """
+    return valid & (output[: len(OUTPUT_CLASSES)].argmax(0) == SURFACE_CLASS)
 
 
 def pair_slices(

@@ -149,6 +149,12 @@ class Frame:
         object.__setattr__(other, "depth", depth)
         return other
 
+    def with_mask(self, mask: Mask) -> "Frame":
+        """The same frame with a mask of its object, (H, W) bool, that holds pixels with depth."""
+        other = copy(self)  # what was checked is right
+        object.__setattr__(other, "mask", mask)
+        return other
+
     @property
     def camera(self) -> PinholeCamera:
         """The pinhole camera that took the frame."""

@@ -34,6 +34,7 @@ from nextview.sensing.support_plane import (
     NO_SUPPORT,
     base_below_view,
     find_support_plane,
+    refuse_mistakes,
 )
 from nextview.sensing.view_warning import ViewWarning
 from nextview.sensing.walls import before_walls, find_walls
@@ -61,6 +62,17 @@ MAY_BE_TWO = ViewWarning(
     "outline",
     "the object may be two things that touch: name it by a mask or a box, or move them apart",
 )
+
+
+@dataclass(frozen=True)
+class Carried:
+    """What a segmentation says of what an object stands on.
+
+    Attributes:
+        plane: of the surface that carries it; None where none that is seen does.
+    """
+
+    plane: Plane | None
 
 
 @dataclass(frozen=True)
@@ -170,12 +182,16 @@ class ObservedObject:
         """How often earlier observations changed."""
         return self.state.revision
 
-    def add(self, frame: Frame) -> Observation:
+    def add(self, frame: Frame, carried: Carried | None = None) -> Observation:
         """Take in a frame and return its observation from three object radii.
 
         ObservationError where the object is not found in it; the frame is then not taken in.
+
+        Args:
+            frame: of a depth camera.
+            carried: what the object stands on, by a segmentation; None: that is looked for.
         """
-        self.state = self._after(frame)
+        self.state = self._after(frame, carried)
         return self.state.observations[-1]
 
     def reconsider(self, novelty: Callable[[Sequence[Observation]], float]) -> None:
@@ -224,7 +240,7 @@ class ObservedObject:
                 found.append(joins)
         return found
 
-    def _after(self, frame: Frame) -> ObjectState:
+    def _after(self, frame: Frame, carried: Carried | None) -> ObjectState:
         """The state after a frame: all stages from the frame to its observation, in order."""
         before = self.state
         known = self._known_frames
@@ -232,7 +248,7 @@ class ObservedObject:
 
         noise = noise_of(frame)
         samples = self._samples(frame, noise)
-        plane, up, rng = self._find_plane(frame, samples)
+        plane, up, rng = self._find_plane(frame, samples, carried)
         warnings = known.check(frame, plane)
         sightings, may_be_two = self._segment(
             frame,
@@ -309,6 +325,7 @@ class ObservedObject:
         self,
         frame: Frame,
         samples: Samples | None,
+        carried: Carried | None,
     ) -> tuple[Plane | None, Float, np.random.Generator]:
         """Return the support plane, if it is seen, the direction up, (3,), and the generator."""
         before = self.state
@@ -319,13 +336,17 @@ class ObservedObject:
         rng = before.rng
         plane = None
         earlier = [s.plane for s in before.sightings if s.plane is not None]
-        if samples is not None and earlier:
+        if samples is not None and carried is not None and carried.plane is not None:
+            plane = carried.plane
+            if not before.sightings:
+                refuse_mistakes(frame, samples, plane, up)
+        elif samples is not None and earlier:
             near = np.zeros(len(samples.points), bool)
             if before.frame is not None:
                 away = np.linalg.norm(samples.points - before.frame.centre, axis=1)
                 near = away < before.frame.radius
             plane = find_again(earlier[0], samples, near)
-        elif samples is not None:
+        elif samples is not None and carried is None:
             rng = deepcopy(rng)
             plane = find_support_plane(
                 frame,

@@ -363,6 +363,8 @@ def lies_better_as_range(
         if found is None:
             continue
         on = found.holds(its_samples)
+        if not on.any():  # it is known by finer samples
+            continue
         share = max(share, _share_held(samples, on, found.normal))
         held = max(held, _share_held(nearer, on, found.normal))
     return held > RANGE * share

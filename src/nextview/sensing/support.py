@@ -444,6 +444,11 @@ def _goes_on_below(samples: Samples, plane: Plane, thing: Index) -> bool:
 
 def _in_plane(points: Float, plane: Plane) -> Float:
     """Coordinates of points, (N, 3), along a level plane, (N, 2), metres."""
+    return points @ axes_along(plane).T
+
+
+def axes_along(plane: Plane) -> Float:
+    """Two directions along a plane, perpendicular to each other, (2, 3)."""
     first = np.cross(plane.normal, np.eye(3)[np.abs(plane.normal).argmin()])
     first /= np.linalg.norm(first)
-    return points @ np.stack([first, np.cross(plane.normal, first)], 1)
+    return np.stack([first, np.cross(plane.normal, first)])

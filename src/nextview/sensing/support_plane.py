@@ -66,10 +66,7 @@ def find_support_plane(
 
     if up is not None and frame.mask is None and _share(plane, level) < LARGE_SHARE:
         _refuse_wrong_pose(frame, samples, 2 * _share(plane, level), up, rng)
-    if planes.lies_better_as_range(frame, plane, level, rng, up, above):
-        raise ObservationError(
-            "the depth is measured along the rays, a range: give it along the optical axis"
-        )
+    _refuse_range(frame, plane, level, rng, up, above)
     if plane is None or up is None:
         return plane
 
@@ -77,6 +74,45 @@ def find_support_plane(
         plane = _beneath_object(frame, samples, plane, point)
     place = None if frame.mask is not None else point
     return None if support.is_named(frame, samples, plane, place) else plane
+
+
+def refuse_mistakes(
+    frame: Frame,
+    samples: Samples,
+    plane: Plane | None,
+    up: Float | None,
+) -> None:
+    """Refuse a frame whose pose is wrong, or whose depth is a range, by its surfaces.
+
+    Args:
+        frame: the frame.
+        samples: of the surfaces in it.
+        plane: of these, the one that things stand on; None if none is level.
+        up: direction against gravity, (3,), world; None if it is not known.
+
+    Raises:
+        ObservationError: the pose is wrong, or the depth is measured along the rays.
+    """
+    rng = np.random.default_rng(0)
+    level = samples if up is None else samples.some(~steep(samples, up))
+    if up is not None and _share(plane, level) < LARGE_SHARE:
+        _refuse_wrong_pose(frame, samples, 2 * _share(plane, level), up, rng)
+    _refuse_range(frame, plane, level, rng, up, None)
+
+
+def _refuse_range(
+    frame: Frame,
+    plane: Plane | None,
+    level: Samples,
+    rng: Generator,
+    up: Float | None,
+    above: Float | None,
+) -> None:
+    """Refuse a frame that fits a plane better if its depth is taken along each ray."""
+    if planes.lies_better_as_range(frame, plane, level, rng, up, above):
+        raise ObservationError(
+            "the depth is measured along the rays, a range: give it along the optical axis"
+        )
 
 
 def base_below_view(samples: Samples, up: Float, point: Float) -> Plane | None:

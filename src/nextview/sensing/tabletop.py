@@ -15,6 +15,7 @@ from nextview.sensing.clusters import Joins
 from nextview.sensing.convex_pieces import STANDS, Pieces, cut
 from nextview.sensing.facets import Noise, noise_of
 from nextview.sensing.frame import Frame, within
+from nextview.sensing.levels import Supports, SurfaceLevel
 from nextview.sensing.mask_edges import trimmed
 from nextview.sensing.object_frame import Box, upright_axes
 from nextview.sensing.planes import LEAST_SUPPORT, Plane, Samples, sample
@@ -24,6 +25,7 @@ from nextview.sensing.support_plane import (
     MASK_POINTS,
     NO_SUPPORT,
     find_support_plane,
+    refuse_mistakes,
 )
 from nextview.sensing.view_warning import ViewWarning
 from nextview.sensing.walls import before_walls, find_walls
@@ -59,7 +61,8 @@ class TableTop:
         up: direction against gravity, (3,), world.
         above: pixels above the plane, before all walls and inside the region, (H, W) bool.
         free: pixels before all walls, (H, W) bool; None where there is no wall.
-        height: of each pixel over the plane, (H, W) float32, metres.
+        height: of each pixel over the plane, (H, W) float32, metres; where a segmentation tells
+            surfaces, over the one that carries what it shows.
         levels: level planes over a ground that may be a part of a thing, the highest first: table
             tops, seats. On one of them another thing may stand.
         lower: whether the frame shows that the ground of earlier frames is none, and a lower one.
@@ -67,6 +70,8 @@ class TableTop:
         warnings: about the frame.
         given: pixels of each thing by a segmentation of the user's own, (H, W) bool each; None
             where there is none.
+        supports: the surfaces that a segmentation tells, and what stands on each; None where it
+            tells none.
     """
 
     frame: Frame
@@ -81,6 +86,7 @@ class TableTop:
     shows_ground: bool = True
     warnings: tuple[ViewWarning, ...] = ()
     given: tuple[Mask, ...] | None = None
+    supports: Supports | None = None
 
     @classmethod
     def of(
@@ -92,6 +98,8 @@ class TableTop:
         region: Box | None = None,
         widest: float | None = None,
         given: Sequence[Mask] | None = None,
+        surface: Mask | None = None,
+        levels: Sequence[SurfaceLevel] = (),
     ) -> TableTop:
         """Find the support plane of a frame, and what is above it.
 
@@ -105,11 +113,25 @@ class TableTop:
                 no larger may be a part of it. None: it is not known.
             given: pixels of each thing by a segmentation of the user's own, (H, W) bool each; None
                 where there is none.
+            surface: pixels of the surfaces by this segmentation, (H, W) bool: the ground is the
+                one that carries most of the things. None where it tells none.
+            levels: of the surfaces of earlier frames.
 
         Raises:
             ObservationError: no support plane is seen.
         """
         noise = noise_of(frame)
+        inside = frame.depth > 0 if frame.mask is None else frame.mask
+        if region is not None:
+            inside = inside & segmentation.inside_box(frame, region)
+        masks = None if given is None else tuple(mask & inside for mask in given)
+        if masks is not None and surface is not None:
+            upright = _upright(frame, up)
+            if upright is None and ground is not None:
+                upright = ground.plane.normal
+            supports = Supports.of(frame, masks, surface, noise, upright, levels)
+            return cls._on_surfaces(supports, noise, up, ground, inside, widest)
+
         samples = sample(frame, frame.depth > 0, noise)
         lower = False
         shows_ground = True
@@ -139,14 +161,11 @@ class TableTop:
         free = before_walls(frame, walls, noise) if walls else None
         if free is not None:
             above &= free
-        inside = frame.depth > 0 if frame.mask is None else frame.mask
-        if region is not None:
-            inside = inside & segmentation.inside_box(frame, region)
         above &= inside
         height = frame.along(plane.normal, plane.offset)
         above &= height > UNEVEN_DEVIATIONS * _unevenness(frame, height)
         upwards = plane.normal if up is None or frame.pose is None else up
-        levels = () if ground.wide else support.level_planes(samples, plane)[:-1]
+        below = () if ground.wide else support.level_planes(samples, plane)[:-1]
         return cls(
             frame,
             noise,
@@ -155,10 +174,81 @@ class TableTop:
             above,
             free,
             height,
-            tuple(levels),
+            tuple(below),
             lower,
             shows_ground,
-            given=None if given is None else tuple(mask & inside for mask in given),
+            given=masks,
+        )
+
+    @classmethod
+    def _on_surfaces(
+        cls,
+        supports: Supports,
+        noise: Noise,
+        up: Float | None,
+        ground: GroundPlane | None,
+        inside: Mask,
+        widest: float | None,
+    ) -> TableTop:
+        """What stands on the surfaces that a segmentation tells, see ``of``.
+
+        Args:
+            supports: the surfaces, and what each of them carries.
+            noise: of the frame.
+            up: direction against gravity, (3,), world; None: the normal of the plane.
+            ground: as an earlier frame shows it; None: it is looked for.
+            inside: pixels where is looked, (H, W) bool.
+            widest: diameter of the largest thing that is looked for, metres; None: any.
+        """
+        frame = supports.frame
+        level = (
+            supports.ground(inside, widest)
+            if ground is None
+            else supports.again(ground.plane)
+        )
+        if ground is None:
+            upright = _upright(frame, up)
+            shown = sample(frame, supports.surface & (frame.depth > 0), noise)
+            refuse_mistakes(
+                frame, shown, None if level is None else level.plane, upright
+            )
+            if level is None:
+                raise ObservationError(NO_SUPPORT)
+            ground = GroundPlane(level.plane)
+        elif level is not None:
+            ground = replace(ground, plane=level.plane)
+        plane = ground.plane
+
+        height = frame.along(plane.normal, plane.offset)
+        for other in supports.levels:
+            on = other.pixels
+            height[on] = frame.along(other.plane.normal, other.plane.offset)[on]
+        above = np.zeros(frame.shape, bool)
+        for mask, carrier in zip(supports.masks, supports.carriers, strict=True):
+            if carrier is None or not mask.any():
+                continue
+            part = within(mask)
+            own = mask[part]
+            under = carrier.plane
+            raised = frame.along(under.normal, under.offset, part)
+            height[part][own] = raised[own]
+            above[part] |= own & segmentation.above_plane(frame, under, noise, part)
+
+        samples = sample(frame, frame.depth > 0, noise)
+        walls = find_walls(samples, plane, np.random.default_rng(0))
+        free = before_walls(frame, walls, noise) if walls else None
+        upwards = plane.normal if up is None or frame.pose is None else up
+        return cls(
+            frame,
+            noise,
+            ground,
+            upwards,
+            above,
+            free,
+            height,
+            shows_ground=level is not None,
+            given=supports.masks,
+            supports=supports,
         )
 
     @property
@@ -166,12 +256,39 @@ class TableTop:
         """The plane that things stand on."""
         return self.ground.plane
 
+    @property
+    def carried_by_none(self) -> tuple[Mask, ...]:
+        """Pixels of each thing that no surface carries, (H, W) bool each.
+
+        None where no segmentation tells surfaces.
+        """
+        if self.supports is None:
+            return ()
+        pairs = zip(self.supports.masks, self.supports.carriers, strict=True)
+        return tuple(
+            mask
+            for mask, carrier in pairs
+            if carrier is None and np.count_nonzero(mask) >= FEWEST_OBJECT_PIXELS
+        )
+
+    @property
+    def other_surfaces(self) -> Mask:
+        """Pixels of surfaces other than the ground, (H, W) bool."""
+        found = np.zeros(self.frame.shape, bool)
+        for level in () if self.supports is None else self.supports.levels:
+            if level.plane is not self.plane:
+                found |= level.pixels
+        return found
+
     def under(self, mask: Mask) -> Plane:
         """The plane that a thing stands on: the highest beside its bottom, or the ground.
 
         Args:
             mask: its pixels, (H, W) bool.
         """
+        if self.supports is not None:
+            level = self.supports.under(mask)
+            return self.plane if level is None else level.plane
         if not self.levels:
             return self.plane
         rows, columns = np.nonzero(mask & (self.frame.depth > 0))
@@ -248,8 +365,11 @@ class TableTop:
     def _given_segments(self) -> list[Mask]:
         """The things of the masks that were given, those with most pixels first."""
         assert self.given is not None
+        left_out = {id(mask) for mask in self.carried_by_none}
         found = []
         for mask in self.given:
+            if id(mask) in left_out:
+                continue
             inside = mask & (self.frame.depth > 0)
             if np.count_nonzero(inside) < FEWEST_OBJECT_PIXELS:
                 continue
@@ -375,13 +495,18 @@ def _find_ground(
     Raises:
         ObservationError: no support plane is seen.
     """
-    upright = None if up is None or frame.pose is None else upright_axes(up)[2]
-    plane = find_support_plane(frame, samples, upright, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    plane = find_support_plane(frame, samples, _upright(frame, up), rng)
     if plane is None:
         raise ObservationError(NO_SUPPORT)
     if widest is None:
         return GroundPlane(plane)
     return support.ground_of(samples, plane, widest)
+
+
+def _upright(frame: Frame, up: Float | None) -> Float | None:
+    """Direction against gravity, (3,), of unit length; None where a frame does not tell it."""
+    return None if up is None or frame.pose is None else upright_axes(up)[2]
 
 
 def _unevenness(frame: Frame, height: Float32) -> float:

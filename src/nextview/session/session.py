@@ -62,6 +62,7 @@ from nextview.things.expected_views import Goal, Outlook
 from nextview.types import Float, Mask
 
 if TYPE_CHECKING:
+    from nextview.segmentation.instances import Segmenter
     from nextview.sensing.observed_object import ObservedObject
 
 # times that the size of a taught thing is off, half hidden say, which none has
@@ -146,6 +147,8 @@ class Session:
         distance: of the camera from the object's centre, metres; ``sphere.distance`` object radii
             by default.
         unknown: share of objects of known classes that may be called unknown; 0: none.
+        segmentation: that tells the things in frames, see ``Scene``: the object is the one that its
+            point, its box or the camera's aim chooses. None for the one built in.
 
     Raises:
         SessionError: the models lack what the policy needs.
@@ -162,6 +165,7 @@ class Session:
         object: ObservedObject | None = None,
         distance: float | None = None,
         unknown: float = 0.0,
+        segmentation: Segmenter | None = None,
     ) -> None:
         _check_needs(policy, models)
         if object is not None and not hasattr(object, "sightings"):
@@ -181,6 +185,7 @@ class Session:
         )
         self.stopping = stopping or Stopping.of(models.recogniser.calibration)
         self.unknown = unknown
+        self.segmentation = segmentation
         self.views: list[View] = []
         self._goal: Goal = "thing"
         self.observers: list[Callable[[Session], None]] = []
@@ -655,9 +660,13 @@ class Session:
         try:
             if (repeated := after_repeated(before, frame, self._before)) is not None:
                 object.state = repeated
-            else:
+            elif self.segmentation is None:
                 object.add(frame)
                 self._reconsider(object)
+            else:
+                from nextview.segmentation.choosing import choose_instance
+
+                object.add(*choose_instance(self.segmentation, frame, object))
 
             self._refuse_disagreement(object)
             self._check_distance(object)

@@ -47,6 +47,7 @@ from nextview.things.several import SeveralRecognisers
 
 if TYPE_CHECKING:
     from nextview.captured.camera import CapturedCamera
+    from nextview.segmentation.instances import Segmenter
     from nextview.sensing.observed_object import ObservedObject
     from nextview.simulation.sensor import Sensor
 
@@ -102,6 +103,7 @@ class System:
         clearance: float | None = None,
         any_orientation: bool = False,
         goal: Goal = "thing",
+        segmentation: "Segmenter | None" = None,
     ) -> Session:
         """Create a session for one object; a robot needs to give only a distance.
 
@@ -127,6 +129,8 @@ class System:
                 by a mask or in a box, with ``ObservedObject(support=False)``.
             goal: "thing" looks until it is sure which thing it is; "pose" until its pose is as
                 sure, too, see ``Session.goal``.
+            segmentation: that tells the things in frames, as that of a ``Scene``; the object is one
+                of these.
 
         Raises:
             ModelError: things in any orientation are recognised by their geometry, and the models
@@ -137,7 +141,9 @@ class System:
         start = drawn if start is None else start
         options = (self.stopping, rng, object, distance, self.unknown)
         models = _in_any_orientation(self.models) if any_orientation else self.models
-        session = Session(models, self.policy, self.sphere, start, *options)
+        session = Session(
+            models, self.policy, self.sphere, start, *options, segmentation
+        )
         session.limits = Limits(min_height, max_height, clearance)
         session.goal = goal
         return session
