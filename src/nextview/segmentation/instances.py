@@ -56,11 +56,10 @@ class Instances:
 class LearnedSegmenter:
     """A trained network as a segmentation.
 
-    >>> own = LearnedSegmenter("models/segmentation.json")                      # doctest: +SKIP
-    >>> scene = nextview.Scene("ycb", segmentation=own)                         # doctest: +SKIP
+    >>> scene = nextview.Scene("ycb", segmentation=LearnedSegmenter())          # doctest: +SKIP
 
     Args:
-        card: path of the network's card.
+        card: path of the network's card; None for the bundled network.
         up: direction against gravity in the world of the frames, (3,); None: it is not known, as
             always for frames without a pose.
 
@@ -70,7 +69,7 @@ class LearnedSegmenter:
 
     def __init__(
         self,
-        card: str | Path,
+        card: str | Path | None = None,
         up: ArrayLike | None = (0.0, 0.0, 1.0),
     ) -> None:
         self.card = card

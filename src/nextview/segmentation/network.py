@@ -12,6 +12,7 @@ from nextview.runtime import check_end, open_onnx, run_onnx
 from nextview.segmentation.features import PICTURE_CHANNELS, SIDE_MULTIPLE
 from nextview.types import Float32
 
+BUNDLED_NETWORK = Path(__file__).parent / "bundled" / "segmentation.json"
 PICTURE_INPUT = "features"
 PICTURE_OUTPUT = "output"
 OUTPUT_CLASSES = (
@@ -180,13 +181,13 @@ class SegmentationNetwork:
         return found[0][0, :, :height, :width]
 
 
-def load_network(path: str | Path) -> SegmentationNetwork:
+def load_network(path: str | Path | None = None) -> SegmentationNetwork:
     """Open a segmentation network.
 
     Args:
-        path: of its card.
+        path: of its card; None for the bundled one.
 
     Raises:
         ModelError: see ``SegmentationNetwork``.
     """
-    return SegmentationNetwork(Path(path))
+    return SegmentationNetwork(BUNDLED_NETWORK if path is None else Path(path))
