@@ -19,10 +19,13 @@ from nextview.types import Float32, Index, Mask
 
 THING_CLASS = OUTPUT_CLASSES.index("thing")
 SURFACE_CLASS = OUTPUT_CLASSES.index("surface")
+# added to all log-odds: the training counts pairs of different things four times
+JOINING_ODDS = 0.7
 LIMIT_OF_ODDS = 4.0  # log-odds of one pair beyond which it says no more
 EDGE_SHARPNESS = (
     60.0  # steps of a sixtieth of the depth count as much as a pixel of the picture
 )
+SCRAP_PIXELS = 16  # of an instance that is none of its own, but a piece of an edge
 CERTAIN_ODDS = 2.0  # of all neighbours around a pixel, to be joined before all others
 
 
@@ -43,11 +46,12 @@ def part(output: Float32, valid: Mask) -> Index:
     thing = valid & (output[: len(OUTPUT_CLASSES)].argmax(0) == THING_CLASS)
     size = thing.size
     at = np.arange(size).reshape(thing.shape)
-    certain = _certain(output[AFFINITY_OUTPUTS])
+    of_pairs = output[AFFINITY_OUTPUTS] + JOINING_ODDS
+    certain = _certain(of_pairs)
     ends = []
     odds = []
     joining = []
-    for values, step in zip(output[AFFINITY_OUTPUTS], AFFINITY_STEPS, strict=True):
+    for values, step in zip(of_pairs, AFFINITY_STEPS, strict=True):
         first, second = pair_slices(thing.shape, *step)
         both = thing[first] & thing[second]
         ends.append(np.stack([at[first][both], at[second][both]]))
@@ -66,7 +70,35 @@ def part(output: Float32, valid: Mask) -> Index:
     if used[0] != 0:  # every pixel is of a thing
         region = region + 1
     label = _contracted(region[pairs], weight, int(region.max(initial=0)) + 1)
-    return label[region].reshape(thing.shape)
+    return _without_scraps(label[region], pairs, weight).reshape(thing.shape)
+
+
+def _without_scraps(labels: Index, pairs: Index, weight: Float32) -> Index:
+    """Join each scrap of few pixels to the instance with which its pairs have the highest odds.
+
+    Args:
+        labels: instance of each pixel from 1 on, 0 for none, (P,).
+        pairs: pixels of the two ends of each pair, (2, E).
+        weight: log-odds of each, (E,).
+    """
+    sizes = np.bincount(labels)
+    scrap = sizes < SCRAP_PIXELS
+    scrap[0] = False
+    ends = labels[pairs]
+    other = np.concatenate([ends, ends[::-1]], 1)
+    odds = np.concatenate([weight, weight])
+    out = scrap[other[0]] & ~scrap[other[1]] & (other[1] > 0)
+    if not out.any():
+        return labels
+    one, two = other[:, out]
+    keys, which, count = np.unique(
+        one * len(sizes) + two, return_inverse=True, return_counts=True
+    )
+    mean = np.bincount(which, odds[out]) / count
+    order = np.argsort(mean, kind="stable")  # the last one that is written stays
+    owner = np.arange(len(sizes))
+    owner[keys[order] // len(sizes)] = keys[order] % len(sizes)
+    return np.unique(owner[labels], return_inverse=True)[1] + (owner[labels].min() > 0)
 
 
 def surface_of(output: Float32, valid: Mask) -> Mask:
