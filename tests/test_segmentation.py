@@ -231,3 +231,17 @@ def test_a_scene_refuses_masks_of_another_frame(ycb, ycb_meshes):
     with pytest.raises(ObservationError, match=r"segmentation"):
         scene.update(camera.frame(view(20)))
     assert scene.frames == ()
+
+
+def test_the_bundled_network_parts_things_that_stand_apart(ycb_meshes):
+    names = ["cracker_box", "tomato_soup_can", "mug"]
+    camera = camera_over([ycb_meshes[name] for name in names])
+    found = LearnedSegmenter()(camera.frame(view(20)))
+    for number in range(len(names)):
+        own = camera.owner == number
+        there = found.labels[own]
+        best = np.bincount(there[there > 0]).argmax()
+        both = (found.labels == best) & own
+        assert both.sum() > 0.8 * ((found.labels == best) | own).sum()
+    ground = (camera.owner < 0) & (camera.frame(view(20)).depth > 0)
+    assert found.surface[ground].mean() > 0.9
