@@ -1,7 +1,7 @@
 """Point-pair features as a recogniser of taught things, on the same frames as the package's own.
 
     python -m research.point_pairs YCB [--things mug bowl ...] [--draws 1 2 3] [--every 1]
-        [--resting] [--any-orientation]
+        [--poses thrown] [--any-orientation]
 
 Drost et al., "Model globally, match locally: Efficient and robust 3D object recognition", CVPR
 2010, as OpenCV's contributed module ``ppf_match_3d`` has it: ``pip install './research[ppf]'``. Its
@@ -40,7 +40,15 @@ from rich.progress import track
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from benchmarks.verified_things import Episode, Setting, Taught, judged, moved, shown
+from benchmarks.verified_things import (
+    Episode,
+    Poses,
+    Setting,
+    Taught,
+    judged,
+    moved,
+    shown,
+)
 from nextview.cli.exit_status import orderly_end
 from nextview.errors import UsageError
 from nextview.geometry.observation import Observation
@@ -312,7 +320,7 @@ def main(
     draws: tuple[int, ...] = (1,),
     every: int = 1,
     sensor: str = "wrist",
-    resting: bool = False,
+    poses: Poses = "scanned",
     any_orientation: bool = False,
 ) -> None:
     """Show things, and recognise each in both ways.
@@ -324,7 +332,7 @@ def main(
         draws: numbers of the draws; each is another azimuth, view and noise.
         every: show every so many of the things only.
         sensor: what the views are taken with.
-        resting: show things in any pose that they can rest in.
+        poses: show things as they were scanned, as they fall, or as people stand them up.
         any_orientation: show things that hang in a room, turned at random about all axes.
     """
     cv2.setNumThreads(1)
@@ -339,7 +347,7 @@ def main(
     begun = time.process_time()
     pairs = PointPairs([taught.surfaces[k] for k in some])
     learned = time.process_time() - begun
-    setting = Setting(sensor, 1, resting, 0, any_orientation)
+    setting = Setting(sensor, 1, poses, 0, any_orientation)
     known = taught.things(some)
     if any_orientation:
         known = known.in_any_orientation()
