@@ -122,7 +122,7 @@ def beside(taught: Taught, episodes: Sequence[Episode], draw: int) -> list[Outco
     known = sorted({taught.names.index(episode.name) for episode in episodes})
     some = np.array(known)
     things = taught.things(some).in_any_orientation()
-    setting = Setting("wrist", VIEWS, resting=False, clutter=0, any_orientation=True)
+    setting = Setting("wrist", VIEWS, poses="scanned", clutter=0, any_orientation=True)
     outcomes = []
     for number, episode in enumerate(track(episodes, "nextview")):
         thing = taught.names.index(episode.name)
