@@ -244,9 +244,11 @@ def solids_of(entries: Sequence[Entry], count: int, rng: Generator) -> list[Soli
             mesh = load_mesh(entry.path, max_faces=LARGEST_SHAPE)
         except MeshError:
             continue
+
         size = life_radius(mesh, entry.label, rng) if entry.label in LIFE_SIZES else 1.0
         vertices = mesh.vertices * size
-        low, high = vertices.min(0), vertices.max(0)
+        low = vertices.min(0)
+        high = vertices.max(0)
         foot = np.append((low + high)[:2] / 2, low[2])
         solids.append((vertices - foot, mesh.faces))
     return solids

@@ -84,17 +84,20 @@ def _without_scraps(labels: Index, pairs: Index, weight: Float32) -> Index:
     sizes = np.bincount(labels)
     scrap = sizes < SCRAP_PIXELS
     scrap[0] = False
+
     ends = labels[pairs]
     other = np.concatenate([ends, ends[::-1]], 1)
     odds = np.concatenate([weight, weight])
     out = scrap[other[0]] & ~scrap[other[1]] & (other[1] > 0)
     if not out.any():
         return labels
+
     one, two = other[:, out]
     keys, which, count = np.unique(
         one * len(sizes) + two, return_inverse=True, return_counts=True
     )
     mean = np.bincount(which, odds[out]) / count
+
     order = np.argsort(mean, kind="stable")  # the last one that is written stays
     owner = np.arange(len(sizes))
     owner[keys[order] // len(sizes)] = keys[order] % len(sizes)

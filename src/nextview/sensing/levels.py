@@ -288,6 +288,7 @@ def _found(
         plane = find_plane(samples, rng, up)
         if plane is None:
             break
+
         own = samples.some(plane.holds(samples))
         height = np.abs(frame.along(plane.normal, plane.offset))
         on = left & (height < apart)
@@ -296,6 +297,7 @@ def _found(
         if wide and sides is not None and not _beside(own, found):
             tolerance = float(np.median(own.tolerance))
             found.append(SurfaceLevel(plane, axes_along(plane), sides, tolerance, on))
+
         left = left & (height > 2 * apart)
         if np.count_nonzero(left) < LEAST_LEFT * np.count_nonzero(surface):
             break

@@ -157,14 +157,13 @@ class TableTop:
         shows_ground &= ground.seen
 
         above = segmentation.above_plane(frame, plane, noise)
-        walls = find_walls(samples, plane, np.random.default_rng(0))
-        free = before_walls(frame, walls, noise) if walls else None
+        free = _free_of_walls(frame, samples, plane, noise)
         if free is not None:
             above &= free
         above &= inside
         height = frame.along(plane.normal, plane.offset)
         above &= height > UNEVEN_DEVIATIONS * _unevenness(frame, height)
-        upwards = plane.normal if up is None or frame.pose is None else up
+        upwards = _upwards(frame, up, plane)
         below = () if ground.wide else support.level_planes(samples, plane)[:-1]
         return cls(
             frame,
@@ -235,9 +234,8 @@ class TableTop:
             above[part] |= own & segmentation.above_plane(frame, under, noise, part)
 
         samples = sample(frame, frame.depth > 0, noise)
-        walls = find_walls(samples, plane, np.random.default_rng(0))
-        free = before_walls(frame, walls, noise) if walls else None
-        upwards = plane.normal if up is None or frame.pose is None else up
+        free = _free_of_walls(frame, samples, plane, noise)
+        upwards = _upwards(frame, up, plane)
         return cls(
             frame,
             noise,
@@ -370,6 +368,7 @@ class TableTop:
         for mask in self.given:
             if id(mask) in left_out:
                 continue
+
             inside = mask & (self.frame.depth > 0)
             if np.count_nonzero(inside) < FEWEST_OBJECT_PIXELS:
                 continue
@@ -502,6 +501,19 @@ def _find_ground(
     if widest is None:
         return GroundPlane(plane)
     return support.ground_of(samples, plane, widest)
+
+
+def _free_of_walls(
+    frame: Frame, samples: Samples, plane: Plane, noise: Noise
+) -> Mask | None:
+    """Pixels before the walls that are seen, (H, W) bool; None where none is."""
+    walls = find_walls(samples, plane, np.random.default_rng(0))
+    return before_walls(frame, walls, noise) if walls else None
+
+
+def _upwards(frame: Frame, up: Float | None, plane: Plane) -> Float:
+    """Direction against gravity, (3,); the normal of a plane where a frame does not tell it."""
+    return plane.normal if up is None or frame.pose is None else up
 
 
 def _upright(frame: Frame, up: Float | None) -> Float | None:

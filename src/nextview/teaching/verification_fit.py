@@ -194,7 +194,8 @@ def _views(
     shares = np.ones(1)
     if len(lies) > 1:
         stable = stable_poses(mesh)
-        lies, shares = stable.rotations, stable.shares
+        lies = stable.rotations
+        shares = stable.shares
     turn = rotation_z(rng.uniform(0, 2 * np.pi)) @ lies[rng.choice(len(lies), p=shares)]
     camera = SensedCamera(rotated(mesh, turn), sensor, rng.spawn(1)[0])
 

@@ -35,7 +35,7 @@ class TaughtThings:
         residuals: how badly known things are explained, in the same order; None if that was not
             fitted.
         symmetries: of each thing, in the same order.
-        anyhow: whether they need not rest: all orientations are equally likely.
+        any_orientation: whether they need not rest: all orientations are equally likely.
         rows: hypotheses of the memory that are of these things, (R,) int64.
     """
 
@@ -79,7 +79,7 @@ class TaughtThings:
             about.things[known[name]].symmetries for name in self.names
         )
         self.verifier = Verifier(surfaces, owners, memory.rotations[self.rows], weights)
-        self.anyhow = False
+        self.any_orientation = False
 
     @classmethod
     def of(cls, recogniser: TaughtRecogniser) -> "TaughtThings | None":
@@ -112,7 +112,7 @@ class TaughtThings:
     def in_any_orientation(self) -> "TaughtThings":
         """The same things, which may be held, lean or fly: they need not rest."""
         tilted = copy(self)
-        tilted.anyhow = True
+        tilted.any_orientation = True
         return tilted
 
     def __call__(self, observations: Sequence[Observation]) -> Verified:
@@ -175,7 +175,7 @@ class TaughtThings:
         Returns:
             The belief in each thing, and the poses.
         """
-        if self.anyhow:
+        if self.any_orientation:
             return self.verifier.in_any_orientation(observations)
         known = joint[self.rows]
         resting = self.verifier(observations, known / known.sum())

@@ -308,11 +308,7 @@ class Verifier:
             against=-np.log(by_features + TINY),
         )
 
-        images = _images(observations)
-        level = levelling(
-            [image.ground for image in images if image.ground is not None]
-        )
-        images = [image.turned(level) for image in images]
+        images, level = _levelled(observations)
         return self._settled(proposed, images, VERIFICATION_STAGES, self.prior, level)
 
     def in_any_orientation(
@@ -350,12 +346,8 @@ class Verifier:
         Returns:
             What is found of both kinds of hypotheses together.
         """
-        images = _images(observations)
-        level = levelling(
-            [image.ground for image in images if image.ground is not None]
-        )
+        images, level = _levelled(observations)
         try:
-            images = [image.turned(level) for image in images]
             unusual = self._tilted(images, level)
         except ObservationError:  # too little is seen to be compared
             return resting
@@ -564,6 +556,16 @@ class Verifier:
             seen_behind=behind / np.maximum(visible, 1),
             below=self._below(alignment, views).depth,
         )
+
+
+def _levelled(
+    observations: Sequence[Observation],
+) -> tuple[list[MetricImage], Float]:
+    """The observations that show the thing, turned so that the ground is level, and that turn."""
+    images = _images(observations)
+    grounds = [image.ground for image in images if image.ground is not None]
+    level = levelling(grounds)
+    return [image.turned(level) for image in images], level
 
 
 def _images(observations: Sequence[Observation]) -> list[MetricImage]:
