@@ -304,6 +304,7 @@ class Scene:
             self._widest,
             None if given is None else given.masks,
             None if given is None else given.surface,
+            None if given is None else given.pieces,
             () if before is None or ground is None else before.levels,
         )
 
@@ -455,7 +456,8 @@ def _instances(top: TableTop) -> Instances | None:
     """What a segmentation said of a frame; None where none was asked."""
     if top.given is None:
         return None
-    return Instances(top.given, None if top.supports is None else top.supports.surface)
+    surface = None if top.supports is None else top.supports.surface
+    return Instances(top.given, surface, top.pieces)
 
 
 def _stands_on(track: Track, top: TableTop) -> Plane:

@@ -15,7 +15,7 @@ from nextview.errors import ObservationError
 from nextview.geometry.observation import array_of
 from nextview.segmentation.features import features, shrink
 from nextview.segmentation.network import load_network
-from nextview.segmentation.parting import part, sharpen, surface_of
+from nextview.segmentation.parting import DOUBTFUL_ODDS, part, sharpen, surface_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import upright_axes
 from nextview.types import Index, Mask
@@ -29,10 +29,14 @@ class Segmentation:
         labels: number of the thing that each pixel shows, (H, W) int; 0 for none.
         surface: pixels of what carries things, such as floors, tables and the bottoms of bins,
             (H, W) bool; None where the segmentation does not tell them.
+        pieces: number of the piece that each pixel belongs to, (H, W) int; 0 for none. A piece
+            belongs to one thing without doubt; a thing may be several. None where the segmentation
+            has no doubts.
     """
 
     labels: Index
     surface: Mask | None = None
+    pieces: Index | None = None
 
 
 Segmenter = Callable[[Frame], Any]
@@ -47,10 +51,12 @@ class Instances:
     Attributes:
         masks: pixels of each thing, (H, W) bool each.
         surface: pixels of what carries things, (H, W) bool; None where that is not told.
+        pieces: see ``Segmentation``.
     """
 
     masks: tuple[Mask, ...]
     surface: Mask | None = None
+    pieces: Index | None = None
 
 
 class LearnedSegmenter:
@@ -98,7 +104,8 @@ class LearnedSegmenter:
         labels[surface_of(output, valid) & (labels == 0)] = surface_label
         sharp = sharpen(labels, picture, frame.depth)
         surface = sharp == surface_label
-        return Segmentation(np.where(surface, 0, sharp), surface)
+        pieces = sharpen(part(output, valid, DOUBTFUL_ODDS), picture, frame.depth)
+        return Segmentation(np.where(surface, 0, sharp), surface, pieces)
 
 
 def instances_of(segmentation: Segmenter, frame: Frame) -> Instances:
@@ -119,8 +126,9 @@ def instances_of(segmentation: Segmenter, frame: Frame) -> Instances:
         return Instances(_masks(given, frame))
 
     masks = _masks(given.labels, frame)
+    pieces = None if given.pieces is None else _labels(given.pieces, frame)
     if given.surface is None:
-        return Instances(masks)
+        return Instances(masks, pieces=pieces)
     surface = array_of(given.surface, "the surface of a segmentation")
     if surface.dtype != bool or surface.shape != frame.shape:
         raise ObservationError(
@@ -129,7 +137,22 @@ def instances_of(segmentation: Segmenter, frame: Frame) -> Instances:
         )
     for mask in masks:
         surface = surface & ~mask
-    return Instances(masks, surface)
+    return Instances(masks, surface, pieces)
+
+
+def _labels(given: Any, frame: Frame) -> Index:
+    """The pieces of a segmentation.
+
+    Raises:
+        ObservationError: they are no labels of the frame.
+    """
+    values = array_of(given, "the pieces of a segmentation")
+    if not np.issubdtype(values.dtype, np.integer) or values.shape != frame.shape:
+        raise ObservationError(
+            f"the pieces of a segmentation are (H, W) int, {frame.shape}, not"
+            f" {one_line(f'{values.shape} {values.dtype}')}"
+        )
+    return values
 
 
 def _masks(given: Any, frame: Frame) -> tuple[Mask, ...]:

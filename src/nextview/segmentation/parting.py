@@ -21,6 +21,8 @@ THING_CLASS = OUTPUT_CLASSES.index("thing")
 SURFACE_CLASS = OUTPUT_CLASSES.index("surface")
 # added to all log-odds: the training counts pairs of different things four times
 JOINING_ODDS = 0.7
+# of a pair, below which the network is in doubt whether to join: pieces are joined above it
+DOUBTFUL_ODDS = 2.0
 LIMIT_OF_ODDS = 4.0  # log-odds of one pair beyond which it says no more
 EDGE_SHARPNESS = (
     60.0  # steps of a sixtieth of the depth count as much as a pixel of the picture
@@ -29,7 +31,7 @@ SCRAP_PIXELS = 16  # of an instance that is none of its own, but a piece of an e
 CERTAIN_ODDS = 2.0  # of all neighbours around a pixel, to be joined before all others
 
 
-def part(output: Float32, valid: Mask) -> Index:
+def part(output: Float32, valid: Mask, doubt: float = 0.0) -> Index:
     """Join pixels of things to instances, those first whose pairs speak most for it.
 
     Each pair of pixels that the network compares has log-odds of belonging to one thing. Regions
@@ -39,6 +41,8 @@ def part(output: Float32, valid: Mask) -> Index:
     Args:
         output: of the network, (15, h, w).
         valid: pixels with depth, (h, w) bool.
+        doubt: log-odds that are taken from those of each pair: only what clearly belongs together
+            is joined.
 
     Returns:
         The instance of each pixel from 1 on, 0 for none, (h, w) int64.
@@ -46,7 +50,7 @@ def part(output: Float32, valid: Mask) -> Index:
     thing = valid & (output[: len(OUTPUT_CLASSES)].argmax(0) == THING_CLASS)
     size = thing.size
     at = np.arange(size).reshape(thing.shape)
-    of_pairs = output[AFFINITY_OUTPUTS] + JOINING_ODDS
+    of_pairs = output[AFFINITY_OUTPUTS] + (JOINING_ODDS - doubt)
     certain = _certain(of_pairs)
     ends = []
     odds = []

@@ -72,6 +72,8 @@ class TableTop:
             where there is none.
         supports: the surfaces that a segmentation tells, and what stands on each; None where it
             tells none.
+        pieces: that a segmentation may cut things into, (H, W) int, 0 for none; None where it
+            tells none.
     """
 
     frame: Frame
@@ -87,6 +89,7 @@ class TableTop:
     warnings: tuple[ViewWarning, ...] = ()
     given: tuple[Mask, ...] | None = None
     supports: Supports | None = None
+    pieces: Index | None = None
 
     @classmethod
     def of(
@@ -99,6 +102,7 @@ class TableTop:
         widest: float | None = None,
         given: Sequence[Mask] | None = None,
         surface: Mask | None = None,
+        pieces: Index | None = None,
         levels: Sequence[SurfaceLevel] = (),
     ) -> TableTop:
         """Find the support plane of a frame, and what is above it.
@@ -115,6 +119,7 @@ class TableTop:
                 where there is none.
             surface: pixels of the surfaces by this segmentation, (H, W) bool: the ground is the
                 one that carries most of the things. None where it tells none.
+            pieces: that things may be cut into, by this segmentation, (H, W) int, 0 for none.
             levels: of the surfaces of earlier frames.
 
         Raises:
@@ -130,7 +135,8 @@ class TableTop:
             if upright is None and ground is not None:
                 upright = ground.plane.normal
             supports = Supports.of(frame, masks, surface, noise, upright, levels)
-            return cls._on_surfaces(supports, noise, up, ground, inside, widest)
+            top = cls._on_surfaces(supports, noise, up, ground, inside, widest)
+            return replace(top, pieces=pieces)
 
         samples = sample(frame, frame.depth > 0, noise)
         lower = False
@@ -177,6 +183,7 @@ class TableTop:
             lower,
             shows_ground,
             given=masks,
+            pieces=pieces,
         )
 
     @classmethod
@@ -326,8 +333,8 @@ class TableTop:
             scraps of edges are left out. Where masks were given, the things are those, without the
             background at their edges and the plane.
         """
-        if pixels is None and self.given is not None:
-            return self._given_segments()
+        if self.given is not None:
+            return self._given_segments() if pixels is None else self._pieces(pixels)
         above = self.above if pixels is None else self.above & pixels
         if np.count_nonzero(above) < FEWEST_OBJECT_PIXELS:
             return []
@@ -381,6 +388,16 @@ class TableTop:
             if np.count_nonzero(own) >= FEWEST_OBJECT_PIXELS:
                 found.append(own)
         return sorted(found, key=lambda mask: -np.count_nonzero(mask))
+
+    def _pieces(self, pixels: Mask) -> list[Mask]:
+        """The pieces of the segmentation that was given, within some pixels, (H, W) bool."""
+        if self.pieces is None:
+            return []
+        inside = np.where(pixels & (self.frame.depth > 0), self.pieces, 0)
+        sizes = np.bincount(inside.ravel())
+        sizes[0] = 0
+        numbers = np.flatnonzero(sizes >= FEWEST_OBJECT_PIXELS)
+        return [inside == number for number in numbers[np.argsort(-sizes[numbers])]]
 
     def is_thing(self, mask: Mask) -> bool:
         """Whether some pixels, (H, W) bool, are enough, and high enough, to be a thing."""
