@@ -29,7 +29,6 @@ from nextview.errors import ObservationError, UsageError
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.observation import Observation
 from nextview.scene.objects import UNKNOWN_NAME
-from nextview.segmentation.choosing import choose_instance
 from nextview.segmentation.instances import LearnedSegmenter, Segmenter
 from nextview.sensing import Frame, ObservedObject
 from nextview.things.memory import TaughtRecogniser
@@ -139,18 +138,12 @@ def name_one(
     by = str(given["by"])
     shown = label & (frame.depth > 0)
     point = np.median(frame.positions(*np.nonzero(shown)), axis=0)
-    thing = (
-        ObservedObject(up=None, point=point)
-        if by == "point"
-        else ObservedObject(up=None)
-    )
+    place = point if by == "point" else None
+    thing = ObservedObject(up=None, point=place, segmentation=segmentation)
     masked = frame.with_mask(shown)
     seen = frame if by == "point" else masked
     try:
-        if segmentation is None:
-            view = thing.add(seen)
-        else:
-            view = thing.add(*choose_instance(segmentation, seen, thing))
+        view = thing.add(seen)
     except ObservationError as error:
         print(f"{given['name']} {name} by {by}: {error}")
         return None
@@ -225,7 +218,7 @@ def print_scenes(
         paths: of the depth images.
         names: of the labels, the first of what is none.
         intrinsics: of the camera, (3, 3).
-        segmentation: that tells the things; None for the one by edges.
+        segmentation: that tells the things; None for the bundled network.
     """
     things = right = sure_right = wrong = sure_wrong = 0
     for path in paths:
@@ -268,8 +261,7 @@ def main(
         scans: folder of the scans.
         models: memory of the things.
         intrinsics: of the camera: fx, fy, cx, cy, pixels.
-        network: card of a network that tells things and surfaces; None for the segmentation by
-            edges.
+        network: card of a segmentation network; None for the bundled one.
     """
     things = memory_with_surfaces(models, scans)
     names = (folder / "names.txt").read_text().split()

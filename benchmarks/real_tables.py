@@ -7,8 +7,8 @@ middle of the first pixel at 0). No pose of a camera is known: up is the normal 
 frame is given to a scene of its own. Every name is wrong, so none of them should be confident.
 Printed are the objects that were found, those with a name, and those with a confident one; with
 ``--show`` each confident name, its pixels and how sure its pose is. Nothing is drawn at random.
-``--network`` names the card of a network of ``nextview train segmentation``: it tells things and
-surfaces in place of the segmentation by edges that scenes use.
+``--network`` names the card of a network of ``nextview train segmentation`` in place of the bundled
+one.
 """
 
 import json
@@ -71,8 +71,7 @@ def main(
         folder: of the frames.
         models: memory of things, none of which is in the frames.
         show: whether each confident name is printed.
-        network: card of a network that tells things and surfaces; None for the segmentation by
-            edges that scenes use.
+        network: card of a segmentation network; None for the bundled one.
     """
     frames = sorted(path.parent for path in folder.glob("*/depth.png"))
     if not frames:

@@ -14,8 +14,8 @@ Printed are, over all things that show in at least ``LEAST_PIXELS`` pixels: the 
 over union (IoU) of each with the segment that fits it best, the shares with more than .5, .75 and
 .9, the share of segments that fit some thing by more than .5 (precision), segments that hold most
 of two things (merges), and things of which two segments hold a fifth each (splits); the mean IoU by
-how many things a frame shows; and the seconds a frame takes. Without ``--network``, the card of a
-network of ``nextview train segmentation``, the segmentation by edges is asked, which scenes use.
+how many things a frame shows; and the seconds a frame takes. ``--network``
+names the card of a network of ``nextview train segmentation``; without it the bundled one is asked.
 ``--figure`` draws the worst frames and the best.
 """
 
@@ -34,11 +34,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from rich.progress import track
 
-from nextview.errors import ObservationError, UsageError
+from nextview.errors import UsageError
 from nextview.geometry.mesh import load_mesh
 from nextview.segmentation.instances import LearnedSegmenter
 from nextview.sensing.frame import Frame
-from nextview.sensing.tabletop import TableTop
 from nextview.simulation.worlds import Shape, draw_world, photograph
 
 LEAST_PIXELS = 200  # of a thing that counts; of a segment half as many
@@ -162,19 +161,6 @@ def simulated_frames(kind: str, scans: Path, frames: int, seed: int) -> Iterator
             return
 
 
-def by_edges(frame: Frame) -> Labels:
-    """Labels by the segmentation that scenes use; none where no support plane is seen."""
-    labels = np.zeros(frame.shape, np.int64)
-    up = None if frame.pose is None else np.array([0.0, 0.0, 1.0])
-    try:
-        segments = TableTop.of(frame, up).segments()
-    except ObservationError:
-        return labels
-    for number, mask in enumerate(segments, 1):
-        labels[mask] = number
-    return labels
-
-
 def draw(rows: list[tuple[float, Truth, Labels]], path: Path) -> None:
     """Draw the worst frames and the best: depth, truth and segments side by side."""
     import matplotlib as mpl
@@ -222,7 +208,7 @@ def main(
         folder: of real frames, or of scans.
         frames: that are simulated.
         seed: of the worlds.
-        network: card of a network; None for the segmentation by edges that scenes use.
+        network: card of a segmentation network; None for the bundled one.
         figure: file for a picture of the worst frames and the best.
     """
     if not folder.is_dir():
@@ -232,14 +218,12 @@ def main(
         if kind == "real"
         else simulated_frames(kind, folder, frames, seed)
     )
-    learned = None if network is None else LearnedSegmenter(network)
+    learned = LearnedSegmenter(network)
     counts = Counts()
     rows = []
     for truth in track(every, f"frames of {kind}"):
         begun = time.perf_counter()
-        found = (
-            by_edges(truth.frame) if learned is None else learned(truth.frame).labels
-        )
+        found = learned(truth.frame).labels
         counts.seconds += time.perf_counter() - begun
         rows.append((counts.add(truth.labels, found), truth, found))
     counts.print_out()

@@ -13,8 +13,8 @@ and of the vertical. The first view is drawn; the others are chosen by ``--by``:
 - random: any candidate view;
 - target: ``Scene.target``.
 
-``--network`` names the card of a network of ``nextview train segmentation``: it tells things and
-surfaces in place of the segmentation by edges that scenes use.
+``--network`` names the card of a network of ``nextview train segmentation`` in place of the bundled
+one.
 
 OUT gets a line a table, and the tables that it holds already are not looked at again: a run that
 was stopped goes on. Printed is, after 1, 2 and 4 frames, the share of the things that were found
@@ -241,7 +241,7 @@ def look_at_table(
         table: with the things.
         seed: of the errors and of the views.
         by: how views are chosen.
-        segmentation: that tells the things; None for the one by edges.
+        segmentation: that tells the things; None for the bundled network.
 
     Returns:
         What was found after each number of frames that is counted; and after how many frames the
@@ -373,8 +373,7 @@ def main(
         seed: of the draw of tables.
         by: ways in which views are chosen, each on every table.
         models: memory of the things.
-        network: card of a network that tells things and surfaces; None for the segmentation by
-            edges that scenes use.
+        network: card of a segmentation network; None for the bundled one.
     """
     lines = (
         [json.loads(line) for line in out.read_text().splitlines()]

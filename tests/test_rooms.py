@@ -10,7 +10,7 @@ from pipeline import INTRINSICS, SHAPE, TABLE, box, cast, meshed, pose_at
 from nextview.data.samples import sample_mesh
 from nextview.errors import ObservationError
 from nextview.geometry.viewsphere import look_at_origin
-from nextview.sensing import Frame, ObservedObject, clusters
+from nextview.sensing import Frame, ObservedObject
 from nextview.sensing.facets import Noise, fit_facets
 from nextview.sensing.object_frame import enclose
 from nextview.sensing.outliers import without_outliers
@@ -430,28 +430,6 @@ def test_a_handle_behind_the_edge_of_its_mug_is_kept_by_a_mask(azimuth, wide):
         frame(scene, pose_at(30, azimuth, 0.5, (0, 0, 0.05)), mask_of=0, wide=wide)
     )
     assert_is(thing, scene[0], radius=0.05)
-
-
-def test_a_second_look_does_not_make_an_object_of_another_order_of_size(monkeypatch):
-    """All on the table would count as one where what touches is joined, and the score would
-    prefer it.
-    """
-    parted = clusters.clusters
-
-    def all_as_one(footprints, joins="by their border"):
-        labels, two = parted(footprints, joins)
-        return (
-            [np.minimum(label, 1) for label in labels] if joins == "always" else labels
-        ), two
-
-    monkeypatch.setattr(clusters, "clusters", all_as_one)
-    thing = ObservedObject()
-    blocks = [box((0.1, 0.1, 0.1), (0, y, 0.05)) for y in (0, -0.3, 0.3)]
-    thing.add(frame([*blocks, TABLE], pose_at(35, 20, 1.0, (0, 0, 0.05)), sigma=0.001))
-    before = thing.object_frame.radius
-    assert "always" in thing.other_joins()
-    thing.reconsider(lambda seen: -100 * seen[0].radius)
-    assert thing.object_frame.radius == before < 0.1
 
 
 @pytest.mark.parametrize(

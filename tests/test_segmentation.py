@@ -10,8 +10,10 @@ from nextview.segmentation.features import (
     PICTURE_CHANNELS,
     features,
     largest_planes,
+    quarter_turns,
     shrink,
     surface_normals,
+    turned,
 )
 from nextview.segmentation.instances import LearnedSegmenter, instances_of
 from nextview.segmentation.network import AFFINITY_STEPS as STEPS
@@ -41,7 +43,7 @@ def plane_frame(normal, distance):
 def test_small_picture_lies_on_the_same_plane():
     frame, normal = plane_frame([0.2, -0.8, -1], 0.7)
     small = shrink(frame.depth, frame.rays)
-    assert small.depth.shape == (120, 160)
+    assert small.depth.shape == (160, 214)
     heights = small.points @ normal + 0.7
     assert np.abs(heights).max() < 2e-3  # means of blocks of an inclined plane
 
@@ -79,6 +81,24 @@ def test_planes_of_two_levels_are_found():
         offset for direction, offset in found[:2] if direction @ normal > 0.999
     )
     np.testing.assert_allclose(offsets, [0.7, 1.2], atol=0.01)
+
+
+@pytest.mark.parametrize("quarters", [0, 1, 2, 3])
+def test_a_turned_picture_shows_the_same_points(quarters):
+    frame, _ = plane_frame([0.3, -0.8, -1], 0.7)
+    small = shrink(frame.depth, frame.rays)
+    up = np.array([0.2, -0.9, -0.4])
+    again, there = turned(small, up, quarters)
+    np.testing.assert_allclose(
+        again.points @ there, np.rot90(small.points @ up, quarters)
+    )
+    assert quarter_turns(there) == -quarters % 4
+    assert quarter_turns(turned(again, there, quarter_turns(there))[1]) == 0
+
+
+def test_a_camera_that_looks_straight_down_is_not_turned():
+    assert quarter_turns(np.array([0.1, 0.1, -0.99])) == 0
+    assert quarter_turns(None) == 0
 
 
 def output_of(labels, strength=6.0):
@@ -197,7 +217,7 @@ def test_a_learned_segmenter_tells_things_and_surfaces(monkeypatch):
     output = np.full((3 + len(STEPS), *thing.shape), 3.0, np.float32)
     output[:3] = [np.zeros(thing.shape), ~thing, thing]
 
-    name = "nextview.segmentation.instances.load_network"
+    name = "nextview.segmentation.instances._loaded"
     monkeypatch.setattr(name, lambda card: lambda features: output)
     found = LearnedSegmenter("any.json")(frame)
     np.testing.assert_array_equal(found.labels > 0, depth < 0.9)

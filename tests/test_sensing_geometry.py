@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 from pipeline import INTRINSICS, SHAPE, TABLE, box, cast, pose_at
 from scipy.ndimage import binary_dilation
 
+from nextview.geometry.axes import upright_axes
 from nextview.geometry.mesh import make_mesh
 from nextview.sensing import ObjectFrame
 from nextview.sensing.facets import Noise, estimate_noise, fit_facets
 from nextview.sensing.mask_edges import trimmed
-from nextview.sensing.object_frame import enclose, smallest_circle, upright_axes
+from nextview.sensing.object_frame import enclose, smallest_circle
 from nextview.sensing.planes import Samples, find_plane
 
 UP = np.array([0, 0, 1.0])

@@ -413,32 +413,3 @@ def test_what_a_later_frame_shows_in_another_light_is_not_held_against_the_objec
     assert session.done
     assert session.result.confident
     assert not session.result.stranded
-
-
-@pytest.mark.parametrize(
-    ("score", "joins", "asked"),
-    [(9.0, ["never"], 1), (9.0, [], 0), (0.0, ["never"], 0)],
-)
-def test_only_a_novel_object_that_touches_another_is_reconsidered(
-    monkeypatch,
-    score,
-    joins,
-    asked,
-):
-    calls, pose = [], pose_at(40, 20, 0.8, (0, 0, 0.06))
-    monkeypatch.setattr(
-        Novelty,
-        "scores",
-        lambda self, embeddings, exact: np.full(len(embeddings), score),
-    )
-    monkeypatch.setattr(ObservedObject, "other_joins", lambda self: joins)
-    monkeypatch.setattr(
-        ObservedObject,
-        "reconsider",
-        lambda self, novelty: calls.append(novelty(self.observations)),
-    )
-    depth = cast([TABLE, box((0.4, 0.12, 0.12), (0, 0, 0.06))], pose)[0]
-    nextview.load().session(object=ObservedObject()).update(
-        Frame(depth, INTRINSICS, pose, pixel_centre=0.5)
-    )
-    assert calls == [score] * asked

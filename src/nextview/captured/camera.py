@@ -12,9 +12,10 @@ from nextview.captured.check import check_capture, refuse_many
 from nextview.captured.folders import read_box
 from nextview.captured.frames import Capture, CapturedFrame
 from nextview.errors import DatasetError, NoViewLeftError, ObservationError, UsageError
+from nextview.geometry.axes import upright_axes
 from nextview.geometry.viewsphere import angle_between
 from nextview.sensing.frame import Frame
-from nextview.sensing.object_frame import Box, ObjectFrame, upright_axes
+from nextview.sensing.object_frame import Box, ObjectFrame
 from nextview.sensing.observed_object import ObservedObject
 from nextview.types import Float
 

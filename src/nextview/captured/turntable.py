@@ -18,9 +18,10 @@ from nextview.captured.frames import (
     read_table,
 )
 from nextview.errors import DatasetError, ObservationError
+from nextview.geometry.axes import upright_axes
 from nextview.geometry.viewsphere import rotation_z
 from nextview.sensing import Frame, ObservedObject
-from nextview.sensing.object_frame import smallest_circle, upright_axes
+from nextview.sensing.object_frame import smallest_circle
 from nextview.types import Float
 
 # of the fit; points of a frame; share of them that counts, the nearest

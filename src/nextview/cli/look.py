@@ -20,9 +20,10 @@ from nextview.cli.common_options import Three, check_file, say_written
 from nextview.cli.progress import Terminal, console, track
 from nextview.errors import ObservationError, UsageError
 from nextview.files import new_file
+from nextview.geometry.axes import upright_axes
 from nextview.scene.report import REPORT_COLUMNS, doubts_of, row_of, scene_as_json
 from nextview.scene.scene import Look, Scene
-from nextview.sensing.object_frame import Box, upright_axes
+from nextview.sensing.object_frame import Box
 from nextview.session.result_json import plain
 from nextview.session.system import load
 from nextview.types import Float

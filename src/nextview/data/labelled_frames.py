@@ -45,7 +45,7 @@ from nextview.simulation.worlds import (
 )
 from nextview.types import Float, Float32, Index, Mask
 
-FRAME_SHAPE = (120, 160)  # rows and columns
+FRAME_SHAPE = (160, 213)  # rows and columns
 FRAMES_OF_A_FILE = 400  # at most
 VIEWS_OF_A_WORLD = 2
 FEW_PIXELS = 0.06  # of things; most frames with fewer teach little and are dropped

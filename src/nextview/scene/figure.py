@@ -14,10 +14,10 @@ from matplotlib.patheffects import withStroke
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
+from nextview.geometry.axes import upright_axes
 from nextview.geometry.ray_caster import RayCaster
 from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.sensing.frame import Frame, within
-from nextview.sensing.object_frame import upright_axes
 from nextview.sensing.tabletop import TableTop
 from nextview.session.style import (
     ACCENT,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -10,9 +10,9 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
+from nextview.geometry.axes import upright_axes
 from nextview.scene.tracks import Track, render_track
 from nextview.sensing.frame import Frame
-from nextview.sensing.object_frame import upright_axes
 from nextview.sensing.tabletop import TableTop
 from nextview.types import Float, Index, Mask
 
@@ -298,68 +298,3 @@ def contradicted(found: Sequence[SegmentAgreement]) -> bool:
     """Whether a frame contradicts so many objects that its pose is wrong, not that they moved."""
     against = sum(one.contradicts for one in found)
     return against >= FEWEST_AGAINST and against >= sum(one.confirms for one in found)
-
-
-def same_objects(now: Sequence[Track], before: Sequence[Track]) -> dict[int, int]:
-    """Find the objects that are the same after all frames were judged anew.
-
-    Args:
-        now: the objects.
-        before: the objects as they were judged before.
-
-    Returns:
-        The number that each had before, by its number now; without those that are new.
-    """
-    same = {}
-    for one in now:
-        for other in before:
-            both = _common(one, other)
-            every = _count(one, other.pixels) + _count(other, one.pixels) - both
-            if both > SAME_PIXELS * every:
-                same[one.number] = other.number
-    return same
-
-
-def parts_of(
-    before: Sequence[Track],
-    now: Sequence[Track],
-    same: Mapping[int, int],
-) -> tuple[tuple[int, int], ...]:
-    """Find the objects that turned out to be parts of others when all frames were judged anew.
-
-    Args:
-        before: the objects as they were judged before.
-        now: the objects.
-        same: the number that each of these had before, by its number now.
-
-    Returns:
-        The number of each such part; and the number of the whole, that of before where it had one.
-    """
-    found = []
-    for part in before:
-        if part.number in same.values():
-            continue
-        for whole in now:
-            if _common(part, whole) > SAME_PIXELS * _count(part, whole.pixels):
-                found.append((part.number, same.get(whole.number, whole.number)))
-                break
-    return tuple(found)
-
-
-def _common(one: Track, other: Track) -> int:
-    """Pixels that two objects have in common, in all frames."""
-    pixels = other.pixels
-    return sum(
-        int(np.count_nonzero(mask & pixels[number]))
-        for number, mask in one.pixels.items()
-        if number in pixels
-    )
-
-
-def _count(one: Track, frames: Container[int]) -> int:
-    """Pixels of an object in some frames."""
-    return sum(
-        int(np.count_nonzero(mask))
-        for number, mask in one.pixels.items()
-        if number in frames
-    )

@@ -14,12 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from nextview.geometry.axes import upright_axes
 from nextview.geometry.viewsphere import angle_between
 from nextview.policies.discriminate_geometry import NEAR_TIE
 from nextview.recognition.protocol import LooksAhead
 from nextview.scene.tracks import Track
 from nextview.sensing.frame import Frame
-from nextview.sensing.object_frame import ObjectFrame, upright_axes
+from nextview.sensing.object_frame import ObjectFrame
 from nextview.sensing.tabletop import TableTop
 from nextview.session.system import System
 from nextview.types import Float, Mask

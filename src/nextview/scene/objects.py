@@ -15,14 +15,6 @@ from nextview.session.result import Recognition
 from nextview.types import Float, Mask
 
 UNKNOWN_NAME = "unknown"
-FLOATING = ViewWarning(
-    "floating",
-    "the scan, where it was found, floats above the plane: the name is likely to be wrong",
-)
-FRAGMENT = ViewWarning(
-    "fragment",
-    "few pixels show it, and it touches a larger object: it may be a part of that",
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,10 +33,6 @@ class SceneObject:
         seen_points: corners of the hull of what each frame shows of it, (N, 3), metres.
         touches: numbers of the objects that it touches in the picture and in depth.
         result: all that is known of it.
-        floats: whether its scan, where it was found, stands neither on the plane nor on another
-            object. Then the name is not confident.
-        is_fragment: whether it may be a part of a larger object that it touches. Then the name is
-            not confident either.
     """
 
     number: int
@@ -57,8 +45,6 @@ class SceneObject:
     seen_points: Float = field(repr=False)
     touches: tuple[int, ...]
     result: Recognition = field(repr=False)
-    floats: bool = False
-    is_fragment: bool = False
 
     @classmethod
     def of(cls, track: Track, touching: Collection[tuple[int, int]]) -> SceneObject:
@@ -87,8 +73,6 @@ class SceneObject:
             seen_points=seen,
             touches=tuple(others),
             result=result,
-            floats=track.floats,
-            is_fragment=track.is_fragment,
         )
 
     @property
@@ -117,14 +101,7 @@ class SceneObject:
     @property
     def warnings(self) -> tuple[ViewWarning, ...]:
         """What is likely to be wrong with it; usually nothing."""
-        of_views = tuple(
-            warning for view in self.result.views for warning in view.warnings
-        )
-        if self.floats:
-            of_views += (FLOATING,)
-        if self.is_fragment and self.result.answer is not None:
-            of_views += (FRAGMENT,)
-        return of_views
+        return tuple(warning for view in self.result.views for warning in view.warnings)
 
     def __repr__(self) -> str:
         """One line: ``3: mug, belief 0.998, confident, at [0.412, -0.103, 0.050] m``."""

@@ -435,11 +435,11 @@ def _union(tracks: Sequence[Track], bench: Bench) -> Track:
 
 
 def _cut(tracks: Sequence[Track], bench: Bench) -> list[Track]:
-    """Cut objects along their concave edges where several scans explain them better than one."""
+    """Cut objects into the pieces of the segmentation where several scans explain them better."""
     parts: dict[int, list[Mask]] = {}
     for row in _doubtful(tracks, bench):
         mask = tracks[row].mask_in(bench.number)
-        found = bench.top.segments(mask, "never")
+        found = [] if mask is None else bench.top.pieces_of(mask)
         if 1 < len(found) <= MOST_GROUP:
             parts[row] = found
     return _better(tracks, parts, bench)
@@ -458,7 +458,7 @@ def _doubtful(tracks: Sequence[Track], bench: Bench) -> list[int]:
 
 
 def _without_rests(tracks: Sequence[Track], bench: Bench) -> list[Track]:
-    """Take out what each scan explains; what stays of its pixels is segmented anew."""
+    """Take out what each scan explains; the pieces of what stays of its pixels are objects."""
     parts: dict[int, list[Mask]] = {}
     for row in _doubtful(tracks, bench):
         mask = tracks[row].mask_in(bench.number)
@@ -466,7 +466,7 @@ def _without_rests(tracks: Sequence[Track], bench: Bench) -> list[Track]:
         if mask is None or rendered is None:
             continue
         around = ndimage.binary_dilation(rendered.around(mask.shape), iterations=2)
-        rests = bench.top.segments(mask & ~around)
+        rests = bench.top.pieces_of(mask & ~around)
         if rests:
             parts[row] = [mask & ~np.any(rests, axis=0), *rests]
     return _better(tracks, parts, bench)

@@ -16,16 +16,13 @@ from numpy.typing import ArrayLike
 
 from nextview.checks import number
 from nextview.errors import ObservationError, SessionError
-from nextview.scene.floating import floating
+from nextview.geometry.axes import upright_axes
 from nextview.scene.following import (
     SegmentAgreement,
     agreement,
     assign,
     contradicted,
-    parts_of,
-    same_objects,
 )
-from nextview.scene.fragments import fragments
 from nextview.scene.judging import Judge
 from nextview.scene.next_view import best, candidates, is_sure, values
 from nextview.scene.objects import SceneObject
@@ -35,9 +32,7 @@ from nextview.scene.tracks import Track, render_track
 from nextview.segmentation.instances import Instances, Segmenter, instances_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import KnownFrames
-from nextview.sensing.object_frame import Box, upright_axes
-from nextview.sensing.planes import Plane
-from nextview.sensing.support import GroundPlane
+from nextview.sensing.object_frame import Box
 from nextview.sensing.tabletop import TableTop
 from nextview.sensing.view_warning import ViewWarning
 from nextview.session.repeated import REPEATED
@@ -62,10 +57,6 @@ MOVED_OR_POSE = ViewWarning(
     "pose",
     "what was known is not where it was, and nothing else stands where it was: it is taken to have"
     " moved, but the frame's pose may be wrong",
-)
-LOWER_GROUND = ViewWarning(
-    "ground",
-    "this frame shows that the ground is lower than it was taken to be: all frames are judged anew",
 )
 
 
@@ -110,9 +101,9 @@ class Scene:
             of the last frame.
         reachable: says of a camera-to-world pose, (4, 4), whether the camera can be brought there.
         segmentation: a segmentation of your own: from a frame to the pixels of each thing,
-            (N, H, W) bool, to labels, (H, W) int, 0 for none, or to a ``Segmentation``. Where it
-            tells surfaces, things stand on these, and what stands on none is left out. None for the
-            one built in.
+            (N, H, W) bool, to labels, (H, W) int, 0 for none, or to a ``Segmentation``. None for
+            the bundled network, which also tells the surfaces where another one does not. What
+            stands on no surface is left out.
     """
 
     def __init__(
@@ -227,18 +218,11 @@ class Scene:
                 return Look(False, warnings=(REPEATED,))
 
             before = self._state
-            ground = before.tops[0].ground if before.tops else None
-            given = None
-            if self.segmentation is not None:
-                given = instances_of(self.segmentation, frame)
-            top = self._top_of(frame, ground, before.tracks, given)
+            instances = instances_of(self.segmentation, frame, self.up)
+            top = self._top_of(frame, instances, before.tops)
             shown = top.plane if top.shows_ground else None
             top = replace(top, warnings=tuple(known.check(frame, shown)))
-
-            if top.lower:
-                state, look = self._judged_anew(top)
-            else:
-                state, look = self._after(before, top)
+            state, look = self._after(before, top)
             self._state = state
             self._target = None
             return look
@@ -284,73 +268,18 @@ class Scene:
     def _top_of(
         self,
         frame: Frame,
-        ground: GroundPlane | None,
-        tracks: Sequence[Track],
-        given: Instances | None,
+        instances: Instances,
+        before: Sequence[TableTop],
     ) -> TableTop:
-        """What a frame shows on the ground, which is looked for if it is not known.
+        """What a frame shows on its surfaces.
 
         Raises:
-            ObservationError: no support plane is seen.
+            ObservationError: it shows none.
         """
-        known = [_sphere(track) for track in tracks]
-        before = self._state.tops[-1].supports if self._state.tops else None
+        earlier = before[-1] if before else None
         return TableTop.of(
-            frame,
-            self.up,
-            ground,
-            known,
-            self.region,
-            self._widest,
-            None if given is None else given.masks,
-            None if given is None else given.surface,
-            None if given is None else given.pieces,
-            () if before is None or ground is None else before.levels,
+            frame, instances, self.up, earlier, self.region, self._widest
         )
-
-    def _judged_anew(self, last: TableTop) -> tuple[SceneState, Look]:
-        """Judge all frames anew, on the lower ground that a new one shows.
-
-        Args:
-            last: what the new frame shows.
-        """
-        before = self._state
-        anew = SceneState(region=self.region)
-        tops = [
-            replace(
-                self._top_of(old.frame, last.ground, anew.tracks, _instances(old)),
-                warnings=old.warnings,
-            )
-            for old in before.tops
-        ]
-        for top in (*tops, last):
-            anew, look = self._after(anew, top)
-        if not look.taken:
-            return before, look
-
-        same = same_objects(anew.tracks, before.tracks)
-        joined = parts_of(before.tracks, anew.tracks, same)
-        known = {track.number for track in before.tracks}
-        pairs = [(same.get(a, a), same.get(b, b)) for a, b in anew.touching]
-        state = replace(
-            anew,
-            tracks=tuple(
-                replace(track, number=same.get(track.number, track.number))
-                for track in anew.tracks
-            ),
-            touching=frozenset((min(pair), max(pair)) for pair in pairs),
-        )
-
-        now = {track.number for track in state.tracks}
-        look = replace(
-            look,
-            appeared=tuple(sorted(now - known)),
-            gone=tuple(sorted(known - now - {ended for ended, _ in joined})),
-            moved=(),
-            joined=joined,
-            warnings=(*look.warnings, LOWER_GROUND),
-        )
-        return state, look
 
     def _after(self, before: SceneState, top: TableTop) -> tuple[SceneState, Look]:
         """The scene after a frame, which is left out where it does not fit.
@@ -362,8 +291,7 @@ class Scene:
         if contradicted(found):
             return before, Look(False, warnings=(ViewWarning("pose", WRONG_POSE),))
         seen_again = any(one.confirms for one in found)
-        if before.tops and top.ground.wide and not (top.shows_ground or seen_again):
-            self._top_of(top.frame, None, (), None)  # names a mistake in the pose
+        if before.tops and not (top.shows_ground or seen_again):
             raise ObservationError(NOTHING_AGAIN)
 
         state, look = self._taken(before, top, found)
@@ -446,26 +374,6 @@ class Scene:
         ]
 
 
-def _sphere(track: Track) -> tuple[Float, float]:
-    """Centre, (3,), and radius of an object, metres."""
-    frame = track.thing.object_frame
-    return frame.centre, frame.radius
-
-
-def _instances(top: TableTop) -> Instances | None:
-    """What a segmentation said of a frame; None where none was asked."""
-    if top.given is None:
-        return None
-    surface = None if top.supports is None else top.supports.surface
-    return Instances(top.given, surface, top.pieces)
-
-
-def _stands_on(track: Track, top: TableTop) -> Plane:
-    """The plane that an object stands on: the ground, or the surface that carries it."""
-    plane = track.thing.sightings[-1].plane
-    return top.plane if top.supports is None or plane is None else plane
-
-
 def _most_pixels(masks: Sequence[Mask]) -> list[bool]:
     """Whether each mask, (H, W) bool, is one of the largest, which are verified in a frame."""
     order = sorted(range(len(masks)), key=lambda row: -np.count_nonzero(masks[row]))
@@ -519,14 +427,9 @@ def _numbered(
     changed = {*gone, *moved, *(ended for ended, _ in joined)}
     touching = {pair for pair in state.touching if not set(pair) & changed}
     touching |= _touching(kept, state.tops[-1], len(state.tops) - 1)
-    in_the_air = floating(kept, [_stands_on(track, state.tops[-1]) for track in kept])
-    small = fragments(kept, touching)
     after = replace(
         state,
-        tracks=tuple(
-            replace(track, floats=floats, is_fragment=is_fragment)
-            for track, floats, is_fragment in zip(kept, in_the_air, small, strict=True)
-        ),
+        tracks=tuple(kept),
         touching=frozenset(touching),
         next_number=number,
     )

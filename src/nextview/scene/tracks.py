@@ -45,8 +45,6 @@ class Track:
         again: frames that show it where it was known to be, with its pixels in each: they were not
             taken in as sightings.
         absorbed: numbers of objects whose pixels all became its own since the last frame.
-        floats: whether its scan stands neither on the plane nor on another object.
-        is_fragment: whether it may be a part of a larger object that it touches.
         lately_named: whether it had a name before the last frame that shows it.
     """
 
@@ -57,16 +55,12 @@ class Track:
     tries: int = 0
     again: tuple[tuple[int, Mask], ...] = ()
     absorbed: tuple[int, ...] = ()
-    floats: bool = False
-    is_fragment: bool = False
     lately_named: bool = False
 
     @property
     def confident(self) -> bool:
         """Whether its name may be acted on."""
-        if self.result is None or self.floats or self.is_fragment:
-            return False
-        return self.result.confident
+        return self.result is not None and self.result.confident
 
     @property
     def posed(self) -> PoseCandidate | None:

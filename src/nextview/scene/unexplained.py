@@ -9,12 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
 
+from nextview.geometry.axes import upright_axes
 from nextview.scene.following import GONE, SAME_OBJECT_SHARE, Outline, seen_through
 from nextview.scene.tracks import EDGE_WIDTH, Track
-from nextview.sensing.clusters import on_ground
-from nextview.sensing.object_frame import Box, upright_axes
-from nextview.sensing.segmentation import inside_box
+from nextview.sensing.masks import inside_box
+from nextview.sensing.object_frame import Box
 from nextview.sensing.tabletop import LOWEST_SHARE, NEAR_TABLE, THINNEST, TableTop
 from nextview.types import Float, Mask
 
@@ -146,7 +147,7 @@ def _patches(
         rows, columns = np.nonzero(label == part)
         few = slice(None, None, max(1, len(rows) // PATCH_POINTS))
         points = frame.positions(rows[few], columns[few])
-        if region is None and not on_ground(points @ axes[:2].T, ground).mean() > 0.5:
+        if region is None and not _on_ground(points @ axes[:2].T, ground).mean() > 0.5:
             continue
         found.append(UnexplainedPatch(points, float(areas[part])))
     return found
@@ -158,3 +159,17 @@ def _ground_of(top: TableTop) -> Float:
     rows, columns = np.nonzero(shown)
     few = slice(None, None, max(1, len(rows) // GROUND_POINTS))
     return top.frame.positions(rows[few], columns[few])
+
+
+def _on_ground(points: Float, ground: Float) -> Mask:
+    """Which points, (N, 2), lie within the convex hull of what is seen of the ground, (N,) bool.
+
+    Args:
+        points: along the ground.
+        ground: points of it, (M, 2).
+    """
+    try:
+        sides = ConvexHull(ground).equations
+    except (QhullError, ValueError):  # only a line is seen of it, or nothing
+        return np.ones(len(points), bool)
+    return np.asarray((points @ sides[:, :2].T + sides[:, 2] <= 0).all(1))

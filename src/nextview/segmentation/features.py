@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from nextview.types import Float, Float32, Mask
 
-LONG_SIDE = 160  # pixels of the longer side of the network's picture, about
+LONG_SIDE = 213  # pixels of the longer side of the network's picture, about
 SIDE_MULTIPLE = 16  # its sides are padded to multiples of this
 # pixels of a block whose depths differ by less, relatively, are averaged
 NEAR_IN_DEPTH = 0.015
@@ -21,6 +21,8 @@ PLANE_SAMPLES = 40  # along each side, pixels that a plane is compared with
 PLANE_TOLERANCE = 0.012  # of the depth, within which a pixel lies on a plane
 HEIGHT_SCALE = 30.0  # heights of a thirtieth of the distance are told well from 0
 PICTURE_CHANNELS = 15
+# part of a direction that lies in the picture, from which on it tells how the picture is turned
+LEAST_UPRIGHT = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +47,41 @@ class SmallPicture:
             [x[None, :] * self.depth, y[:, None] * self.depth, self.depth],
             -1,
         ).astype(np.float32)
+
+
+def quarter_turns(up: Float | None) -> int:
+    """By how many quarters, counter-clockwise, a picture is turned so that up is up in it.
+
+    Args:
+        up: direction against gravity in the camera's axes, (3,); None where it is not known.
+    """
+    if up is None or np.hypot(up[0], up[1]) < LEAST_UPRIGHT:
+        return 0
+    return round(float(np.arctan2(up[0], -up[1])) / (np.pi / 2)) % 4
+
+
+def turned(
+    picture: SmallPicture,
+    up: Float | None,
+    quarters: int,
+) -> tuple[SmallPicture, Float | None]:
+    """Turn a picture counter-clockwise, as if its camera were turned clockwise.
+
+    Args:
+        picture: the picture.
+        up: direction against gravity in the camera's axes, (3,); None where it is not known.
+        quarters: of a whole turn.
+
+    Returns:
+        The picture and the direction in its axes.
+    """
+    depth = picture.depth
+    x, y = picture.rays
+    for _ in range(quarters):
+        depth = np.rot90(depth)
+        x, y = y, -x[::-1]
+        up = None if up is None else np.array([up[1], -up[0], up[2]])
+    return SmallPicture(np.ascontiguousarray(depth), (x, y), picture.factor), up
 
 
 def shrink(depth: Float32, rays: tuple[Float32, Float32]) -> SmallPicture:

@@ -1,24 +1,51 @@
-"""Which pixels of a frame are one thing: by a trained network, or by a segmentation of your own."""
+"""Which pixels of a frame are one thing, and which are of the surfaces that things stand on.
+
+A trained network tells both. A segmentation of your own may tell the things in its place.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from nextview.checks import one_line
 from nextview.errors import ObservationError
+from nextview.geometry.axes import upright_axes
 from nextview.geometry.observation import array_of
-from nextview.segmentation.features import features, shrink
-from nextview.segmentation.network import load_network
+from nextview.segmentation.features import features, quarter_turns, shrink, turned
+from nextview.segmentation.network import SegmentationNetwork, load_network
 from nextview.segmentation.parting import DOUBTFUL_ODDS, part, sharpen, surface_of
-from nextview.sensing.frame import Frame
-from nextview.sensing.object_frame import upright_axes
-from nextview.types import Index, Mask
+from nextview.types import Float, Float32, Index, Mask
+
+
+class MeasuredFrame(Protocol):
+    """What is used of a ``nextview.sensing.Frame``; see there."""
+
+    @property
+    def depth(self) -> Float32:
+        """(H, W), metres; 0 where nothing was measured."""
+
+    @property
+    def rays(self) -> tuple[Float32, Float32]:
+        """Slopes x/z of its columns, (W,), and y/z of its rows, (H,)."""
+
+    @property
+    def pose(self) -> Float | None:
+        """Camera-to-world, (4, 4), as it was given."""
+
+    @property
+    def camera_to_world(self) -> Float:
+        """The same; the camera's own axes where none was given."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +66,9 @@ class Segmentation:
     pieces: Index | None = None
 
 
-Segmenter = Callable[[Frame], Any]
-"""From a frame to a ``Segmentation``, or only to the pixels of each thing, (N, H, W) bool, or to
-the number of the thing that each pixel shows, (H, W) int, 0 for none."""
+Segmenter = Callable[[Any], Any]
+"""From a ``nextview.sensing.Frame`` to a ``Segmentation``, or only to the pixels of each thing,
+(N, H, W) bool, or to the number of the thing that each pixel shows, (H, W) int, 0 for none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,19 +77,19 @@ class Instances:
 
     Attributes:
         masks: pixels of each thing, (H, W) bool each.
-        surface: pixels of what carries things, (H, W) bool; None where that is not told.
+        surface: pixels of what carries things, (H, W) bool.
         pieces: see ``Segmentation``.
     """
 
     masks: tuple[Mask, ...]
-    surface: Mask | None = None
+    surface: Mask
     pieces: Index | None = None
 
 
 class LearnedSegmenter:
     """A trained network as a segmentation.
 
-    >>> scene = nextview.Scene("ycb", segmentation=LearnedSegmenter())          # doctest: +SKIP
+    >>> LearnedSegmenter()(frame).labels                                        # doctest: +SKIP
 
     Args:
         card: path of the network's card; None for the bundled network.
@@ -80,13 +107,13 @@ class LearnedSegmenter:
     ) -> None:
         self.card = card
         self.up = None if up is None else upright_axes(up)[2]
-        self.network = load_network(card)
+        self.network = _loaded(card)
 
     def __reduce__(self) -> tuple[type[LearnedSegmenter], tuple[Any, ...]]:
         """It is pickled as the path of its card."""
         return LearnedSegmenter, (self.card, self.up)
 
-    def __call__(self, frame: Frame) -> Segmentation:
+    def __call__(self, frame: MeasuredFrame) -> Segmentation:
         """Return the thing that each pixel shows, and the surfaces.
 
         Args:
@@ -96,40 +123,53 @@ class LearnedSegmenter:
         up = None
         if frame.pose is not None and self.up is not None:
             up = self.up @ frame.camera_to_world[:3, :3]
-        output = self.network(features(picture, up))
-        valid = picture.depth > 0
+        quarters = quarter_turns(up)
+        upright, up = turned(picture, up, quarters)
+        output = self.network(features(upright, up))
+        valid = upright.depth > 0
         labels = part(output, valid)
-
         surface_label = int(labels.max(initial=0)) + 1
         labels[surface_of(output, valid) & (labels == 0)] = surface_label
+        fine = part(output, valid, DOUBTFUL_ODDS)
+
+        labels, fine = (np.rot90(found, -quarters) for found in (labels, fine))
         sharp = sharpen(labels, picture, frame.depth)
         surface = sharp == surface_label
-        pieces = sharpen(part(output, valid, DOUBTFUL_ODDS), picture, frame.depth)
+        pieces = sharpen(fine, picture, frame.depth)
         return Segmentation(np.where(surface, 0, sharp), surface, pieces)
 
 
-def instances_of(segmentation: Segmenter, frame: Frame) -> Instances:
-    """Ask a segmentation for the things in a frame.
+@lru_cache(maxsize=8)
+def _loaded(card: str | Path | None) -> SegmentationNetwork:
+    """A network, opened once."""
+    return load_network(card)
+
+
+def instances_of(
+    segmentation: Segmenter | None,
+    frame: MeasuredFrame,
+    up: ArrayLike | None = None,
+) -> Instances:
+    """Ask a segmentation for the things in a frame, and for the surfaces.
 
     Args:
-        segmentation: see ``Segmenter``.
+        segmentation: see ``Segmenter``; None for the bundled network, which also tells the surfaces
+            where another segmentation does not.
         frame: of a depth camera.
-
-    Returns:
-        The pixels of each thing, and of the surfaces if they are told.
+        up: direction against gravity in the world of the frame, (3,); None: it is not known.
 
     Raises:
         ObservationError: what it returned are no masks or labels of the frame.
     """
-    given = segmentation(frame)
+    learned = LearnedSegmenter(up=up)
+    given = learned(frame) if segmentation is None else segmentation(frame)
     if not isinstance(given, Segmentation):
-        return Instances(_masks(given, frame))
-
+        given = Segmentation(given)
     masks = _masks(given.labels, frame)
     pieces = None if given.pieces is None else _labels(given.pieces, frame)
-    if given.surface is None:
-        return Instances(masks, pieces=pieces)
-    surface = array_of(given.surface, "the surface of a segmentation")
+
+    surface = learned(frame).surface if given.surface is None else given.surface
+    surface = array_of(surface, "the surface of a segmentation")
     if surface.dtype != bool or surface.shape != frame.shape:
         raise ObservationError(
             f"the surface of a segmentation is (H, W) bool, {frame.shape}, not"
@@ -140,7 +180,7 @@ def instances_of(segmentation: Segmenter, frame: Frame) -> Instances:
     return Instances(masks, surface, pieces)
 
 
-def _labels(given: Any, frame: Frame) -> Index:
+def _labels(given: Any, frame: MeasuredFrame) -> Index:
     """The pieces of a segmentation.
 
     Raises:
@@ -155,7 +195,7 @@ def _labels(given: Any, frame: Frame) -> Index:
     return values
 
 
-def _masks(given: Any, frame: Frame) -> tuple[Mask, ...]:
+def _masks(given: Any, frame: MeasuredFrame) -> tuple[Mask, ...]:
     """The pixels of each thing, by masks or labels.
 
     Raises:

@@ -24,16 +24,16 @@ OUTPUT_CLASSES = (
 AFFINITY_STEPS = (
     (0, 1),
     (1, 0),
-    (0, 3),
-    (3, 0),
-    (3, 3),
-    (3, -3),
-    (0, 8),
-    (8, 0),
-    (8, 8),
-    (8, -8),
-    (0, 20),
-    (20, 0),
+    (0, 4),
+    (4, 0),
+    (4, 4),
+    (4, -4),
+    (0, 10),
+    (10, 0),
+    (10, 10),
+    (10, -10),
+    (0, 26),
+    (26, 0),
 )
 OUTPUTS = len(OUTPUT_CLASSES) + len(AFFINITY_STEPS)
 AFFINITY_OUTPUTS = slice(len(OUTPUT_CLASSES), OUTPUTS)

@@ -8,9 +8,9 @@ import numpy as np
 
 from nextview.checks import one_line
 from nextview.errors import ObservationError
+from nextview.geometry.axes import upright_axes
 from nextview.sensing.frame import Frame
 from nextview.sensing.lean import lean_of
-from nextview.sensing.object_frame import upright_axes
 from nextview.sensing.planes import Plane
 from nextview.sensing.plausibility import (
     check_frame,

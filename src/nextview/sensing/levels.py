@@ -17,23 +17,19 @@ from scipy.spatial import ConvexHull, QhullError
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.planes import (
+    LEAST_SUPPORT,
     POSE_SHIFT,
     POSE_TURN,
     TILT,
     TOLERANCES_ASIDE,
     Plane,
     Samples,
+    axes_along,
     find_plane,
     sample,
     steep,
 )
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
-from nextview.sensing.support import (
-    BOTTOM_MARGIN,
-    BOTTOM_SHARE,
-    SURFACE_STEP,
-    axes_along,
-)
 from nextview.types import Float, Mask
 
 MOST_LEVELS = 6
@@ -45,6 +41,13 @@ INSTANCE_POINTS = 500  # points of an instance that are compared with levels
 MOST_INSIDE = (
     0.5  # share of an instance's points that lie over what carries it, at least
 )
+BOTTOM_SHARE = (
+    0.04  # share of an instance's points that may lie lower than its bottom: noise
+)
+# height over a plane of the bottom of what stands on it, as a part of the distance, at most
+BOTTOM_MARGIN = 0.02
+# neighbouring pixels of one surface differ by at most this part of their depth, and noise
+SURFACE_STEP = 0.04
 RING_WIDTH = 3  # pixels around the bottom of an instance that tell what is below it
 HANGING_SHARE = 0.8  # share of these that lie behind an instance that hangs in the air
 
@@ -88,7 +91,8 @@ class Supports:
         masks: pixels of each instance, (H, W) bool each.
         surface: pixels of all surfaces, (H, W) bool.
         levels: planes of the surfaces, those that carry most pixels of instances first.
-        carriers: the level that carries each instance; None where none that is seen does.
+        carriers: the level that carries each instance, a surface or the top of another instance;
+            None where none that is seen does.
     """
 
     frame: Frame
@@ -130,8 +134,11 @@ class Supports:
             if not any(_same(level, other, frame) for other in levels)
         ]
         levels = _by_load([*levels, *hidden], frame, masks)
-        carriers = tuple(carrier_of(mask, frame, levels) for mask in masks)
-        return cls(frame, tuple(masks), surface, tuple(levels), carriers)
+        carriers = [carrier_of(mask, frame, levels) for mask in masks]
+        if levels and None in carriers:
+            upright = levels[0].plane.normal if up is None else up
+            carriers = _on_others(carriers, masks, frame, noise, upright)
+        return cls(frame, tuple(masks), surface, tuple(levels), tuple(carriers))
 
     def ground(self, among: Mask, widest: float | None) -> SurfaceLevel | None:
         """The level that carries most pixels of things that are looked for.
@@ -158,9 +165,19 @@ class Supports:
             return self.levels[int(load.argmax())]
         return min(self.levels, key=self._off_the_axis)
 
-    def under(self, mask: Mask) -> SurfaceLevel | None:
-        """The level that carries some pixels, (H, W) bool; None where none that is seen does."""
-        return carrier_of(mask, self.frame, self.levels)
+    def under(self, mask: Mask, stands: bool = False) -> SurfaceLevel | None:
+        """The level that carries something; None where none that is seen does.
+
+        Args:
+            mask: its pixels, (H, W) bool.
+            stands: whether it is known to stand on something, so that it does not hang.
+        """
+        level = carrier_of(mask, self.frame, self.levels, stands)
+        if level is not None or not self.masks:
+            return level
+        shared = [np.count_nonzero(mask & own) for own in self.masks]
+        row = int(np.argmax(shared))
+        return self.carriers[row] if shared[row] else None
 
     def again(self, plane: Plane) -> SurfaceLevel | None:
         """The level that a plane of an earlier frame is in this one; None where it is not seen.
@@ -170,8 +187,11 @@ class Supports:
         """
         found = None
         least = np.inf
+        enough = LEAST_SUPPORT * np.count_nonzero(self.surface)
         for level in self.levels:
-            if not level.pixels.any() or level.plane.normal @ plane.normal < TILT:
+            if not np.count_nonzero(level.pixels) > enough:
+                continue
+            if level.plane.normal @ plane.normal < TILT:
                 continue
             apart, reach = _apart(plane, level, self.frame)
             if apart < min(reach, least):
@@ -189,7 +209,10 @@ class Supports:
 
 
 def carrier_of(
-    mask: Mask, frame: Frame, levels: Sequence[SurfaceLevel]
+    mask: Mask,
+    frame: Frame,
+    levels: Sequence[SurfaceLevel],
+    stands: bool = False,
 ) -> SurfaceLevel | None:
     """The level that something stands on: it touches it, or is next above it and hides it.
 
@@ -197,6 +220,7 @@ def carrier_of(
         mask: its pixels, (H, W) bool.
         frame: that shows it.
         levels: of the frame.
+        stands: whether it is known to stand on something, so that it does not hang.
 
     Returns:
         The level; None where its bottom is seen to touch none, or what is below is not seen.
@@ -222,7 +246,9 @@ def carrier_of(
         best = level
         least = abs(bottom)
         touches = bottom < margin
-    if best is None or touches or not _hangs(mask, frame, best.plane, away):
+    if best is None or touches or stands:
+        return best
+    if not _hangs(mask, frame, best.plane, away):
         return best
     return None
 
@@ -327,6 +353,34 @@ def _sides(points: Float, plane: Plane) -> Float | None:
         return ConvexHull(points @ axes_along(plane).T).equations
     except (QhullError, ValueError):
         return None
+
+
+def _on_others(
+    carriers: Sequence[SurfaceLevel | None],
+    masks: Sequence[Mask],
+    frame: Frame,
+    noise: Noise,
+    up: Float,
+) -> list[SurfaceLevel | None]:
+    """Carriers, where instances that no surface carries may stand on other instances.
+
+    Args:
+        carriers: of each instance.
+        masks: pixels of each, (H, W) bool.
+        frame: that shows them.
+        noise: of the frame.
+        up: direction against gravity, (3,), world.
+    """
+    things = np.zeros(frame.shape, bool)
+    for mask in masks:
+        things |= mask
+    tops = _found(frame, things & (frame.depth > 0), noise, up)
+    found = list(carriers)
+    for row, mask in enumerate(masks):
+        if found[row] is None:
+            others = [top for top in tops if not (top.pixels & mask).any()]
+            found[row] = carrier_of(mask, frame, others)
+    return found
 
 
 def _points(mask: Mask, frame: Frame) -> Float:

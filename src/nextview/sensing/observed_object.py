@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from copy import copy, deepcopy
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import get_args
 
@@ -12,17 +12,25 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nextview.errors import ObservationError, UsageError
+from nextview.geometry.axes import three, upright_axes
 from nextview.geometry.observation import Observation
-from nextview.sensing import clusters, plausibility, segmentation
-from nextview.sensing.clusters import Footprint
-from nextview.sensing.convex_pieces import STANDS, cut
+from nextview.segmentation.instances import Instances, Segmenter, instances_of
+from nextview.sensing import plausibility
+from nextview.sensing.choosing import Parting, choose_instance
 from nextview.sensing.displacement import displacement
 from nextview.sensing.facets import Noise, noise_of
 from nextview.sensing.frame import Frame
 from nextview.sensing.known_frames import KnownFrames
-from nextview.sensing.mask_edges import trimmed
-from nextview.sensing.object_frame import Box, ObjectFrame, three, upright_axes
-from nextview.sensing.planes import Plane, Samples, find_again, sample
+from nextview.sensing.levels import Supports
+from nextview.sensing.masks import (
+    SPHERE_MARGIN,
+    above_plane,
+    inside_box,
+    inside_mask,
+    inside_sphere,
+)
+from nextview.sensing.object_frame import Box, ObjectFrame
+from nextview.sensing.planes import Plane, find_again, sample
 from nextview.sensing.resampling import observation_of
 from nextview.sensing.sighting import (
     FEWEST_OBJECT_PIXELS,
@@ -30,22 +38,12 @@ from nextview.sensing.sighting import (
     object_frame_of,
     sighting_of,
 )
-from nextview.sensing.support_plane import (
-    NO_SUPPORT,
-    base_below_view,
-    find_support_plane,
-    refuse_mistakes,
-)
+from nextview.sensing.surface_checks import refuse_mistakes
 from nextview.sensing.view_warning import ViewWarning
-from nextview.sensing.walls import before_walls, find_walls
-from nextview.types import Float, Index, Mask
+from nextview.types import Float, Mask
 
-# share of an object's pixels in an earlier frame that has to change before they are looked at again
-MENDED_SHARE = 0.03
-# the novelty score has to be so much lower for an object to be joined or taken apart otherwise
-LESS_NOVEL = 1.0
-# factor by which the radius may change where an object is looked at anew
-SIZE_CHANGE = 2.0
+# share of an object's pixels by which another parting differs, at least
+OTHER_SHARE = 0.03
 # change of the centre or the radius, in object radii, below which the object frame is left as it is
 SAME_FRAME = 0.01
 NO_OUTLINE = (
@@ -58,21 +56,6 @@ NO_PLANE = ViewWarning(
     "no support plane is seen, so where the object ends below is guessed: support=False if it"
     " stands on none",
 )
-MAY_BE_TWO = ViewWarning(
-    "outline",
-    "the object may be two things that touch: name it by a mask or a box, or move them apart",
-)
-
-
-@dataclass(frozen=True)
-class Carried:
-    """What a segmentation says of what an object stands on.
-
-    Attributes:
-        plane: of the surface that carries it; None where none that is seen does.
-    """
-
-    plane: Plane | None
 
 
 @dataclass(frozen=True)
@@ -80,29 +63,27 @@ class ObjectState:
     """What is known of an object after some frames.
 
     Attributes:
-        rng: source of all random numbers.
         frame: the object frame; None before the object is found.
         sightings: what each frame shows of the object.
         observations: of the frames, in the latest object frame.
         warnings: about the latest frame.
         revision: how often the object frame changed.
-        joins: whether what touches it is a part of it.
+        parting: what of the segmentation is the object.
     """
 
-    rng: np.random.Generator
     frame: ObjectFrame | None = None
     sightings: tuple[Sighting, ...] = ()
     observations: tuple[Observation, ...] = ()
     warnings: tuple[ViewWarning, ...] = ()
     revision: int = 0
-    joins: clusters.Joins = "by their border"
+    parting: Parting = "instance"
 
 
 class ObservedObject:
     """One object, seen in more and more frames. ``add`` takes a frame and gives an observation.
 
     The object is found in each frame: by the frame's mask; else as what lies in a ``box``; else as
-    the cluster on the support plane that is nearest to a ``point``, or at which the first camera is
+    the instance of the segmentation that is nearest to a ``point``, or at which the first camera is
     aimed. Its centre and radius are those of the box, or estimated from all frames that show enough
     of it. When they get better the earlier frames are expressed anew: ``observations`` are always
     all in the same, latest object frame, and ``revision`` counts how often it changed. Its x axis
@@ -122,7 +103,8 @@ class ObservedObject:
         denoise: smooth depth, fill holes and drop flying pixels. For sensors; renders need it not.
         life_size: whether the object is as large as its kind is in life: then the radius is
             evidence of the class.
-        rng: for the search for planes, is copied; seed 0 by default.
+        segmentation: that tells the things in frames, see ``nextview.Scene``; None for the bundled
+            network.
     """
 
     def __init__(
@@ -134,7 +116,7 @@ class ObservedObject:
         known: ObjectFrame | None = None,
         denoise: bool = True,
         life_size: bool = True,
-        rng: np.random.Generator | None = None,
+        segmentation: Segmenter | None = None,
     ) -> None:
         if sum(asked is not None for asked in (point, box, known)) > 1:
             raise UsageError(
@@ -148,10 +130,8 @@ class ObservedObject:
         self.known = known if box is None else box.object_frame
         self.denoise = denoise
         self.life_size = life_size
-        self.state = ObjectState(
-            np.random.default_rng(0) if rng is None else deepcopy(rng),
-            self.known,
-        )
+        self.segmentation = segmentation
+        self.state = ObjectState(self.known)
 
     @property
     def object_frame(self) -> ObjectFrame:
@@ -182,94 +162,86 @@ class ObservedObject:
         """How often earlier observations changed."""
         return self.state.revision
 
-    def add(self, frame: Frame, carried: Carried | None = None) -> Observation:
+    def add(self, frame: Frame) -> Observation:
         """Take in a frame and return its observation from three object radii.
 
         ObservationError where the object is not found in it; the frame is then not taken in.
 
         Args:
             frame: of a depth camera.
-            carried: what the object stands on, by a segmentation; None: that is looked for.
         """
-        self.state = self._after(frame, carried)
+        self.state = self._after(frame)
         return self.state.observations[-1]
 
-    def reconsider(self, novelty: Callable[[Sequence[Observation]], float]) -> None:
-        """Decide by their novelty whether touching things are parts of the object.
+    def part_otherwise(
+        self,
+        p_value: Callable[[Sequence[Observation]], float],
+    ) -> None:
+        """Decide what of the segmentation is the object, by what explains its views best.
 
-        An object of another order of size is another thing, such as the wall behind it, and is not
-        considered.
+        It may be an instance, an instance with all that touches it, or a piece of one.
+
+        Args:
+            p_value: of some views of it as views of a known thing.
         """
-        found = [(novelty(self.observations), self.state)]
-        radius = self.object_frame.radius
-        for joins in self.other_joins():
+        if self.known is not None or not self.support:
+            return
+        others = [
+            parting for parting in get_args(Parting) if parting != self.state.parting
+        ]
+        found = [self.state]
+        for parting in others:
             other = copy(self)
-            other.state = ObjectState(
-                self.state.rng,
-                self.known,
-                revision=self.revision + 1,
-                joins=joins,
-            )
+            revision = self.revision + 1
+            other.state = ObjectState(self.known, revision=revision, parting=parting)
             with suppress(ObservationError):
                 for sighting in self.sightings:
                     other.add(sighting.frame_as_given)
-                if 1 / SIZE_CHANGE < other.object_frame.radius / radius < SIZE_CHANGE:
-                    found.append(
-                        (novelty(other.observations) + LESS_NOVEL, other.state)
-                    )
+                if _differ(other.sightings, self.sightings):
+                    found.append(other.state)
+        if len(found) > 1:
+            values = [p_value(state.observations) for state in found]
+            self.state = found[int(np.argmax(values))]
 
-        self.state = min(found, key=lambda pair: pair[0])[1]
-
-    def other_joins(self) -> list[clusters.Joins]:
-        """Other rules for what touches the object, by which it has other pixels."""
-        old = _earlier_footprints(self.sightings)
-        found: list[clusters.Joins] = []
-
-        for joins in (
-            j for j in get_args(clusters.Joins) if old and j != self.state.joins
-        ):
-            labels, _ = clusters.clusters([foot for foot, _ in old], joins)
-            votes = np.concatenate(
-                [label[was] for label, (_, was) in zip(labels, old, strict=True)]
-            )
-            target = np.bincount(votes, minlength=1).argmax()
-            if any(
-                _changed(*pair, label == target)
-                for pair, label in zip(old, labels, strict=True)
-            ):
-                found.append(joins)
-        return found
-
-    def _after(self, frame: Frame, carried: Carried | None) -> ObjectState:
+    def _after(self, frame: Frame) -> ObjectState:
         """The state after a frame: all stages from the frame to its observation, in order."""
         before = self.state
         known = self._known_frames
         known.refuse(frame)
 
         noise = noise_of(frame)
-        samples = self._samples(frame, noise)
-        plane, up, rng = self._find_plane(frame, samples, carried)
+        up = self._up(frame)
+        instances = None
+        supports = None
+        if self.support:
+            instances = self._instances(frame, up)
+            supports = Supports.of(frame, instances.masks, instances.surface, noise, up)
+        pixels = self._pixels(frame, supports, instances)
+        plane = self._plane_under(pixels, frame, noise, supports, up)
+        if up is None and plane is None:
+            raise ObservationError(
+                "no support plane is seen, so there is no telling where up is: give it, and the"
+                " camera's pose"
+            )
         warnings = known.check(frame, plane)
-        sightings, may_be_two = self._segment(
-            frame,
-            upright_axes(up),
-            plane,
-            samples,
-            noise,
-        )
 
+        mask = self._without_plane(pixels, frame, plane, noise)
+        seen = sighting_of(frame, mask, plane, noise, self.denoise)
         displaced = None
-        if before.sightings and self.known is None and not may_be_two:
-            displaced = displacement(sightings[-1], sightings[:-1])
+        if before.sightings and self.known is None:
+            displaced = displacement(seen, before.sightings)
         if displaced is not None and displaced.mended:
-            sightings[-1] = sightings[-1].shifted(-displaced.shift)
+            seen = seen.shifted(-displaced.shift)
 
-        after = self._known_by(sightings, up)
-        warnings += self._check(after, plane, may_be_two)
+        if up is None:
+            assert plane is not None
+            up = plane.normal
+        after = self._known_by([*before.sightings, seen], up)
+        warnings += self._check(after, plane)
         if not any(warning.holds for warning in warnings):
             warnings += plausibility.check_last_view(after.observations)
         warnings += plausibility.check_place(displaced)
-        return replace(after, rng=rng, warnings=tuple(warnings))
+        return replace(after, warnings=tuple(warnings))
 
     def take_sightings(self, sightings: Sequence[Sighting], up: Float) -> None:
         """Know the object by some sightings, whatever was known of it before.
@@ -314,234 +286,99 @@ class ObservedObject:
             0.0 if known is None else known.radius,
         )
 
-    def _samples(self, frame: Frame, noise: Noise) -> Samples | None:
-        """Samples of all beside the mask; None where no plane is looked for."""
-        if not self.support:
-            return None
-        seen = frame.depth > 0
-        return sample(frame, seen if frame.mask is None else seen & ~frame.mask, noise)
+    def _up(self, frame: Frame) -> Float | None:
+        """Direction against gravity, (3,), world; None where nothing tells it yet."""
+        if self.state.frame is not None:
+            return self.state.frame.axes[2]
+        return None if frame.pose is None else self.up
 
-    def _find_plane(
+    def _instances(self, frame: Frame, up: Float | None) -> Instances:
+        """The instances of a frame and its surfaces; a mask of the frame is the only one."""
+        found = instances_of(self.segmentation, frame, up)
+        if frame.mask is None:
+            return found
+        return Instances((frame.mask,), found.surface & ~frame.mask)
+
+    def _pixels(
         self,
         frame: Frame,
-        samples: Samples | None,
-        carried: Carried | None,
-    ) -> tuple[Plane | None, Float, np.random.Generator]:
-        """Return the support plane, if it is seen, the direction up, (3,), and the generator."""
-        before = self.state
-        up = None if frame.pose is None else self.up
-        if before.frame is not None:
-            up = before.frame.axes[2]
+        supports: Supports | None,
+        instances: Instances | None,
+    ) -> Mask:
+        """Where the object is: in the mask, in its box or sphere, or an instance, (H, W) bool.
 
-        rng = before.rng
-        plane = None
-        earlier = [s.plane for s in before.sightings if s.plane is not None]
-        if samples is not None and carried is not None and carried.plane is not None:
-            plane = carried.plane
-            if not before.sightings:
-                refuse_mistakes(frame, samples, plane, up)
-        elif samples is not None and earlier:
-            near = np.zeros(len(samples.points), bool)
-            if before.frame is not None:
-                away = np.linalg.norm(samples.points - before.frame.centre, axis=1)
-                near = away < before.frame.radius
-            plane = find_again(earlier[0], samples, near)
-        elif samples is not None and carried is None:
-            rng = deepcopy(rng)
-            plane = find_support_plane(
-                frame,
-                samples,
-                up,
-                rng,
-                self.point,
-                self.known,
-                self.box,
+        Raises:
+            ObservationError: nothing is there.
+        """
+        if frame.mask is not None:
+            return frame.mask
+        if self.box is not None:
+            return inside_box(frame, self.box)
+        if self.known is not None:
+            return inside_sphere(
+                frame, self.known.centre, SPHERE_MARGIN * self.known.radius
             )
+        if supports is None or instances is None:
+            raise ObservationError(NO_OUTLINE)
+        state = self.state
+        return choose_instance(
+            supports, self.point, state.frame, state.parting, instances.pieces
+        )
 
-        if up is None:
-            if plane is None:
-                raise ObservationError(
-                    "no support plane is seen, so there is no telling where up is: give it, and"
-                    " the camera's pose"
-                )
-            up = plane.normal
-        return plane, up, rng
-
-    def _segment(
+    def _plane_under(
         self,
+        pixels: Mask,
         frame: Frame,
-        axes: Float,
-        plane: Plane | None,
-        samples: Samples | None,
         noise: Noise,
-    ) -> tuple[list[Sighting], bool]:
-        """Find the object in a frame.
+        supports: Supports | None,
+        up: Float | None,
+    ) -> Plane | None:
+        """The plane on which the object stands; None if it is not seen.
 
-        Returns:
-            The earlier sightings, as they count now, and that of the frame; and whether the object
-            may be two things.
+        Raises:
+            ObservationError: a first frame's pose is wrong, or its depth is a range.
+        """
+        if supports is None:
+            return None
+        level = supports.under(pixels, stands=True)
+        before = self.state
+        if not before.sightings:
+            shown = supports.surface & (frame.depth > 0)
+            plane = None if level is None else level.plane
+            refuse_mistakes(frame, sample(frame, shown, noise), plane, up)
+            return plane
+        if level is not None:
+            return level.plane
+
+        earlier = [s.plane for s in before.sightings if s.plane is not None]
+        if not earlier or before.frame is None:
+            return None
+        samples = sample(frame, (frame.depth > 0) & ~pixels, noise)
+        away = np.linalg.norm(samples.points - before.frame.centre, axis=1)
+        return find_again(earlier[0], samples, away < before.frame.radius)
+
+    def _without_plane(
+        self,
+        pixels: Mask,
+        frame: Frame,
+        plane: Plane | None,
+        noise: Noise,
+    ) -> Mask:
+        """The object's pixels without those of its support, (H, W) bool.
+
+        Raises:
+            ObservationError: too little is seen of it.
         """
         if frame.mask is not None and self.known is not None:
-            mask = frame.mask  # its size does not hang on pixels at the edge
-        elif frame.mask is not None:
-            mask = segmentation.inside_mask(frame, frame.mask, plane, noise)
-        elif self.known is not None:
-            mask = segmentation.inside_region(frame, self.known, self.box, plane, noise)
-        elif not self.support:
-            raise ObservationError(NO_OUTLINE)
-        else:
-            return self._segment_on_plane(frame, axes, plane, samples, noise)
-
-        latest = sighting_of(frame, mask, plane, noise, self.denoise)
-        return [*self.state.sightings, latest], False
-
-    def _segment_on_plane(
-        self,
-        frame: Frame,
-        axes: Float,
-        plane: Plane | None,
-        samples: Samples | None,
-        noise: Noise,
-    ) -> tuple[list[Sighting], bool]:
-        """Find the object among what rises above a plane, seen from above, see ``_segment``.
-
-        It is the plane on which the object stands, if that is seen, or else one as low as all that
-        is seen.
-        """
-        base = plane
-        if base is None and samples is not None and self.point is not None:
-            base = base_below_view(samples, axes[2], self.point)
-        if base is None or samples is None:
-            raise ObservationError(NO_SUPPORT)
-
-        height = frame.along(base.normal, base.offset)
-        above = segmentation.above_plane(frame, base, noise)
-        walls = find_walls(samples, base, np.random.default_rng(0), self._place)
-        free = before_walls(frame, walls, noise)
-        above &= free
-        pieces = cut(frame.depth, above, height, noise, free if walls else None)
-
-        ground = base.extent(samples) @ axes[:2].T
-        earlier = _earlier_footprints(self.state.sightings)
-        if earlier:
-            cell = earlier[0][0].cell
-        else:
-            cell = clusters.FOOTPRINT_CELL * segmentation.distance_to_object(
-                frame,
-                above,
-                ground,
-                axes,
-                noise,
-                self.point,
-            )
-        if self._place is None:
-            # what is far ahead, such as a wall, is no place on the plane
-            ahead = axes[:2] @ segmentation.place_ahead(frame)
-            middle = np.clip(ahead, ground.min(0), ground.max(0))
-        else:
-            middle = axes[:2] @ self._place
-        latest = clusters.footprint(frame, pieces, axes, cell, middle / cell)
-
-        footprints = [*(footprint for footprint, _ in earlier), latest]
-        chosen = [pairs for _, pairs in earlier]
-        labels, may_be_two = clusters.clusters(footprints, self.state.joins)
-        target = self._choose(frame, footprints, labels, chosen, ground, axes)
-        segmentation.join_other_sides(labels, chosen, target)
-
-        its_own = labels[-1] == target
-        mask = latest.pixels_of(its_own)
-        if (labels[-1][~its_own] > 0).any():
-            # cells at the border may hold pixels of a neighbour
-            mask = trimmed(frame.depth, mask, noise, height > STANDS * frame.depth)
-        if target == 0 or np.count_nonzero(mask) < FEWEST_OBJECT_PIXELS:
-            where = "of the object known so far" if earlier else "on the support plane"
+            return pixels  # its size does not hang on pixels at the edge
+        if frame.mask is not None or self.known is None:
+            return inside_mask(frame, pixels, plane, noise)
+        mask = pixels if plane is None else pixels & above_plane(frame, plane, noise)
+        if np.count_nonzero(mask) < FEWEST_OBJECT_PIXELS:
             raise ObservationError(
-                f"this frame shows nothing {where}: check its pose, or aim the camera at the object"
+                "nothing is seen where the object should be: a wrong pose, or a wrong box?"
             )
-
-        sighting = replace(
-            sighting_of(frame, mask, plane, noise, self.denoise),
-            footprint=latest,
-            chosen=its_own,
-        )
-        known = self._reconsidered(labels[:-1], target)
-        return [*known, sighting], bool(may_be_two[target])
-
-    @property
-    def _place(self) -> Float | None:
-        """The known place of the object, (3,), world, metres."""
-        if self.point is not None:
-            return self.point
-        return None if self.state.frame is None else self.state.frame.centre
-
-    def _choose(
-        self,
-        frame: Frame,
-        footprints: Sequence[Footprint],
-        labels: Sequence[Index],
-        chosen: Sequence[Mask],
-        ground: Float,
-        axes: Float,
-    ) -> int:
-        """The object's cluster: by the point, by earlier frames, or what the camera is aimed at."""
-        to_cells = axes[:2] / footprints[-1].cell
-        if self.point is not None:
-            point = to_cells @ self.point
-            return segmentation.cluster_at_point(footprints, labels, point)
-
-        known = self.state.frame
-        if known is not None:
-            return segmentation.cluster_seen_before(
-                footprints,
-                labels,
-                chosen,
-                to_cells @ known.centre,
-                known.radius * float(np.linalg.norm(to_cells[0])),
-            )
-        return clusters.central(
-            footprints[-1],
-            labels[-1],
-            ground / footprints[-1].cell,
-            frame.intrinsics[:2, 2],
-        )
-
-    def _reconsidered(self, labels: Sequence[Index], target: int) -> list[Sighting]:
-        """The earlier sightings, each with what now counts as the object in it."""
-        sightings = list[Sighting]()
-        of_footprints = iter(labels)
-        for earlier in self.state.sightings:
-            if earlier.footprint is None or earlier.chosen is None:
-                sightings.append(earlier)
-                continue
-            now = next(of_footprints) == target
-            if not _changed(earlier.footprint, earlier.chosen, now):
-                sightings.append(earlier)
-                continue
-
-            try:
-                sighting = sighting_of(
-                    earlier.frame,
-                    earlier.footprint.pixels_of(now),
-                    earlier.plane,
-                    earlier.noise,
-                    self.denoise,
-                )
-            except ObservationError:  # what was taken for the object was what hid it
-                sighting = replace(
-                    earlier,
-                    facets=earlier.facets.some(slice(0)),
-                    mask=np.zeros_like(earlier.mask),
-                    hull=earlier.hull[:0],
-                )
-            sightings.append(
-                replace(
-                    sighting,
-                    footprint=earlier.footprint,
-                    chosen=now,
-                    shift=earlier.shift,
-                )
-            )
-        return sightings
+        return mask
 
     def _known_by(self, sightings: Sequence[Sighting], up: Float) -> ObjectState:
         """The state by some sightings: estimate the object frame, and resample what changed."""
@@ -582,18 +419,11 @@ class ObservedObject:
         front = first[:3, 1] if from_above else -ahead
         return object_frame_of(sightings, upright_axes(up, front))
 
-    def _check(
-        self,
-        after: ObjectState,
-        plane: Plane | None,
-        may_be_two: bool,
-    ) -> list[ViewWarning]:
+    def _check(self, after: ObjectState, plane: Plane | None) -> list[ViewWarning]:
         """Return likely faults of what a frame shows of the object."""
         before = self.state
         assert after.frame is not None
         warnings = plausibility.check_observation(after.observations[-1])
-        if may_be_two:
-            warnings.append(MAY_BE_TWO)
         if before.frame is not None:
             radius = after.frame.radius
             warnings += plausibility.check_size(radius, before.frame.radius)
@@ -605,24 +435,20 @@ class ObservedObject:
         return warnings
 
 
-def _earlier_footprints(sightings: Sequence[Sighting]) -> list[tuple[Footprint, Mask]]:
-    """The footprints of those sightings that were found by one, and the object's pairs in each."""
-    return [
-        (sighting.footprint, sighting.chosen)
-        for sighting in sightings
-        if sighting.footprint is not None and sighting.chosen is not None
-    ]
-
-
-def _changed(foot: Footprint, old: Mask, new: Mask) -> bool:
-    """Whether so much of an object changes in a frame that it is to be looked at again."""
-    return bool(foot.pixels[new != old].sum() > MENDED_SHARE * foot.pixels[old].sum())
-
-
 def _same(new: ObjectFrame, old: ObjectFrame) -> bool:
     moved = np.linalg.norm(new.centre - old.centre) / old.radius
     return bool(
         moved < SAME_FRAME
         and abs(new.radius / old.radius - 1) < SAME_FRAME
         and np.allclose(new.axes, old.axes)
+    )
+
+
+def _differ(some: Sequence[Sighting], others: Sequence[Sighting]) -> bool:
+    """Whether some frames show an object in other pixels."""
+    pairs = zip(some, others, strict=True)
+    return any(
+        np.count_nonzero(one.mask != other.mask)
+        > OTHER_SHARE * np.count_nonzero(other.mask)
+        for one, other in pairs
     )

@@ -169,6 +169,13 @@ class Plane:
         return samples.points[on & (part == np.bincount(part[on]).argmax())]
 
 
+def axes_along(plane: Plane) -> Float:
+    """Two directions along a plane, perpendicular to each other, (2, 3)."""
+    first = np.cross(plane.normal, np.eye(3)[np.abs(plane.normal).argmin()])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(plane.normal, first)])
+
+
 def steep(samples: Samples, up: Float) -> Mask:
     """Return the samples on surfaces that rise steeply.
 

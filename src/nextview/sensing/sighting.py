@@ -10,7 +10,6 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from nextview.errors import ObservationError
-from nextview.sensing.clusters import Footprint
 from nextview.sensing.facets import SIZE, Facets, Noise, fit_facets
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.object_frame import ObjectFrame, enclose
@@ -37,8 +36,6 @@ class Sighting:
         mask: its pixels, (H, W) bool.
         hull: corners of its convex hull, world, (K, 3), metres.
         plane: the support plane, if it is seen.
-        footprint: of all that is above the plane, where the object was found so.
-        chosen: which cells of the footprint are the object's, (cells,) bool.
         shift: by which the pose was shifted, (3,), metres.
         warnings: about the frame, whatever it shows of the object.
     """
@@ -49,8 +46,6 @@ class Sighting:
     mask: Mask
     hull: Float
     plane: Plane | None
-    footprint: Footprint | None = None
-    chosen: Mask | None = None
     shift: Float = field(default_factory=lambda: np.zeros(3))
     warnings: tuple[ViewWarning, ...] = ()
 

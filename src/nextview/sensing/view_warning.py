@@ -8,7 +8,7 @@ class ViewWarning:
     """Something that is likely to be wrong, in a sentence.
 
     Names are "nothing seen", "opengl axes", "ros axes", "inverse pose", "scale", "outside",
-    "contradiction" and "repeated"; of a frame "intrinsics", "unit", "far origin", "outline",
+    "contradiction" and "repeated"; of a frame "intrinsics", "unit", "far origin",
     "support", "point", "size", "stale pose", "displaced" and "lean". Those of scenes are on the
     page on tables.
 

@@ -32,9 +32,9 @@ from nextview.policies.base import EpisodeState, Policy, SeeksPose, ValuesViews
 from nextview.policies.off_grid import anywhere
 from nextview.recognition.belief import MUCH, Stopping, log_evidence_of
 from nextview.recognition.evidence import Evidence
-from nextview.recognition.inference import Models, NetworkRecogniser
+from nextview.recognition.inference import Models
 from nextview.recognition.map_names import maps_among
-from nextview.recognition.novelty import Novelty, ViewScore, values_of
+from nextview.recognition.novelty import ViewScore, values_of
 from nextview.recognition.poses import share_of_likeliest
 from nextview.recognition.protocol import JudgesTogether, LooksAhead
 from nextview.sensing.frame import Frame
@@ -147,10 +147,11 @@ class Session:
         distance: of the camera from the object's centre, metres; ``sphere.distance`` object radii
             by default.
         unknown: share of objects of known classes that may be called unknown; 0: none.
-        segmentation: that tells the things in frames, see ``Scene``: the object is the one that its
-            point, its box or the camera's aim chooses. None for the one built in.
+        segmentation: that tells the things in frames, see ``Scene``; None for the bundled network.
+            An object has its own.
 
     Raises:
+        UsageError: an object and a segmentation are given.
         SessionError: the models lack what the policy needs.
     """
 
@@ -171,6 +172,10 @@ class Session:
         if object is not None and not hasattr(object, "sightings"):
             wanted = "what to find in frames is a nextview.sensing.ObservedObject"
             raise UsageError(f"{wanted}, not {one_line(repr(object))}")
+        if object is not None and segmentation is not None:
+            raise UsageError(
+                "an object has its own segmentation: ObservedObject(segmentation=...)"
+            )
         if number(unknown, "the share of known objects called unknown", 0) >= 1:
             raise UsageError(
                 f"the share of known objects called unknown is below 1, not {unknown}"
@@ -181,7 +186,9 @@ class Session:
         self.sphere = sphere
         self._distance = _checked_distance(distance)
         self.object = (
-            _new_object() if object is None and distance is not None else object
+            _new_object(segmentation)
+            if object is None and distance is not None
+            else object
         )
         self.stopping = stopping or Stopping.of(models.recogniser.calibration)
         self.unknown = unknown
@@ -650,7 +657,7 @@ class Session:
             raise SessionError(
                 "this session has taken observations; begin another one for frames"
             )
-        object = self.object or _new_object()
+        object = self.object or _new_object(self.segmentation)
         if len(object.sightings) != self._before + len(self.views):
             raise SessionError(
                 "frames were added to this object outside of the session; begin another one"
@@ -660,13 +667,10 @@ class Session:
         try:
             if (repeated := after_repeated(before, frame, self._before)) is not None:
                 object.state = repeated
-            elif self.segmentation is None:
-                object.add(frame)
-                self._reconsider(object)
             else:
-                from nextview.segmentation.choosing import choose_instance
-
-                object.add(*choose_instance(self.segmentation, frame, object))
+                object.add(frame)
+                if self.unknown and frame.mask is None:
+                    self._part(object)
 
             self._refuse_disagreement(object)
             self._check_distance(object)
@@ -680,28 +684,26 @@ class Session:
             object.state = before
             raise
 
-    def _reconsider(self, object: ObservedObject) -> None:
-        """See ``ObservedObject.reconsider``: where the last view is suspiciously novel."""
+    def _part(self, object: ObservedObject) -> None:
+        """Look for another parting of what is suspiciously novel."""
+        if self._p_value(object.observations) < SUSPICIOUS * self.unknown:
+            object.part_otherwise(self._p_value)
+
+    def _p_value(self, observations: Sequence[Observation]) -> float:
+        """The p-value of some views as views of a known thing; 1 where nothing tells it."""
+        seen = [one for one in observations if one.seen]
+        if not seen:
+            return 1.0
+        found = self.models.evidence(seen)
         recogniser = self.models.recogniser
-        score = recogniser.novelty
-        if (
-            not self.unknown
-            or not isinstance(score, Novelty)
-            or not isinstance(recogniser, NetworkRecogniser)
-        ):
-            return
-        if not object.other_joins():
-            return
-
-        def novelty(seen: Sequence[Observation]) -> float:
-            found = [ViewScore(o, recogniser.novelty_scores) for o in seen if o.seen]
-            return float(np.mean(values_of(found, whole=True))) if found else np.inf
-
-        if (
-            score.of_views([novelty(object.observations[-1:])])
-            < SUSPICIOUS * self.unknown
-        ):
-            object.reconsider(novelty)
+        if isinstance(recogniser, JudgesTogether):
+            azimuths = azimuth_of(np.stack([direction_of(one.pose) for one in seen]))
+            total = log_evidence_of(found.logits, found.azimuth_bins, azimuths).sum(0)
+            p_value = recogniser.together(seen, total, len(seen)).p_value
+            return 1.0 if p_value is None else p_value
+        if recogniser.novelty is None or found.novelty is None:
+            return 1.0
+        return recogniser.novelty.of_views(values_of(found.novelty))
 
     def _refuse_disagreement(self, object: ObservedObject) -> None:
         """Refuse frames that only together make the object reach as far as the camera's distance.
@@ -1088,10 +1090,10 @@ def _checked_distance(given: float | None) -> float | None:
     return None if given is None else number(given, "the distance, in metres,", above=0)
 
 
-def _new_object() -> ObservedObject:
+def _new_object(segmentation: Segmenter | None) -> ObservedObject:
     from nextview.sensing.observed_object import ObservedObject
 
-    return ObservedObject()
+    return ObservedObject(segmentation=segmentation)
 
 
 def _check_needs(policy: Policy, models: Models) -> None:

@@ -13,8 +13,8 @@ from nextview.geometry.viewsphere import CAMERA_DISTANCE
 from nextview.sensing import Frame, ObjectFrame, ObservedObject
 from nextview.sensing.facets import SIZE
 from nextview.sensing.frame import Part, spans, within
+from nextview.sensing.masks import inside_sphere
 from nextview.sensing.resampling import virtual_pose
-from nextview.sensing.segmentation import inside_sphere
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
 from nextview.simulation.scene import boxes_around
 from nextview.simulation.sensor import Sensor, SensorMix, sensor_named, uniform_field

@@ -51,6 +51,8 @@ def random_solid(rng: Generator, size: float) -> Solid:
         tool,
         frame,
         frame,
+        chain,
+        sheet,
         lump,
         bent_lump,
         plate,
@@ -447,6 +449,42 @@ def frame(rng: Generator) -> Solid:
         return bow
     stem = np.linspace([0.5, 0, 0], [rng.uniform(0.8, 1.6), rng.normal(0, 0.1), 0], 6)
     return joined([bow, tube(stem, np.full(6, rng.uniform(0.015, 0.06)))])
+
+
+def chain(rng: Generator) -> Solid:
+    """A heap of thin links: a chain, a necklace, a string of beads."""
+    radius = rng.uniform(0.06, 0.18)
+    links = []
+    place = np.zeros(2)
+    heading = rng.uniform(0, 2 * np.pi)
+    for _ in range(int(rng.integers(4, 16))):
+        sides = 10
+        angles = np.linspace(0, 2 * np.pi, sides)
+        ring = np.c_[np.cos(angles), rng.uniform(0.4, 0.9) * np.sin(angles), 0 * angles]
+        link = tube(0.5 * ring, np.full(sides, radius), 6)
+        tilt = [heading, rng.normal(0, 0.4), rng.normal(0, 0.4)]
+        turn = Rotation.from_euler("zyx", tilt)
+        links.append(moved(link, turn, (*place, rng.uniform(0, radius))))
+        heading += rng.normal(0, 0.9)
+        place = place + 0.7 * np.array([np.cos(heading), np.sin(heading)])
+    return joined(links)
+
+
+def sheet(rng: Generator) -> Solid:
+    """Something flat with an outline of its own: a key, a spatula, a gasket, a leaf."""
+    count = int(rng.integers(5, 40))
+    angles = np.sort(rng.uniform(0, 2 * np.pi, count))
+    if np.diff(angles, append=angles[0] + 2 * np.pi).max() > 2.5:
+        angles = np.arange(count) / count * 2 * np.pi
+    waves = rng.normal(0, [0.2, 0.15, 0.1, 0.08])
+    turns = np.arange(2, 6)[:, None] * angles + rng.uniform(0, 2 * np.pi, 4)[:, None]
+    radii = 0.5 * np.clip(1 + waves @ np.sin(turns), 0.35, 2)
+    outline = radii[:, None] * np.c_[np.cos(angles), np.sin(angles)]
+    rings = [outline]
+    if rng.random() < 0.4:
+        rings.append(ring_points(rng.uniform(0.05, 0.14), 16))
+    flat, faces = extruded(rings, rng.uniform(0.01, 0.08))
+    return flat * [rng.uniform(1, 4), 1, 1], faces
 
 
 def lump(rng: Generator) -> Solid:

@@ -42,6 +42,8 @@ ALIGNED = (
     0.4  # share of levels whose things are turned by quarters, so that their sides meet
 )
 STEPS_OUTWARDS = 60
+SMALL_FURNITURE = 0.8  # metres: a monitor or a night stand
+RAISED = 0.7  # share of small furniture that stands on other furniture, if there is any
 LEAST_STABLE = 0.03  # share of throws of a resting pose, at least
 LARGEST_SHAPE = 20_000  # triangles
 
@@ -335,12 +337,12 @@ def draw_shapes(
 
 
 KINDS = {
-    "table": 0.44,
-    "bin": 0.2,
-    "floor": 0.1,
-    "shelf": 0.1,
-    "room": 0.1,
-    "belt": 0.06,
+    "table": 0.36,
+    "bin": 0.16,
+    "floor": 0.08,
+    "shelf": 0.08,
+    "room": 0.27,
+    "belt": 0.05,
 }
 """Kinds of worlds, and the share of each."""
 
@@ -363,7 +365,7 @@ def draw_world(
     drawn = str(rng.choice(list(KINDS), p=list(KINDS.values())))
     kind = drawn if kind is None else kind
     if kind == "room" and len(furniture):
-        return _room(furniture, rng)
+        return _room(shapes, furniture, rng)
     scale = float(np.exp(rng.uniform(np.log(0.03), np.log(0.17))))
     if kind == "bin":
         return _bin(shapes, furniture, rng, scale)
@@ -669,8 +671,8 @@ def _shelf(shapes: Sequence[Shape], rng: Generator, scale: float) -> World:
     return world
 
 
-def _room(furniture: Sequence[Solid], rng: Generator) -> World:
-    """Life-size furniture on a floor, before walls."""
+def _room(shapes: Sequence[Shape], furniture: Sequence[Solid], rng: Generator) -> World:
+    """Life-size furniture on a floor, before walls, with or without things on it."""
     world = World(np.array([0, 0, 0.4]), 1.0, (5.0, 55.0))
     world.add(slab((14, 14, 0.1), (0, 0), 0), SURFACE)
     for angle in rng.uniform(0, 2 * np.pi, int(rng.integers(0, 3))):
@@ -683,7 +685,19 @@ def _room(furniture: Sequence[Solid], rng: Generator) -> World:
     for _ in range(int(rng.integers(1, 5))):
         solid = furniture[int(rng.integers(len(furniture)))]
         solid = moved(solid, Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)))
-        dropped = ground.drop(solid, rng, False, gap, 1.0)
+        small = np.ptp(solid[0], axis=0).max() < SMALL_FURNITURE
+        raised = bool(small and world.things and rng.random() < RAISED)
+        dropped = ground.drop(solid, rng, raised, gap, 1.0)
+        if dropped is not None:
+            world.add(dropped, world.things)
+
+    for _ in range(int(rng.choice([0, 0, 1, 3]))):
+        shape = shapes[int(rng.integers(len(shapes)))]
+        pose = shape.resting[int(rng.integers(len(shape.resting)))]
+        turn = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi))
+        size = rng.uniform(0.1, 0.4)
+        vertices = (turn * Rotation.from_matrix(pose)).apply(shape.solid[0] * size)
+        dropped = ground.drop((vertices, shape.solid[1]), rng, True, 0.0, 0.6)
         if dropped is not None:
             world.add(dropped, world.things)
     return world
@@ -751,7 +765,7 @@ def _camera_pose(world: World, rng: Generator, sensor: Sensor) -> Float:
     if world.yaw is not None:
         azimuth = world.yaw + rng.uniform(-0.9, 0.9)
     near = 3.0 if world.scale < 0.5 else 1.8
-    distance = float(np.clip(world.scale * near * 3.3 ** rng.random(), 0.22, 5.5))
+    distance = float(np.clip(world.scale * near * 4.5 ** rng.random(), 0.22, 5.5))
     pose = look_at_origin(np.array([elevation]), np.array([azimuth]), distance)[0]
     aside = world.scale * np.array([1.2, 1.2, 0.3]) * rng.normal(0, 1, 3)
     if world.scale > 0.5:

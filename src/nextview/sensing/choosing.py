@@ -1,0 +1,177 @@
+"""Which instance of a frame is the object that is looked at."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import compress
+from typing import Literal
+
+import numpy as np
+
+from nextview.errors import ObservationError
+from nextview.sensing.frame import Frame
+from nextview.sensing.levels import Supports
+from nextview.sensing.masks import SPHERE_MARGIN, inside_sphere, touching
+from nextview.sensing.object_frame import ObjectFrame
+from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
+from nextview.types import Float, Index, Mask
+
+Parting = Literal["instance", "touching", "piece"]
+"""What of the segmentation is one object: an instance; an instance with all that touches it; or a
+piece of one."""
+
+NO_INSTANCE = (
+    "the segmentation finds nothing {where} in this frame: check its pose, aim the camera at the"
+    " object, or give a mask"
+)
+NEAREST_POINT = 0.01  # metres between the camera and a point on an object, at least
+POINTS_COMPARED = 1000  # of an instance with the point that chooses one
+# picture widths from the optical axis at which an instance counts for 1 / e of its pixels
+AIM_SPREAD = 0.08
+
+
+def choose_instance(
+    supports: Supports,
+    point: Float | None,
+    known: ObjectFrame | None,
+    parting: Parting = "instance",
+    pieces: Index | None = None,
+) -> Mask:
+    """Choose the instance that an object is in a frame.
+
+    It is the one where the object was found so far; in a first frame the one nearest to a point,
+    or the one at which the camera is aimed.
+
+    Args:
+        supports: the instances of the frame, and what carries them.
+        point: on the object, (3,), world, metres; None if it was not given.
+        known: where the object is by earlier frames; None in a first one.
+        parting: what of the segmentation is one object.
+        pieces: of the segmentation, (H, W) int, 0 for none; None where it tells none.
+
+    Returns:
+        Its pixels, (H, W) bool.
+
+    Raises:
+        ObservationError: there is no such instance.
+    """
+    chosen = _chosen(supports, point, known)
+    if parting == "touching":
+        return _with_neighbours(chosen, supports)
+    if parting == "piece" and pieces is not None:
+        numbers = np.unique(pieces[chosen & (pieces > 0)])
+        masks = tuple(chosen & (pieces == number) for number in numbers)
+        carriers = (supports.under(chosen),) * len(masks)
+        parts = replace(supports, masks=masks, carriers=carriers)
+        return _chosen(parts, point, known) if _of_size(parts) else chosen
+    return chosen
+
+
+def _chosen(supports: Supports, point: Float | None, known: ObjectFrame | None) -> Mask:
+    """The instance where the object was found, at its point, or before the camera."""
+    if known is not None:
+        return _seen_before(supports, known)
+    if point is not None:
+        return _at_point(supports, point)
+    return _aimed_at(supports)
+
+
+def _with_neighbours(chosen: Mask, supports: Supports) -> Mask:
+    """An instance with all that touches it, directly or through others, (H, W) bool."""
+    found = chosen
+    left = [mask for mask in supports.masks if not (mask & chosen).any()]
+    while True:
+        beside = [touching(supports.frame, found, mask) for mask in left]
+        if not any(beside):
+            return found
+        for mask in compress(left, beside):
+            found = found | mask
+        left = [
+            mask for mask, is_beside in zip(left, beside, strict=True) if not is_beside
+        ]
+
+
+def _at_point(supports: Supports, point: Float) -> Mask:
+    """The instance nearest to a point, (3,), world, metres, on its surface or inside of it."""
+    frame = supports.frame
+    away = float(np.linalg.norm(point - frame.camera_to_world[:3, 3]))
+    if away < NEAREST_POINT:
+        raise ObservationError(
+            f"the object's point is {away:.2g} m from the camera: of the world?"
+        )
+    shown = _of_size(supports)
+    if not shown:
+        raise ObservationError(NO_INSTANCE.format(where="at the point"))
+    distances = [_distance(mask, frame, point) for mask in shown]
+    return shown[int(np.argmin(distances))]
+
+
+def _distance(mask: Mask, frame: Frame, point: Float) -> float:
+    """Metres from a point to an instance; 0 behind its surface, no deeper than it is wide."""
+    rows, columns = np.nonzero(mask & (frame.depth > 0))
+    few = slice(None, None, max(1, len(rows) // POINTS_COMPARED))
+    points = frame.positions(rows[few], columns[few])
+    nearest = float(np.linalg.norm(points - point, axis=1).min())
+
+    pose = frame.camera_to_world
+    x, y, z = (point - pose[:3, 3]) @ pose[:3, :3]
+    if z <= 0:
+        return nearest
+    across, down, _ = frame.intrinsics @ np.array([x / z, y / z, 1.0])
+    row = int(np.floor(down))
+    column = int(np.floor(across))
+    height, width = frame.shape
+    if not (0 <= row < height and 0 <= column < width) or not mask[row, column]:
+        return nearest
+    deep = z - float(frame.depth[row, column])
+    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    return 0.0 if 0 <= deep < size else nearest
+
+
+def _seen_before(supports: Supports, known: ObjectFrame) -> Mask:
+    """The instance that fills most of where the object was found, and is not much elsewhere."""
+    frame = supports.frame
+    inside = inside_sphere(frame, known.centre, SPHERE_MARGIN * known.radius)
+    shown = _of_size(supports)
+    worth = [_overlap(mask & (frame.depth > 0), inside) for mask in shown]
+    if not any(worth):
+        raise ObservationError(NO_INSTANCE.format(where="of the object known so far"))
+    return shown[int(np.argmax(worth))]
+
+
+def _overlap(mask: Mask, inside: Mask) -> float:
+    """Pixels of an instance in a place, times the share of its pixels that these are."""
+    there = int(np.count_nonzero(mask & inside))
+    return there**2 / max(int(np.count_nonzero(mask)), 1)
+
+
+def _aimed_at(supports: Supports) -> Mask:
+    """The largest instance near the optical axis; of those that a surface carries, if there are.
+
+    Its pixels count the less, the farther it lies from the axis.
+    """
+    shown = _of_size(supports)
+    pairs = zip(supports.masks, supports.carriers, strict=True)
+    carried = {id(mask) for mask, level in pairs if level is not None}
+    shown = [mask for mask in shown if id(mask) in carried] or shown
+    if not shown:
+        raise ObservationError(NO_INSTANCE.format(where="before the camera"))
+    return max(shown, key=lambda mask: _weight(mask, supports.frame))
+
+
+def _weight(mask: Mask, frame: Frame) -> float:
+    """Pixels of an instance, less the farther it lies from the optical axis."""
+    rows, columns = np.nonzero(mask)
+    column, row = frame.intrinsics[:2, 2]
+    away = float(np.hypot(rows - row, columns - column).min()) / frame.shape[1]
+    return float(len(rows) * np.exp(-((away / AIM_SPREAD) ** 2)))
+
+
+def _of_size(supports: Supports) -> list[Mask]:
+    """The instances that show in enough pixels."""
+    measured = supports.frame.depth > 0
+    return [
+        mask
+        for mask in supports.masks
+        if np.count_nonzero(mask & measured) >= FEWEST_OBJECT_PIXELS
+    ]

@@ -1,0 +1,80 @@
+"""Refuse a first frame whose pose or depth its surfaces contradict.
+
+By a wrong pose the largest plane in view leans, and depth that is measured along the rays shows no
+plane where there is one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.random import Generator
+
+from nextview.errors import ObservationError
+from nextview.sensing import planes
+from nextview.sensing.frame import Frame
+from nextview.sensing.planes import Plane, Samples, find_plane, steep
+from nextview.types import Float
+
+# share of the samples on a plane from which no other plane holds twice as many
+LARGE_SHARE = 1 / 3
+
+
+def refuse_mistakes(
+    frame: Frame,
+    samples: Samples,
+    plane: Plane | None,
+    up: Float | None,
+) -> None:
+    """Refuse a frame whose pose is wrong, or whose depth is a range, by its surfaces.
+
+    Args:
+        frame: the frame.
+        samples: of the surfaces in it.
+        plane: of these, the one that things stand on; None if none is level.
+        up: direction against gravity, (3,), world; None if it is not known.
+
+    Raises:
+        ObservationError: the pose is wrong, or the depth is measured along the rays.
+    """
+    rng = np.random.default_rng(0)
+    level = samples if up is None else samples.some(~steep(samples, up))
+    if up is not None and _share(plane, level) < LARGE_SHARE:
+        _refuse_wrong_pose(frame, samples, 2 * _share(plane, level), up, rng)
+    _refuse_range(frame, plane, level, rng, up)
+
+
+def _refuse_range(
+    frame: Frame,
+    plane: Plane | None,
+    level: Samples,
+    rng: Generator,
+    up: Float | None,
+) -> None:
+    """Refuse a frame that fits a plane better if its depth is taken along each ray."""
+    if planes.lies_better_as_range(frame, plane, level, rng, up):
+        raise ObservationError(
+            "the depth is measured along the rays, a range: give it along the optical axis"
+        )
+
+
+def _share(plane: Plane | None, samples: Samples) -> float:
+    """Share of the samples that lie on a plane."""
+    return 0.0 if plane is None else float(plane.holds(samples).mean())
+
+
+def _refuse_wrong_pose(
+    frame: Frame,
+    samples: Samples,
+    least: float,
+    up: Float,
+    rng: Generator,
+) -> None:
+    """Refuse a frame whose largest plane holds more than a share, and would be level otherwise."""
+    largest = find_plane(samples, rng)
+    if largest is None:
+        return
+    mistake = planes.mistake_in_pose(largest, frame.camera_to_world, up)
+    if mistake and largest.holds(samples).mean() > least:
+        raise ObservationError(
+            f"the largest plane in view is not level: {mistake} Or up is another direction"
+        )
