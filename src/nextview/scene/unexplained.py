@@ -116,8 +116,7 @@ def _patches(
         left &= inside_box(frame, region)
     else:
         left &= top.height > 0
-        if top.free is not None:
-            left &= top.free
+    left &= ~top.background
     if frame.mask is not None:
         left &= frame.mask
     for mask in top.carried_by_none:

@@ -6,7 +6,7 @@ A trained network tells both. A segmentation of your own may tell the things in 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -20,7 +20,13 @@ from nextview.geometry.axes import upright_axes
 from nextview.geometry.observation import array_of
 from nextview.segmentation.features import features, quarter_turns, shrink, turned
 from nextview.segmentation.network import SegmentationNetwork, load_network
-from nextview.segmentation.parting import DOUBTFUL_ODDS, part, sharpen, surface_of
+from nextview.segmentation.parting import (
+    DOUBTFUL_ODDS,
+    background_of,
+    part,
+    sharpen,
+    surface_of,
+)
 from nextview.types import Float, Float32, Index, Mask
 
 
@@ -59,11 +65,14 @@ class Segmentation:
         pieces: number of the piece that each pixel belongs to, (H, W) int; 0 for none. A piece
             belongs to one thing without doubt; a thing may be several. None where the segmentation
             has no doubts.
+        background: pixels that are clearly neither a thing nor a surface, such as walls and the
+            sides of bins, (H, W) bool; None where the segmentation does not tell them.
     """
 
     labels: Index
     surface: Mask | None = None
     pieces: Index | None = None
+    background: Mask | None = None
 
 
 Segmenter = Callable[[Any], Any]
@@ -78,11 +87,13 @@ class Instances:
     Attributes:
         masks: pixels of each thing, (H, W) bool each.
         surface: pixels of what carries things, (H, W) bool.
+        background: pixels that are clearly neither, (H, W) bool.
         pieces: see ``Segmentation``.
     """
 
     masks: tuple[Mask, ...]
     surface: Mask
+    background: Mask
     pieces: Index | None = None
 
 
@@ -130,13 +141,16 @@ class LearnedSegmenter:
         labels = part(output, valid)
         surface_label = int(labels.max(initial=0)) + 1
         labels[surface_of(output, valid) & (labels == 0)] = surface_label
+        labels[background_of(output, valid) & (labels == 0)] = surface_label + 1
         fine = part(output, valid, DOUBTFUL_ODDS)
 
         labels, fine = (np.rot90(found, -quarters) for found in (labels, fine))
         sharp = sharpen(labels, picture, frame.depth)
         surface = sharp == surface_label
+        background = sharp == surface_label + 1
         pieces = sharpen(fine, picture, frame.depth)
-        return Segmentation(np.where(surface, 0, sharp), surface, pieces)
+        labels = np.where(surface | background, 0, sharp)
+        return Segmentation(labels, surface, pieces, background)
 
 
 @lru_cache(maxsize=8)
@@ -168,16 +182,36 @@ def instances_of(
     masks = _masks(given.labels, frame)
     pieces = None if given.pieces is None else _labels(given.pieces, frame)
 
-    surface = learned(frame).surface if given.surface is None else given.surface
-    surface = array_of(surface, "the surface of a segmentation")
-    if surface.dtype != bool or surface.shape != frame.shape:
-        raise ObservationError(
-            f"the surface of a segmentation is (H, W) bool, {frame.shape}, not"
-            f" {one_line(f'{surface.shape} {surface.dtype}')}"
+    if given.surface is None or given.background is None:
+        told = learned(frame)
+        given = replace(
+            given,
+            surface=told.surface if given.surface is None else given.surface,
+            background=told.background
+            if given.background is None
+            else given.background,
         )
+    surface = _pixels(given.surface, "surface", frame)
+    background = _pixels(given.background, "background", frame)
     for mask in masks:
         surface = surface & ~mask
-    return Instances(masks, surface, pieces)
+        background = background & ~mask
+    return Instances(masks, surface, background, pieces)
+
+
+def _pixels(given: Any, what: str, frame: MeasuredFrame) -> Mask:
+    """The surface or the background of a segmentation.
+
+    Raises:
+        ObservationError: these are no pixels of the frame.
+    """
+    values = array_of(given, f"the {what} of a segmentation")
+    if values.dtype != bool or values.shape != frame.shape:
+        raise ObservationError(
+            f"the {what} of a segmentation is (H, W) bool, {frame.shape}, not"
+            f" {one_line(f'{values.shape} {values.dtype}')}"
+        )
+    return values
 
 
 def _labels(given: Any, frame: MeasuredFrame) -> Index:

@@ -18,6 +18,7 @@ from nextview.segmentation.network import (
 from nextview.types import Float32, Index, Mask
 
 THING_CLASS = OUTPUT_CLASSES.index("thing")
+BACKGROUND_CLASS = OUTPUT_CLASSES.index("background")
 SURFACE_CLASS = OUTPUT_CLASSES.index("surface")
 # added to all log-odds: the training counts pairs of different things four times
 JOINING_ODDS = 0.7
@@ -28,7 +29,8 @@ EDGE_SHARPNESS = (
     60.0  # steps of a sixtieth of the depth count as much as a pixel of the picture
 )
 SCRAP_PIXELS = 16  # of an instance that is none of its own, but a piece of an edge
-CERTAIN_ODDS = 2.0  # of all neighbours around a pixel, to be joined before all others
+# of all neighbours around a pixel, to be joined before all others; and of what is background
+CERTAIN_ODDS = 2.0
 
 
 def part(output: Float32, valid: Mask, doubt: float = 0.0) -> Index:
@@ -116,6 +118,18 @@ def surface_of(output: Float32, valid: Mask) -> Mask:
         valid: pixels with depth, (h, w) bool.
     """
     return valid & (output[: len(OUTPUT_CLASSES)].argmax(0) == SURFACE_CLASS)
+
+
+def background_of(output: Float32, valid: Mask) -> Mask:
+    """Return the pixels that are clearly neither a thing nor a surface, (h, w) bool.
+
+    Args:
+        output: of the network, (15, h, w).
+        valid: pixels with depth, (h, w) bool.
+    """
+    odds = output[: len(OUTPUT_CLASSES)]
+    others = np.logaddexp(odds[THING_CLASS], odds[SURFACE_CLASS])
+    return valid & (odds[BACKGROUND_CLASS] - others > CERTAIN_ODDS)
 
 
 def pair_slices(

@@ -297,7 +297,10 @@ class ObservedObject:
         found = instances_of(self.segmentation, frame, up)
         if frame.mask is None:
             return found
-        return Instances((frame.mask,), found.surface & ~frame.mask)
+        outside = ~frame.mask
+        return Instances(
+            (frame.mask,), found.surface & outside, found.background & outside
+        )
 
     def _pixels(
         self,

@@ -27,7 +27,6 @@ from nextview.sensing.planes import Plane, sample
 from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS, Sighting, sighting_of
 from nextview.sensing.surface_checks import refuse_mistakes
 from nextview.sensing.view_warning import ViewWarning
-from nextview.sensing.walls import before_walls, find_walls
 from nextview.types import Float, Float32, Index, Mask
 
 NO_SUPPORT = (
@@ -57,7 +56,7 @@ class TableTop:
         plane: the level that carries most things, or that carried most in an earlier frame.
         up: direction against gravity, (3,), world.
         above: pixels of things above what carries them, (H, W) bool.
-        free: pixels before all walls, (H, W) bool; None where there is no wall.
+        background: pixels that clearly show neither a thing nor a surface, (H, W) bool.
         height: of each pixel over the plane that carries what it shows, (H, W) float32, metres.
         supports: the surfaces, and what stands on each.
         pieces: that a segmentation may cut things into, (H, W) int, 0 for none; None where it
@@ -71,7 +70,7 @@ class TableTop:
     plane: Plane
     up: Float
     above: Mask
-    free: Mask | None
+    background: Mask
     height: Float32
     supports: Supports
     pieces: Index | None = None
@@ -129,16 +128,13 @@ class TableTop:
             raise ObservationError(NO_SUPPORT)
 
         height, above = _heights(supports, plane, noise)
-        walls = find_walls(
-            sample(frame, frame.depth > 0, noise), plane, np.random.default_rng(0)
-        )
         return cls(
             frame,
             noise,
             plane,
             plane.normal if upright is None else upright,
             above,
-            before_walls(frame, walls, noise) if walls else None,
+            instances.background,
             height,
             supports,
             instances.pieces,
