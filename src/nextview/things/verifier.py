@@ -29,6 +29,7 @@ from nextview.things.registration import (
     render,
     start,
 )
+from nextview.things.stranger import Evidence, log_odds_of_stranger
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.verification import PixelModel, ViewLikelihood, likelihood
 from nextview.things.view_templates import ViewTemplates
@@ -116,8 +117,6 @@ class Verified:
         noise_share: see ``ViewLikelihood``, of each hypothesis in each view, (M, V) float64.
         against: what features hold against each thing, nats, (T,) float64; 0 for things in any
             orientation, whose outlines are judged by the geometry anyway.
-        seen_behind: share of what should be visible of each hypothesis that the cameras see past,
-            of all views together, (M,) float64.
         below: by how much each hypothesis reaches below the ground, (M,) float64, metres; 0 where
             noise, tilt and errors of the scan explain it.
     """
@@ -136,7 +135,6 @@ class Verified:
     misfit: Float
     noise_share: Float
     against: Float
-    seen_behind: Float
     below: Float
 
     def select(self, rows: NDArray) -> "Verified":
@@ -197,7 +195,6 @@ OF_HYPOTHESES = (
     "explained",
     "misfit",
     "noise_share",
-    "seen_behind",
     "below",
 )
 """What ``Verified`` holds of each hypothesis, beside its probability and prior belief."""
@@ -326,8 +323,7 @@ class Verifier:
         Raises:
             ObservationError: no view shows the thing, or its scale is not known.
         """
-        images = [replace(image, ground=None) for image in _images(observations)]
-        return self._tilted(images, np.eye(3))
+        return self._tilted(*_held(observations))
 
     def whole_search(
         self,
@@ -352,6 +348,34 @@ class Verifier:
         except ObservationError:  # too little is seen to be compared
             return resting
         return self._joined(resting, unusual)
+
+    def log_odds_of_stranger(
+        self,
+        observations: Sequence[Observation],
+        found: Verified,
+        resting: bool,
+    ) -> float:
+        """How much likelier a stranger of its shape is than the likeliest hypothesis.
+
+        Args:
+            observations: the views that it was found in.
+            found: what was found of them.
+            resting: whether the ground counts, if it is seen.
+
+        Returns:
+            Log-odds, nats: see ``stranger.log_odds_of_stranger``.
+        """
+        images, level = _levelled(observations) if resting else _held(observations)
+        views = [image.view(FINE_SIDE) for image in images]
+        evidence = Evidence(
+            self.caster,
+            views,
+            self.prior,
+            self.weights,
+            self.pixels,
+        )
+        likeliest = found.alignment(np.zeros(1, np.int64), self).turned(level)
+        return log_odds_of_stranger(evidence, likeliest)
 
     @cached_property
     def templates(self) -> ViewTemplates:
@@ -534,8 +558,6 @@ class Verifier:
 
         ``alignment`` and ``views`` are in the frame that was turned to be level.
         """
-        visible = np.sum([view.visible for view in judged], axis=0)
-        behind = np.sum([view.seen_behind for view in judged], axis=0)
         aligned = alignment.turned(level.T)
         shares = np.exp(scores - scores.max())
         return Verified(
@@ -553,7 +575,6 @@ class Verifier:
             misfit=np.stack([view.misfit for view in judged], 1),
             noise_share=np.stack([view.noise_share for view in judged], 1),
             against=proposed.against,
-            seen_behind=behind / np.maximum(visible, 1),
             below=self._below(alignment, views).depth,
         )
 
@@ -566,6 +587,12 @@ def _levelled(
     grounds = [image.ground for image in images if image.ground is not None]
     level = levelling(grounds)
     return [image.turned(level) for image in images], level
+
+
+def _held(observations: Sequence[Observation]) -> tuple[list[MetricImage], Float]:
+    """The observations that show the thing, without a ground to stand on, and no turn."""
+    images = [replace(image, ground=None) for image in _images(observations)]
+    return images, np.eye(3)
 
 
 def _images(observations: Sequence[Observation]) -> list[MetricImage]:
