@@ -5,6 +5,8 @@ from collections.abc import Callable, Sequence
 from nextview.recognition.poses import UNKNOWN_TURN, PoseCandidate, uncertainty_of
 from nextview.things.verifier import Verified
 
+# share of what should be visible of the scan, past which cameras see what is behind
+MOST_SEEN_BEHIND = 0.1
 FEWEST_PIXELS = 350  # that show a thing whose shape can be told
 
 
@@ -27,12 +29,15 @@ def doubt_of(
         The reason in words; "" if there is none.
     """
     below = 1000 * float(found.below[0])
+    behind = float(found.seen_behind[0])
     own = [one for one in poses if one.thing == poses[0].thing]
     degrees = uncertainty_of(own).degrees
     if below:
         return f"its scan would reach {below:.0f} mm below the ground"
     if pixels < FEWEST_PIXELS:
         return f"only {pixels} pixels show it"
+    if behind >= MOST_SEEN_BEHIND:
+        return f"the camera sees past {100 * behind:.0f} % of its scan"
     if degrees >= UNKNOWN_TURN:
         return f"its orientation is known to ± {degrees:.0f}° only"
     if stranger() > 0:

@@ -240,6 +240,12 @@ class Rendered:
         before = self.depth - self._apart(view)
         return (view.kind == ELSEWHERE) & (view.depth < before)
 
+    def seen_behind(self, view: DepthView) -> Mask:
+        """Where something is measured behind a hypothesis that should hide it, (H, P) bool."""
+        shows = np.isfinite(self.depth)
+        behind = np.where(shows, self.depth, 0) + self._apart(view)
+        return shows & (view.kind == ELSEWHERE) & (view.depth > behind)
+
     def _apart(self, view: DepthView) -> Float32:
         """Metres from which on depth is before or behind the hypotheses, (H, P)."""
         return np.hypot(HIDING, HIDING_NOISE * view.noise) + self.errors[:, None]

@@ -63,7 +63,7 @@ UNKNOWNS = POSE + 3
 
 STRETCH_LEVELS = (Level(5, 0.05, 0.5, True), Level(5, 0.02, 0.1, True))
 STRETCH_STEP = (
-    0.1  # logarithm by which a step stretches at most, and usually not at all
+    0.1  # logarithm by which a step stretches at most; it is damped by it, too
 )
 UNTOLD = 1.0  # deviation of a stretch that the views tell nothing of
 

@@ -46,6 +46,9 @@ class ViewLikelihood:
             float64, 0 for exactly: see ``likelihood``.
         noise_share: part of the noise of the camera in the variance of a depth that is measured on
             the hypothesis, beside the errors of its scan, (H,) float64.
+        visible: pixels where the hypothesis should show and depth was measured, (H,) float64; those
+            near the outline of the thing count less.
+        seen_behind: those of them in which something behind it was measured, (H,) float64.
     """
 
     total: Float
@@ -53,6 +56,8 @@ class ViewLikelihood:
     explained: Float
     misfit: Float
     noise_share: Float
+    visible: Float
+    seen_behind: Float
 
     def select(self, rows: Index) -> "ViewLikelihood":
         """Some of the hypotheses, by index."""
@@ -136,12 +141,15 @@ def likelihood(
         model.missing * missing + model.through * impossible
     )
     pixels = counted.sum(1).astype(np.float64)
+    visible = shows & ~hole & ~rendered.hidden(view)
     return ViewLikelihood(
         total=judged.sum(1) + model.outlier * below * pixels,
         pixels=pixels,
         explained=explained,
         misfit=misfit,
         noise_share=_noise_share(view, rendered),
+        visible=np.where(visible, deep, 0).sum(1),
+        seen_behind=np.where(rendered.seen_behind(view), deep, 0).sum(1),
     )
 
 

@@ -117,6 +117,8 @@ class Verified:
         noise_share: see ``ViewLikelihood``, of each hypothesis in each view, (M, V) float64.
         against: what features hold against each thing, nats, (T,) float64; 0 for things in any
             orientation, whose outlines are judged by the geometry anyway.
+        seen_behind: share of what should be visible of each hypothesis that the cameras see past,
+            of all views together, (M,) float64.
         below: by how much each hypothesis reaches below the ground, (M,) float64, metres; 0 where
             noise, tilt and errors of the scan explain it.
     """
@@ -135,6 +137,7 @@ class Verified:
     misfit: Float
     noise_share: Float
     against: Float
+    seen_behind: Float
     below: Float
 
     def select(self, rows: NDArray) -> "Verified":
@@ -195,6 +198,7 @@ OF_HYPOTHESES = (
     "explained",
     "misfit",
     "noise_share",
+    "seen_behind",
     "below",
 )
 """What ``Verified`` holds of each hypothesis, beside its probability and prior belief."""
@@ -558,6 +562,8 @@ class Verifier:
 
         ``alignment`` and ``views`` are in the frame that was turned to be level.
         """
+        visible = np.sum([view.visible for view in judged], axis=0)
+        behind = np.sum([view.seen_behind for view in judged], axis=0)
         aligned = alignment.turned(level.T)
         shares = np.exp(scores - scores.max())
         return Verified(
@@ -575,6 +581,7 @@ class Verifier:
             misfit=np.stack([view.misfit for view in judged], 1),
             noise_share=np.stack([view.noise_share for view in judged], 1),
             against=proposed.against,
+            seen_behind=behind / np.maximum(visible, 1),
             below=self._below(alignment, views).depth,
         )
 
