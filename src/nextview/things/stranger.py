@@ -50,7 +50,8 @@ UNLIKE = (
 CAMERA_SCALE = (
     0.015  # by which part of its size a camera sees everything larger or smaller
 )
-STANDS = 0.004  # metres by which a thing that stands on the ground is seen above it or below it
+# metres by which a thing that stands on the ground is seen above or below it
+BOTTOM_NOISE = 0.004
 ON_OTHERS = 0.1  # share of the things that stand on something else
 OTHERS_HEIGHT = 0.1  # metres of what these stand on: other things, books, trays
 # pixels of the image over which cameras mix depths on both sides of an outline: they match windows
@@ -68,7 +69,7 @@ UNTOLD = 1.0  # deviation of a stretch that the views tell nothing of
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class Comparison:
     """What hypotheses are compared with, and how.
 
     Attributes:
@@ -98,16 +99,16 @@ class Stretched:
     alignment: Alignment
     factors: Float
 
-    def render(self, evidence: Evidence, number: int) -> Rendered:
+    def render(self, comparison: Comparison, number: int) -> Rendered:
         """What the view of this ``number`` would see of it."""
-        view = evidence.views[number]
+        view = comparison.views[number]
         aligned = self.alignment
         rotation = aligned.rotations[0]
         centre = aligned.centres[0] + aligned.cameras[0, number]
         origin = (view.origin - centre) @ rotation / self.factors
         rays = view.rays @ rotation / self.factors
-        origin = origin + evidence.caster.centres[aligned.things[0]]
-        depth, normals = evidence.caster.cast(
+        origin = origin + comparison.caster.centres[aligned.things[0]]
+        depth, normals = comparison.caster.cast(
             aligned.things,
             origin[None].astype(np.float32),
             rays[None].astype(np.float32),
@@ -115,21 +116,21 @@ class Stretched:
         across = normals / self.factors
         lengths = np.linalg.norm(across, axis=2, keepdims=True)
         across = across / np.maximum(lengths, 1e-12) @ rotation.T
-        radii = evidence.caster.radii[aligned.things]
+        radii = comparison.caster.radii[aligned.things]
         return Rendered(depth, across.astype(np.float32), radii)
 
-    def bottom(self, evidence: Evidence) -> tuple[float, Float] | None:
+    def bottom(self, comparison: Comparison) -> tuple[float, Float] | None:
         """Height of its lowest point above the ground, metres; None where no view shows the ground.
 
         And how the height changes with each unknown of a step, (UNKNOWNS,).
         """
         grounds = [
-            ground_height(one) for one in evidence.views if one.ground is not None
+            ground_height(one) for one in comparison.views if one.ground is not None
         ]
         if not grounds:
             return None
         aligned = self.alignment
-        surface = evidence.caster.surfaces[aligned.things[0]]
+        surface = comparison.caster.surfaces[aligned.things[0]]
         up = aligned.rotations[0, 2]  # in the axes of the scan
         points = (surface.vertices - surface.centre) * self.factors
         heights = points @ up
@@ -141,24 +142,24 @@ class Stretched:
         return above, change
 
 
-def log_odds_of_stranger(evidence: Evidence, alignment: Alignment) -> float:
+def log_odds_of_stranger(comparison: Comparison, alignment: Alignment) -> float:
     """How much likelier a stranger of a thing's shape is than the thing, as a logarithm.
 
     Args:
-        evidence: the views.
+        comparison: the views.
         alignment: the one hypothesis that is likeliest, aligned with them.
 
     Returns:
         Log-odds, nats: positive where a stranger is likelier than the thing itself.
     """
     itself = Stretched(alignment, np.ones(3))
-    rivals = [_fitted(evidence, itself, False)]
-    if itself.bottom(evidence) is not None:
-        rivals.append(_fitted(evidence, itself, True))
-    best = _best(evidence, itself, rivals)
-    found, covariance = _estimate(evidence, best)
+    rivals = [_fitted(comparison, itself, False)]
+    if itself.bottom(comparison) is not None:
+        rivals.append(_fitted(comparison, itself, True))
+    best = _best(comparison, itself, rivals)
+    found, covariance = _estimate(comparison, best)
 
-    surface = evidence.caster.surfaces[alignment.things[0]]
+    surface = comparison.caster.surfaces[alignment.things[0]]
     half_sides = np.maximum(np.ptp(surface.vertices, axis=0) / 2, 1e-4)
     taught = np.diag((scan_errors(surface.radius) / half_sides) ** 2) + CAMERA_SCALE**2
     strange = taught + UNLIKE**2 * np.eye(3)
@@ -167,36 +168,36 @@ def log_odds_of_stranger(evidence: Evidence, alignment: Alignment) -> float:
     return factor + float(np.log(STRANGERS / (1 - STRANGERS)))
 
 
-def _fitted(evidence: Evidence, rival: Stretched, standing: bool) -> Stretched:
+def _fitted(comparison: Comparison, rival: Stretched, standing: bool) -> Stretched:
     """A rival stretched and moved to where it explains the views, drawn to the ground or not."""
     for level in STRETCH_LEVELS:
         for _ in range(level.steps):
-            rival = _step(evidence, rival, level, standing)
+            rival = _step(comparison, rival, level, standing)
     return rival
 
 
 def _step(
-    evidence: Evidence,
+    comparison: Comparison,
     rival: Stretched,
     level: Level,
     standing: bool,
 ) -> Stretched:
     """One Gauss-Newton step, damped like those of the registration."""
-    left, right = _equations(evidence, rival, level)
+    left, right = _equations(comparison, rival, level)
     aligned = rival.alignment
     right[STRETCH] -= np.log(rival.factors) / UNLIKE**2
-    radii = evidence.caster.radii[aligned.things]
-    farthest = level.reach(radii, evidence.prior.displaced(evidence.views).max())[0]
+    radii = comparison.caster.radii[aligned.things]
+    farthest = level.reach(radii, comparison.prior.displaced(comparison.views).max())[0]
     damped = np.zeros(len(left))
     damped[TURN] = 1 / level.off**2
     damped[3:POSE] = 1 / farthest**2
     damped[STRETCH] = 1 / STRETCH_STEP**2 + 1 / UNLIKE**2
     left[np.diag_indices(len(left))] += damped
-    ends = rival.bottom(evidence) if standing else None
+    ends = rival.bottom(comparison) if standing else None
     if ends is not None:
         height, change = ends
         weight = 1 / (
-            STANDS**2 + (height / 3) ** 2
+            BOTTOM_NOISE**2 + (height / 3) ** 2
         )  # what stands on others is not held
         left[:UNKNOWNS, :UNKNOWNS] += weight * np.outer(change, change)
         right[:UNKNOWNS] -= weight * height * change
@@ -216,7 +217,7 @@ def _step(
 
 
 def _equations(
-    evidence: Evidence,
+    comparison: Comparison,
     rival: Stretched,
     level: Level,
     outlines: bool = False,
@@ -226,14 +227,14 @@ def _equations(
     ``outlines`` says whether an outline that fits is added to the matrix: it would draw the
     hypothesis, if that were displaced.
     """
-    views = evidence.views
+    views = comparison.views
     aligned = rival.alignment
-    displaced = evidence.prior.displaced(views)
+    displaced = comparison.prior.displaced(views)
     of_cameras = 3 * len(views) if len(views) > 1 else 0
     left = np.zeros((UNKNOWNS + of_cameras, UNKNOWNS + of_cameras))
     right = np.zeros(len(left))
     for number, view in enumerate(views):
-        rendered = rival.render(evidence, number)
+        rendered = rival.render(comparison, number)
         centres = aligned.centres + aligned.cameras[:, number]
         reach = level.reach(rendered.radii, displaced[number])
         # A view that sees the thing displaced is the same, to itself, as a thing in another place.
@@ -244,12 +245,14 @@ def _equations(
         if outlines:
             drawn.append(pulls_of_outline(view, rendered, centres))
         for pulls in drawn:
-            square, towards = _normal_equations(pulls, aligned, evidence.prior)
+            square, towards = _normal_equations(pulls, aligned, comparison.prior)
             left[np.ix_(own, own)] += square[: len(own), : len(own)]
             right[own] += towards[: len(own)]
 
     errors = displaced if of_cameras else None
-    weights, so_far = priors_of(evidence.caster, aligned, errors, level, evidence.prior)
+    weights, so_far = priors_of(
+        comparison.caster, aligned, errors, level, comparison.prior
+    )
     held = np.append(np.arange(POSE), np.arange(UNKNOWNS, len(left)))
     left[held, held] += weights[0]
     right[held] -= weights[0] * so_far[0]
@@ -279,7 +282,7 @@ def _normal_equations(
 
 
 def _best(
-    evidence: Evidence,
+    comparison: Comparison,
     itself: Stretched,
     rivals: Sequence[Stretched],
 ) -> Stretched:
@@ -288,11 +291,11 @@ def _best(
     The thing itself where none does: what stands on others is not drawn to the ground, and fits
     that ended in a worse place do not count.
     """
-    explained = [_explains(evidence, rival) for rival in (itself, *rivals)]
+    explained = [_explains(comparison, rival) for rival in (itself, *rivals)]
     best, highest = itself, -np.inf
     for rival, score in zip(rivals, explained[1:], strict=True):
         prior = -0.5 * float((np.log(rival.factors) ** 2).sum()) / UNLIKE**2
-        ends = rival.bottom(evidence)
+        ends = rival.bottom(comparison)
         if ends is not None:
             height = np.array(ends[:1])
             prior += _log_density(height, np.zeros((1, 1)), np.zeros((0, 0)))
@@ -301,32 +304,32 @@ def _best(
     return best
 
 
-def _explains(evidence: Evidence, rival: Stretched) -> float:
+def _explains(comparison: Comparison, rival: Stretched) -> float:
     """Log-likelihood of the views under a rival, weighted as in the belief, up to a constant."""
     judged = [
-        likelihood(view, rival.render(evidence, number), evidence.pixels)
-        for number, view in enumerate(evidence.views)
+        likelihood(view, rival.render(comparison, number), comparison.pixels)
+        for number, view in enumerate(comparison.views)
     ]
     mean = np.stack([one.mean for one in judged], 1)
-    costs = camera_cost(rival.alignment, evidence.views, evidence.prior)
-    return float(evidence.weights.scores(mean, costs, np.zeros(1))[0])
+    costs = camera_cost(rival.alignment, comparison.views, comparison.prior)
+    return float(comparison.weights.scores(mean, costs, np.zeros(1))[0])
 
 
-def _estimate(evidence: Evidence, rival: Stretched) -> tuple[Float, Float]:
+def _estimate(comparison: Comparison, rival: Stretched) -> tuple[Float, Float]:
     """What the views alone say of the stretch, and of the height of the bottom above the ground.
 
     Returns:
         Logarithms along three axes and, if the ground is seen, metres: mean, (3,) or (4,), and
         covariance.
     """
-    left, right = _equations(evidence, rival, FINE[-1], outlines=True)
+    left, right = _equations(comparison, rival, FINE[-1], outlines=True)
     left[STRETCH, STRETCH] += np.eye(3) / UNTOLD**2
     right[STRETCH] -= np.log(rival.factors) / UNTOLD**2
     inverse = np.linalg.inv(left)
     wanted = np.zeros((3, len(left)))
     wanted[:, STRETCH] = np.eye(3)
     so_far = np.log(rival.factors)
-    ends = rival.bottom(evidence)
+    ends = rival.bottom(comparison)
     if ends is not None:
         height, change = ends
         row = np.append(change, np.zeros(len(left) - UNKNOWNS))
@@ -345,7 +348,7 @@ def _log_density(found: Float, covariance: Float, stretch: Float) -> float:
     if len(found) == size:
         return _log_normal(found, covariance + stretch)
     parts = []
-    for share, height in ((1 - ON_OTHERS, STANDS), (ON_OTHERS, OTHERS_HEIGHT)):
+    for share, height in ((1 - ON_OTHERS, BOTTOM_NOISE), (ON_OTHERS, OTHERS_HEIGHT)):
         prior = np.zeros_like(covariance)
         prior[:size, :size] = stretch
         prior[size, size] = height**2

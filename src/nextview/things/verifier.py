@@ -29,7 +29,7 @@ from nextview.things.registration import (
     render,
     start,
 )
-from nextview.things.stranger import Evidence, log_odds_of_stranger
+from nextview.things.stranger import Comparison, log_odds_of_stranger
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.verification import PixelModel, ViewLikelihood, likelihood
 from nextview.things.view_templates import ViewTemplates
@@ -371,7 +371,7 @@ class Verifier:
         """
         images, level = _levelled(observations) if resting else _held(observations)
         views = [image.view(FINE_SIDE) for image in images]
-        evidence = Evidence(
+        comparison = Comparison(
             self.caster,
             views,
             self.prior,
@@ -379,7 +379,7 @@ class Verifier:
             self.pixels,
         )
         likeliest = found.alignment(np.zeros(1, np.int64), self).turned(level)
-        return log_odds_of_stranger(evidence, likeliest)
+        return log_odds_of_stranger(comparison, likeliest)
 
     @cached_property
     def templates(self) -> ViewTemplates:
