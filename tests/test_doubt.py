@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from small_tables import camera_over, meshes_of, view
 
 import nextview
@@ -12,7 +13,10 @@ from nextview.data.samples import sample_mesh
 from nextview.errors import ModelError
 from nextview.geometry.mesh import Mesh, make_mesh
 from nextview.recognition.protocol import JointBelief
+from nextview.sensing import ObservedObject
+from nextview.simulation.sensor import SENSORS
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.simulation.tables import PlacedThing, SimulatedTable, TableCamera
 
 NAMES = ("chair", "table")
 
@@ -23,10 +27,19 @@ def stretched(name: str, *factors: float) -> Mesh:
     return make_mesh(known.vertices * known.radius * factors, known.faces, "new", "m")
 
 
-def the_object(system, mesh, elevation=50.0, distance=0.65, degrees=20.0):
+def the_object(
+    system,
+    mesh,
+    elevation=50.0,
+    distance=0.65,
+    degrees=20.0,
+    sensor="stereo",
+):
     """The only object that a scene finds where a thing stands on a table."""
     scene = nextview.Scene(system)
-    scene.update(camera_over([mesh]).frame(view(degrees, elevation, distance)))
+    scene.update(
+        camera_over([mesh], sensor=sensor).frame(view(degrees, elevation, distance))
+    )
     (found,) = scene.objects
     return found
 
@@ -38,6 +51,8 @@ def the_object(system, mesh, elevation=50.0, distance=0.65, degrees=20.0):
         (("master_chef_can", 1, 1, 0.9), {}, r"reach 1\d mm below the ground"),
         # A box that is a seventh lower: beside what is seen of it the known one would show.
         (("cracker_box", 1, 1, 0.85), {}, r"sees past 1\d % of its scan"),
+        # A can that is a seventh wider: no pose of the known one is as wide.
+        (("master_chef_can", 1.15, 1.15, 1), {}, "fits better if it is stretched"),
         # A mug whose handle is behind it.
         (
             ("mug", 1, 1, 1),
@@ -59,6 +74,56 @@ def test_a_name_is_not_confident_where_the_thing_in_its_pose_is_in_doubt(
     assert not found.confident
     assert re.search(doubt, found.result.doubt)
     assert found.result.doubt in repr(found.result)
+
+
+def odds_of_stranger(ycb, found):
+    """The log-odds behind the doubt, by the things that a scene compares with."""
+    result = found.result
+    observations = [view.observation for view in result.views]
+    things = ycb.models.recogniser.things
+    return things.log_odds_of_stranger(observations, result.views[-1].joint.found)
+
+
+@pytest.mark.parametrize("sensor", ["none", "stereo", "kinect"])
+@pytest.mark.parametrize(
+    ("name", "wider"),
+    [("master_chef_can", (1.15, 1.15, 1)), ("sugar_box", (1, 1.2, 1.1))],
+)
+def test_a_thing_of_another_size_is_a_stranger_however_noisy_the_camera(
+    ycb,
+    name,
+    wider,
+    sensor,
+):
+    itself = the_object(ycb, stretched(name, 1, 1, 1), sensor=sensor)
+    assert (itself.name, itself.result.doubt) == (name, "")
+    assert odds_of_stranger(ycb, itself) < -2  # seven times as likely as a stranger
+
+    stranger = the_object(ycb, stretched(name, *wider), sensor=sensor)
+    assert not stranger.confident
+    assert odds_of_stranger(ycb, stranger) > 2
+
+
+@pytest.mark.parametrize("height", [0.02, 0.05])
+def test_what_stands_on_another_thing_is_not_stretched_down_to_the_ground(ycb, height):
+    box = trimesh.creation.box([0.16, 0.2, height])
+    corners = np.add(box.vertices, [0, 0, height / 2])
+    tray = PlacedThing("tray", corners, box.faces.astype(np.int32), np.eye(4))
+    can = SimulatedTable.draw(
+        list(meshes_of(["master_chef_can"]).values()),
+        np.random.default_rng(0),
+    ).things[0]
+    lifted = can.pose.copy()
+    lifted[:3, 3] += [0, 0, height]
+    table = SimulatedTable((tray, replace(can, pose=lifted)))
+    camera = TableCamera(table, SENSORS["stereo"], np.random.default_rng(3))
+    frame = camera.frame(view(20.0, 45.0, 0.65))
+
+    observation = ObservedObject().add(frame.with_mask(camera.owner == 1))
+    things = ycb.models.recogniser.things
+    found = things([observation])
+    assert things.names[found.belief.argmax()] == "master_chef_can"
+    assert things.log_odds_of_stranger([observation], found) < -2
 
 
 @pytest.mark.parametrize("name", ["master_chef_can", "cracker_box"])

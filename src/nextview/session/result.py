@@ -289,7 +289,8 @@ class Recognition:
         """Why the answer is not confident however high the belief in it, in words; "" if it may be.
 
         A taught thing is confident as "this thing in this pose": its scan stands on the ground or
-        above, hides what is behind it, has its orientation known, and is seen in enough pixels.
+        above, hides what is behind it, fits without being stretched, has its orientation known, and
+        is seen in enough pixels.
         """
         joint = self._joint
         return "" if joint is None or self.answer is None else joint.doubt

@@ -51,13 +51,13 @@ def below_ground(
     if not grounds:
         return BelowGround(share, depth)
 
-    lowest = min(grounds, key=_ground_height)
+    lowest = min(grounds, key=ground_height)
     assert lowest.ground is not None
     noise = lowest.ground.noise * float(lowest.origin @ lowest.origin)
     for row, thing in enumerate(alignment.things):
         surface = caster.surfaces[thing]
         turn = alignment.rotations[row, 2]
-        above = alignment.centres[row, 2] - _ground_height(lowest)
+        above = alignment.centres[row, 2] - ground_height(lowest)
         heights = (surface.vertices - surface.centre) @ turn + above
         slack = np.linalg.norm([SUNK, noise, tilt * surface.radius])
         allowed = slack + scan_errors(surface.radius)
@@ -67,7 +67,7 @@ def below_ground(
     return BelowGround(share, depth)
 
 
-def _ground_height(view: DepthView) -> float:
+def ground_height(view: DepthView) -> float:
     """Height of the ground of a view that shows it, below the middle of the object frame."""
     assert view.ground is not None
     return -view.ground.offset / float(view.ground.normal[2])

@@ -1,6 +1,6 @@
 """Why a thing that is believed is not to be acted on yet: "this thing in this pose" is in doubt."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from nextview.recognition.poses import UNKNOWN_TURN, PoseCandidate, uncertainty_of
 from nextview.things.verifier import Verified
@@ -10,13 +10,20 @@ MOST_SEEN_BEHIND = 0.1
 FEWEST_PIXELS = 350  # that show a thing whose shape can be told
 
 
-def doubt_of(found: Verified, poses: Sequence[PoseCandidate], pixels: int) -> str:
+def doubt_of(
+    found: Verified,
+    poses: Sequence[PoseCandidate],
+    pixels: int,
+    stranger: Callable[[], float],
+) -> str:
     """Say why the likeliest hypothesis is in doubt, however strongly it is believed.
 
     Args:
         found: what was found of some views.
         poses: that the object may have, the likeliest first.
         pixels: of a frame that show it, in the frame that shows most of it.
+        stranger: gives the log-odds of a stranger of its shape against the thing, nats; asked only
+            where nothing else is in doubt.
 
     Returns:
         The reason in words; "" if there is none.
@@ -33,4 +40,6 @@ def doubt_of(found: Verified, poses: Sequence[PoseCandidate], pixels: int) -> st
         return f"the camera sees past {100 * behind:.0f} % of its scan"
     if degrees >= UNKNOWN_TURN:
         return f"its orientation is known to ± {degrees:.0f}° only"
+    if stranger() > 0:
+        return "its scan fits better if it is stretched"
     return ""

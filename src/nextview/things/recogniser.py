@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -143,12 +143,18 @@ class VerifiedRecogniser(TaughtRecogniser):
             observations,
             self.labels,
         )
+        doubt = doubt_of(
+            found,
+            poses,
+            _most_pixels(observations),
+            partial(self.things.log_odds_of_stranger, observations, found),
+        )
         return JointBelief(
             belief,
             poses=poses,
             camera_error=camera_error,
             p_value=self.things.p_value(observations, found),
-            doubt=doubt_of(found, poses, _most_pixels(observations)),
+            doubt=doubt,
             found=found,
         )
 

@@ -365,7 +365,7 @@ def _overlap(view: DepthView, shows: Mask) -> Float:
 
 
 @dataclass(frozen=True, eq=False)
-class _PoseEquations:
+class Pulls:
     """By how much, and in which direction, pixels of one view draw hypotheses: N pulls.
 
     Attributes:
@@ -374,6 +374,8 @@ class _PoseEquations:
         directions: unit vectors, (N, 3).
         distances: metres, (N,).
         weights: inverse variances, (N,).
+        inside: how far within the outline of the thing the depth lies that draws, pixels of the
+            image, (N,); infinity where an outline draws.
         count: of all hypotheses.
     """
 
@@ -382,18 +384,19 @@ class _PoseEquations:
     directions: Float32
     distances: Float32
     weights: Float32
+    inside: Float32
     count: int
 
 
 OUTLINE_PIXELS = 1.5  # deviation of an outline, pixels
 
 
-def _pulls(
+def pulls_of(
     view: DepthView,
     rendered: Rendered,
     centres: Float,
     reach: Float32,
-) -> _PoseEquations:
+) -> Pulls:
     """What draws the hypotheses whose centres are these, (H, 3), as this view sees them.
 
     ``reach`` is the deviation of each that is to be expected beside the noise, (H,), metres.
@@ -442,12 +445,13 @@ def _pulls(
     variance = rendered.errors[hypotheses] ** 2 + deviation**2
     expected = reach[hypotheses] ** 2 + (NOISE_REACH * noise) ** 2
     weights = 1 / variance / (1 + distances**2 / expected)
-    return _PoseEquations(
+    return Pulls(
         hypotheses,
         arms,
         directions,
         distances.astype(np.float32),
         weights.astype(np.float32),
+        np.where(along_normal, -view.edge[pixels], np.inf).astype(np.float32),
         len(shows),
     )
 
@@ -566,7 +570,7 @@ def _equations(
         centres = alignment.centres + alignment.cameras[:, number]
         reach = level.reach(rendered.radii, displaced[number])
         square, towards = _normal_equations(
-            _pulls(view, rendered, centres, reach),
+            pulls_of(view, rendered, centres, reach),
             prior,
         )
         left[:, :POSE, :POSE] += square
@@ -580,7 +584,7 @@ def _equations(
             left[:, own, :POSE] += square[:, PLACE, :]
             right[:, own] += towards[:, PLACE]
 
-    weights, so_far = _priors(
+    weights, so_far = priors_of(
         caster,
         alignment,
         displaced if errors_too else None,
@@ -639,15 +643,15 @@ def pose_covariances(
     """
     level = FINE[-1]
     displaced = prior.displaced(views)
-    weights, _ = _priors(caster, alignment, None, level, prior)
+    weights, _ = priors_of(caster, alignment, None, level, prior)
     information = weights[:, :, None] * np.eye(POSE)
 
     for number, view in enumerate(views):
         rendered = render(caster, alignment, view, number)
         centres = alignment.centres + alignment.cameras[:, number]
         reach = level.reach(rendered.radii, displaced[number])
-        drawn = _pulls(view, rendered, centres, reach)
-        held = _outline(view, rendered, centres)
+        drawn = pulls_of(view, rendered, centres, reach)
+        held = pulls_of_outline(view, rendered, centres)
         information += _normal_equations(drawn, prior)[0]
         information += _normal_equations(held, prior)[0]
 
@@ -669,7 +673,7 @@ def inverses(information: Float) -> Float:
     return np.asarray(inverse / (scale[:, :, None] * scale[:, None]), np.float64)
 
 
-def _outline(view: DepthView, rendered: Rendered, centres: Float) -> _PoseEquations:
+def pulls_of_outline(view: DepthView, rendered: Rendered, centres: Float) -> Pulls:
     """What holds hypotheses that lie right, with these centres, (H, 3), at the thing's outline.
 
     These are the pixels of the thing next to others where something farther, or nothing, shows:
@@ -696,18 +700,19 @@ def _outline(view: DepthView, rendered: Rendered, centres: Float) -> _PoseEquati
     arms = points - centres.astype(np.float32)[hypotheses]
     deviation = OUTLINE_PIXELS * view.pitch * depth
     weights = 1 / (rendered.errors[hypotheses] ** 2 + deviation**2)
-    return _PoseEquations(
+    return Pulls(
         hypotheses,
         arms,
         aside[pixels],
         np.zeros_like(depth),
         weights.astype(np.float32),
+        np.full(len(pixels), np.inf, np.float32),
         len(rim),
     )
 
 
 def _normal_equations(
-    pulls: _PoseEquations,
+    pulls: Pulls,
     prior: RegistrationPrior,
 ) -> tuple[Float, Float]:
     """What one view says of turn and place: matrices, (H, 6, 6), and right-hand sides, (H, 6)."""
@@ -730,7 +735,7 @@ def _normal_equations(
     return sums[..., :POSE], sums[..., POSE]
 
 
-def _priors(
+def priors_of(
     caster: SurfaceCaster,
     alignment: Alignment,
     displaced: Float | None,

@@ -184,6 +184,27 @@ class TaughtThings:
             return resting
         return self.verifier.whole_search(observations, resting)
 
+    def log_odds_of_stranger(
+        self,
+        observations: Sequence[Observation],
+        found: Verified,
+    ) -> float:
+        """How much likelier a stranger of its shape is than the likeliest thing.
+
+        Args:
+            observations: the views.
+            found: what was found of them.
+
+        Returns:
+            Log-odds, nats: positive where another thing is likelier.
+        """
+        seen = [observation for observation in observations if observation.seen]
+        return self.verifier.log_odds_of_stranger(
+            seen,
+            found,
+            not self.any_orientation,
+        )
+
     def p_value(
         self,
         observations: Sequence[Observation],

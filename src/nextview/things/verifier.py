@@ -29,6 +29,7 @@ from nextview.things.registration import (
     render,
     start,
 )
+from nextview.things.stranger import Comparison, log_odds_of_stranger
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.verification import PixelModel, ViewLikelihood, likelihood
 from nextview.things.view_templates import ViewTemplates
@@ -326,8 +327,7 @@ class Verifier:
         Raises:
             ObservationError: no view shows the thing, or its scale is not known.
         """
-        images = [replace(image, ground=None) for image in _images(observations)]
-        return self._tilted(images, np.eye(3))
+        return self._tilted(*_held(observations))
 
     def whole_search(
         self,
@@ -352,6 +352,34 @@ class Verifier:
         except ObservationError:  # too little is seen to be compared
             return resting
         return self._joined(resting, unusual)
+
+    def log_odds_of_stranger(
+        self,
+        observations: Sequence[Observation],
+        found: Verified,
+        resting: bool,
+    ) -> float:
+        """How much likelier a stranger of its shape is than the likeliest hypothesis.
+
+        Args:
+            observations: the views that it was found in.
+            found: what was found of them.
+            resting: whether the ground counts, if it is seen.
+
+        Returns:
+            Log-odds, nats: see ``stranger.log_odds_of_stranger``.
+        """
+        images, level = _levelled(observations) if resting else _held(observations)
+        views = [image.view(FINE_SIDE) for image in images]
+        comparison = Comparison(
+            self.caster,
+            views,
+            self.prior,
+            self.weights,
+            self.pixels,
+        )
+        likeliest = found.alignment(np.zeros(1, np.int64), self).turned(level)
+        return log_odds_of_stranger(comparison, likeliest)
 
     @cached_property
     def templates(self) -> ViewTemplates:
@@ -566,6 +594,12 @@ def _levelled(
     grounds = [image.ground for image in images if image.ground is not None]
     level = levelling(grounds)
     return [image.turned(level) for image in images], level
+
+
+def _held(observations: Sequence[Observation]) -> tuple[list[MetricImage], Float]:
+    """The observations that show the thing, without a ground to stand on, and no turn."""
+    images = [replace(image, ground=None) for image in _images(observations)]
+    return images, np.eye(3)
 
 
 def _images(observations: Sequence[Observation]) -> list[MetricImage]:

@@ -1,0 +1,363 @@
+"""Whether views show a taught thing, or a stranger that has its shape in another size.
+
+The rival of a hypothesis is its own scan, stretched along the scan's axes: a box of other sides, a
+can of another height, a bottle with a wider belly. The stretch is estimated together with the pose,
+by the steps of the registration with three further unknowns. Then two priors are compared at this
+estimate: a taught thing is not stretched, but for the errors of its scan and of the camera's scale;
+a stranger is, by any amount that is usual. The ratio of the two probabilities is a Bayes factor
+(MacKay 2003, "Information theory, inference, and learning algorithms", chapter 28; the posterior
+is taken as normal, after Laplace).
+
+Noise makes the estimate less certain, so that it says less for either. It cannot excuse an outline
+or a depth that is off in one direction over a whole side, as it can excuse a residual.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from nextview.things.below_ground import ground_height
+from nextview.things.depth_view import DepthView
+from nextview.things.registration import (
+    FINE,
+    POSE,
+    SHIFT_LIMIT,
+    TURN,
+    TURN_LIMIT,
+    Alignment,
+    Level,
+    Pulls,
+    RegistrationPrior,
+    Rendered,
+    camera_cost,
+    priors_of,
+    pulls_of,
+    pulls_of_outline,
+    rotations_of,
+    scan_errors,
+)
+from nextview.things.surface import SurfaceCaster
+from nextview.things.verification import PixelModel, likelihood
+from nextview.things.weighing import EvidenceWeights
+from nextview.types import Float
+
+# of the things that a scan explains best: so many are another thing of its shape
+STRANGERS = 1 / 3
+UNLIKE = (
+    0.2  # deviation of the logarithm by which a stranger is stretched along each axis
+)
+CAMERA_SCALE = (
+    0.015  # by which part of its size a camera sees everything larger or smaller
+)
+# metres by which a thing that stands on the ground is seen above or below it
+BOTTOM_NOISE = 0.004
+ON_OTHERS = 0.1  # share of the things that stand on something else
+OTHERS_HEIGHT = 0.1  # metres of what these stand on: other things, books, trays
+# pixels of the image over which cameras mix depths on both sides of an outline: they match windows
+BLUR = 8.0
+LEAST_INSIDE = 0.1  # weight of a depth at the very outline, as a root
+
+STRETCH = slice(POSE, POSE + 3)
+UNKNOWNS = POSE + 3
+"""Unknowns of a step: turn, place and stretch of the hypothesis; the cameras' errors follow."""
+
+STRETCH_LEVELS = (Level(5, 0.05, 0.5, True), Level(5, 0.02, 0.1, True))
+# logarithm by which a step stretches at most, and by which it is damped
+STRETCH_STEP = 0.1
+UNTOLD = 1.0  # deviation of a stretch that the views tell nothing of
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """What hypotheses are compared with, and how.
+
+    Attributes:
+        caster: of all surfaces.
+        views: of the thing, in a frame that is level.
+        prior: how far off cameras and the vertical may be.
+        weights: how much pixels and errors of cameras count.
+        pixels: what pixels are like if a hypothesis is true.
+    """
+
+    caster: SurfaceCaster
+    views: Sequence[DepthView]
+    prior: RegistrationPrior
+    weights: EvidenceWeights
+    pixels: PixelModel
+
+
+@dataclass(frozen=True, eq=False)
+class Stretched:
+    """A hypothesis whose scan is stretched about the centre of its surface.
+
+    Attributes:
+        alignment: the one hypothesis.
+        factors: along the axes of the scan file, (3,) float64.
+    """
+
+    alignment: Alignment
+    factors: Float
+
+    def render(self, comparison: Comparison, number: int) -> Rendered:
+        """What the view of this ``number`` would see of it."""
+        view = comparison.views[number]
+        aligned = self.alignment
+        rotation = aligned.rotations[0]
+        centre = aligned.centres[0] + aligned.cameras[0, number]
+        origin = (view.origin - centre) @ rotation / self.factors
+        rays = view.rays @ rotation / self.factors
+        origin = origin + comparison.caster.centres[aligned.things[0]]
+        depth, normals = comparison.caster.cast(
+            aligned.things,
+            origin[None].astype(np.float32),
+            rays[None].astype(np.float32),
+        )
+        across = normals / self.factors
+        lengths = np.linalg.norm(across, axis=2, keepdims=True)
+        across = across / np.maximum(lengths, 1e-12) @ rotation.T
+        radii = comparison.caster.radii[aligned.things]
+        return Rendered(depth, across.astype(np.float32), radii)
+
+    def bottom(self, comparison: Comparison) -> tuple[float, Float] | None:
+        """Height of its lowest point above the ground, metres; None where no view shows the ground.
+
+        And how the height changes with each unknown of a step, (UNKNOWNS,).
+        """
+        grounds = [
+            ground_height(one) for one in comparison.views if one.ground is not None
+        ]
+        if not grounds:
+            return None
+        aligned = self.alignment
+        surface = comparison.caster.surfaces[aligned.things[0]]
+        up = aligned.rotations[0, 2]  # in the axes of the scan
+        points = (surface.vertices - surface.centre) * self.factors
+        heights = points @ up
+        lowest = int(heights.argmin())
+        change = np.zeros(UNKNOWNS)
+        change[POSE - 1] = 1
+        change[STRETCH] = points[lowest] * up
+        above = float(heights[lowest] + aligned.centres[0, 2] - min(grounds))
+        return above, change
+
+
+def log_odds_of_stranger(comparison: Comparison, alignment: Alignment) -> float:
+    """How much likelier a stranger of a thing's shape is than the thing, as a logarithm.
+
+    Args:
+        comparison: the views.
+        alignment: the one hypothesis that is likeliest, aligned with them.
+
+    Returns:
+        Log-odds, nats: positive where a stranger is likelier than the thing itself.
+    """
+    itself = Stretched(alignment, np.ones(3))
+    rivals = [_fitted(comparison, itself, False)]
+    if itself.bottom(comparison) is not None:
+        rivals.append(_fitted(comparison, itself, True))
+    best = _best(comparison, itself, rivals)
+    found, covariance = _estimate(comparison, best)
+
+    surface = comparison.caster.surfaces[alignment.things[0]]
+    half_sides = np.maximum(np.ptp(surface.vertices, axis=0) / 2, 1e-4)
+    taught = np.diag((scan_errors(surface.radius) / half_sides) ** 2) + CAMERA_SCALE**2
+    strange = taught + UNLIKE**2 * np.eye(3)
+    factor = _log_density(found, covariance, strange)
+    factor -= _log_density(found, covariance, taught)
+    return factor + float(np.log(STRANGERS / (1 - STRANGERS)))
+
+
+def _fitted(comparison: Comparison, rival: Stretched, standing: bool) -> Stretched:
+    """A rival stretched and moved to where it explains the views, drawn to the ground or not."""
+    for level in STRETCH_LEVELS:
+        for _ in range(level.steps):
+            rival = _step(comparison, rival, level, standing)
+    return rival
+
+
+def _step(
+    comparison: Comparison,
+    rival: Stretched,
+    level: Level,
+    standing: bool,
+) -> Stretched:
+    """One Gauss-Newton step, damped like those of the registration."""
+    left, right = _equations(comparison, rival, level)
+    aligned = rival.alignment
+    right[STRETCH] -= np.log(rival.factors) / UNLIKE**2
+    radii = comparison.caster.radii[aligned.things]
+    farthest = level.reach(radii, comparison.prior.displaced(comparison.views).max())[0]
+    damped = np.zeros(len(left))
+    damped[TURN] = 1 / level.off**2
+    damped[3:POSE] = 1 / farthest**2
+    damped[STRETCH] = 1 / STRETCH_STEP**2 + 1 / UNLIKE**2
+    left[np.diag_indices(len(left))] += damped
+    ends = rival.bottom(comparison) if standing else None
+    if ends is not None:
+        height, change = ends
+        weight = 1 / (
+            BOTTOM_NOISE**2 + (height / 3) ** 2
+        )  # what stands on others is not held
+        left[:UNKNOWNS, :UNKNOWNS] += weight * np.outer(change, change)
+        right[:UNKNOWNS] -= weight * height * change
+
+    moved = np.linalg.solve(left, right)
+    turn = np.clip(moved[TURN], -TURN_LIMIT, TURN_LIMIT)
+    limit = SHIFT_LIMIT * float(radii[0])
+    cameras = moved[UNKNOWNS:].reshape(-1, 3) if len(moved) > UNKNOWNS else 0
+    grown = np.clip(moved[STRETCH], -STRETCH_STEP, STRETCH_STEP)
+    aligned = replace(
+        aligned,
+        rotations=rotations_of(turn[None]) @ aligned.rotations,
+        centres=aligned.centres + np.clip(moved[3:POSE], -limit, limit),
+        cameras=aligned.cameras + cameras,
+    )
+    return Stretched(aligned, rival.factors * np.exp(grown))
+
+
+def _equations(
+    comparison: Comparison,
+    rival: Stretched,
+    level: Level,
+    outlines: bool = False,
+) -> tuple[Float, Float]:
+    """Matrix, (U, U), and right-hand side, (U,), without a prior of the stretch.
+
+    ``outlines`` says whether an outline that fits is added to the matrix: it would draw the
+    hypothesis, if that were displaced.
+    """
+    views = comparison.views
+    aligned = rival.alignment
+    displaced = comparison.prior.displaced(views)
+    of_cameras = 3 * len(views) if len(views) > 1 else 0
+    left = np.zeros((UNKNOWNS + of_cameras, UNKNOWNS + of_cameras))
+    right = np.zeros(len(left))
+    for number, view in enumerate(views):
+        rendered = rival.render(comparison, number)
+        centres = aligned.centres + aligned.cameras[:, number]
+        reach = level.reach(rendered.radii, displaced[number])
+        # A view that sees the thing displaced is the same, to itself, as a thing in another place.
+        own = np.arange(UNKNOWNS)
+        if of_cameras:
+            own = np.append(own, UNKNOWNS + 3 * number + np.arange(3))
+        drawn = [pulls_of(view, rendered, centres, reach)]
+        if outlines:
+            drawn.append(pulls_of_outline(view, rendered, centres))
+        for pulls in drawn:
+            square, towards = _normal_equations(pulls, aligned, comparison.prior)
+            left[np.ix_(own, own)] += square[: len(own), : len(own)]
+            right[own] += towards[: len(own)]
+
+    errors = displaced if of_cameras else None
+    weights, so_far = priors_of(
+        comparison.caster, aligned, errors, level, comparison.prior
+    )
+    held = np.append(np.arange(POSE), np.arange(UNKNOWNS, len(left)))
+    left[held, held] += weights[0]
+    right[held] -= weights[0] * so_far[0]
+    return left, right
+
+
+def _normal_equations(
+    pulls: Pulls,
+    aligned: Alignment,
+    prior: RegistrationPrior,
+) -> tuple[Float, Float]:
+    """What one view says of turn, place, stretch and, once more, of the place.
+
+    Returns:
+        Matrix, (UNKNOWNS + 3, UNKNOWNS + 3), and right-hand side, (UNKNOWNS + 3,).
+    """
+    rotation = aligned.rotations[0]
+    along_axes = (pulls.directions @ rotation) * (pulls.arms @ rotation)
+    turning = np.cross(pulls.arms, pulls.directions)
+    columns = [turning, pulls.directions, along_axes, pulls.directions]
+    jacobian = np.concatenate(columns, axis=1).astype(np.float64)
+    # Neighbouring pixels err together, and depths beside an outline are those of both its sides.
+    share = min(1, prior.pixels / max(len(jacobian), 1))
+    clear = np.clip(pulls.inside / BLUR, LEAST_INSIDE, 1) ** 2
+    weighted = jacobian * (share * pulls.weights * clear)[:, None]
+    return weighted.T @ jacobian, weighted.T @ pulls.distances
+
+
+def _best(
+    comparison: Comparison,
+    itself: Stretched,
+    rivals: Sequence[Stretched],
+) -> Stretched:
+    """The most probable of the rivals that explain the views better than the thing itself.
+
+    The thing itself where none does: what stands on others is not drawn to the ground, and fits
+    that ended in a worse place do not count.
+    """
+    explained = [_explains(comparison, rival) for rival in (itself, *rivals)]
+    best, highest = itself, -np.inf
+    for rival, score in zip(rivals, explained[1:], strict=True):
+        prior = -0.5 * float((np.log(rival.factors) ** 2).sum()) / UNLIKE**2
+        ends = rival.bottom(comparison)
+        if ends is not None:
+            height = np.array(ends[:1])
+            prior += _log_density(height, np.zeros((1, 1)), np.zeros((0, 0)))
+        if score > explained[0] and score + prior > highest:
+            best, highest = rival, score + prior
+    return best
+
+
+def _explains(comparison: Comparison, rival: Stretched) -> float:
+    """Log-likelihood of the views under a rival, weighted as in the belief, up to a constant."""
+    judged = [
+        likelihood(view, rival.render(comparison, number), comparison.pixels)
+        for number, view in enumerate(comparison.views)
+    ]
+    mean = np.stack([one.mean for one in judged], 1)
+    costs = camera_cost(rival.alignment, comparison.views, comparison.prior)
+    return float(comparison.weights.scores(mean, costs, np.zeros(1))[0])
+
+
+def _estimate(comparison: Comparison, rival: Stretched) -> tuple[Float, Float]:
+    """What the views alone say of the stretch, and of the height of the bottom above the ground.
+
+    Returns:
+        Logarithms along three axes and, if the ground is seen, metres: mean, (3,) or (4,), and
+        covariance.
+    """
+    left, right = _equations(comparison, rival, FINE[-1], outlines=True)
+    left[STRETCH, STRETCH] += np.eye(3) / UNTOLD**2
+    right[STRETCH] -= np.log(rival.factors) / UNTOLD**2
+    inverse = np.linalg.inv(left)
+    wanted = np.zeros((3, len(left)))
+    wanted[:, STRETCH] = np.eye(3)
+    so_far = np.log(rival.factors)
+    ends = rival.bottom(comparison)
+    if ends is not None:
+        height, change = ends
+        row = np.append(change, np.zeros(len(left) - UNKNOWNS))
+        wanted = np.vstack([wanted, row])
+        so_far = np.append(so_far, height)
+    return so_far + wanted @ inverse @ right, wanted @ inverse @ wanted.T
+
+
+def _log_density(found: Float, covariance: Float, stretch: Float) -> float:
+    """Log-density of an estimate if the stretch is normal with some covariance, (S, S).
+
+    If there is one more number, it is the height of the bottom: most things stand on the ground,
+    some stand on others.
+    """
+    size = len(stretch)
+    if len(found) == size:
+        return _log_normal(found, covariance + stretch)
+    parts = []
+    for share, height in ((1 - ON_OTHERS, BOTTOM_NOISE), (ON_OTHERS, OTHERS_HEIGHT)):
+        prior = np.zeros_like(covariance)
+        prior[:size, :size] = stretch
+        prior[size, size] = height**2
+        parts.append(np.log(share) + _log_normal(found, covariance + prior))
+    return float(np.logaddexp(*parts))
+
+
+def _log_normal(values: Float, covariance: Float) -> float:
+    """Log-density of numbers, (N,), that are normal about zero."""
+    scaled = values @ np.linalg.solve(covariance, values)
+    volume = np.linalg.slogdet(2 * np.pi * covariance)[1]
+    return float(-0.5 * (scaled + volume))
