@@ -11,8 +11,10 @@ import nextview
 from nextview.data.samples import sample_mesh
 from nextview.errors import ModelError, UsageError
 from nextview.geometry.mesh import Mesh, make_mesh
+from nextview.recognition.model_card import Symmetry
 from nextview.recognition.protocol import JointBelief
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.things.doubt import unknown_turn
 
 NAMES = ("chair", "table")
 
@@ -93,6 +95,18 @@ def test_the_accuracy_of_cameras_is_two_lengths_of_errors(wrong):
 def test_the_accuracy_of_cameras_says_nothing_of_classes():
     with pytest.raises(ModelError, match="taught things of known geometry alone"):
         nextview.load(threads=1, camera_accuracy=(1.0, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("order", "degrees"), [(1, 30), (2, 30), (4, 19.49), (6, 12.99)]
+)
+def test_an_orientation_is_unknown_from_a_share_of_what_it_can_be_off(order, degrees):
+    # Spread evenly over +-180 degrees / order, it has that limit over the square root of three.
+    symmetries = [Symmetry((0.0, 0.0, 1.0), order)] if order > 1 else []
+    spread = np.linspace(-180 / order, 180 / order, 100_001)
+    found = unknown_turn(symmetries)
+    assert found == pytest.approx(degrees, abs=0.01)
+    assert found == pytest.approx(min(30, 0.75 * spread.std()), abs=0.01)
 
 
 class Doubtful:

@@ -11,7 +11,7 @@ from nextview.recognition.model_card import Symmetry
 from nextview.recognition.poses import PoseCandidate, turn_apart, uncertainty_of
 from nextview.teaching.symmetries import named_symmetries
 from nextview.things.surface import Surface
-from nextview.things.symmetry import find_symmetries
+from nextview.things.symmetry import find_near_symmetries, find_symmetries
 
 PARTS = parts()
 NEAR = 3.0  # degrees by which an axis may be off
@@ -49,6 +49,17 @@ def test_the_symmetries_of_a_part_are_its_true_ones_and_no_others(name):
             posed(turn @ other @ turn.T, found),
         )
         assert apart == pytest.approx(degrees_off(other, np.eye(3), true), abs=NEAR)
+
+
+def test_what_breaks_a_symmetry_leaves_a_near_one():
+    # Without its keyway the gear comes back after each tooth, and the flange without its holes
+    # after any turn. A bracket is like nothing else.
+    expected = {"gear_with_keyway": 20, "flange_of_six": 0, "bracket": None}
+    for name, order in expected.items():
+        surface, turn = placed(*PARTS[name].solid)
+        found = find_near_symmetries(surface)
+        assert [one.order for one in found] == ([] if order is None else [order])
+        assert all(abs(turn[:, 2] @ one.axis) > 0.999 for one in found)
 
 
 def test_a_scan_that_is_off_by_a_hundredth_is_as_round_as_the_can():

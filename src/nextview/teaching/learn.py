@@ -54,10 +54,12 @@ from nextview.teaching.thing_sources import Found, ThingSource, find_things
 from nextview.teaching.thing_views import (
     FACES,
     LEFT_OUT,
+    NEAR_SYMMETRIES,
     SYMMETRIES,
     VERTICES,
     Arrays,
     TeachingOptions,
+    rows_of,
     teach,
 )
 from nextview.teaching.verification_fit import (
@@ -384,14 +386,11 @@ def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]
         arrays["radii"] = arrays["radii"].reshape(1)
         surface = memory.surfaces.surface(index, thing.name)
         if surface is not None:
-            symmetries = np.array(
-                [(*one.axis, one.order) for one in thing.symmetries],
-                np.float64,
-            )
             arrays |= {
                 VERTICES: surface.vertices,
                 FACES: surface.faces,
-                SYMMETRIES: symmetries.reshape(-1, 4),
+                SYMMETRIES: rows_of(thing.symmetries),
+                NEAR_SYMMETRIES: rows_of(thing.near_symmetries),
             }
         kept.append((ThingSource(thing.name, label, Path(thing.source)), arrays))
     return kept
@@ -411,8 +410,7 @@ def _name_symmetries(taught: Sequence[Pair], given: Sequence[str]) -> None:
             raise UsageError(
                 f"--symmetry: {one_line(name)} has no pose without its size; give --unit"
             )
-        rows = [(*one.axis, one.order) for one in symmetries]
-        known[name][SYMMETRIES] = np.array(rows, np.float64).reshape(-1, 4)
+        known[name][SYMMETRIES] = rows_of(symmetries)
 
 
 PER_THING = ("held_out", "held_out_views", "radii", "pictures")
@@ -783,7 +781,13 @@ def _card(
     """
     poses = np.bincount(memory.thing)
     things = tuple(
-        Thing(source.name, str(source.path), int(count), _symmetries_of(arrays))
+        Thing(
+            source.name,
+            str(source.path),
+            int(count),
+            _symmetries_of(arrays, SYMMETRIES),
+            _symmetries_of(arrays, NEAR_SYMMETRIES),
+        )
         for (source, arrays), count in zip(taught, poses, strict=True)
     )
 
@@ -826,9 +830,9 @@ def _card(
     ).made_by(command())
 
 
-def _symmetries_of(arrays: Arrays) -> tuple[Symmetry, ...]:
-    """The symmetries of a thing; () where its geometry is not known."""
-    rows = arrays.get(SYMMETRIES, np.zeros((0, 4))).tolist()
+def _symmetries_of(arrays: Arrays, name: str) -> tuple[Symmetry, ...]:
+    """The symmetries of a thing under this name; () where its geometry is not known."""
+    rows = arrays.get(name, np.zeros((0, 4))).tolist()
     return tuple(Symmetry((x, y, z), int(order)) for x, y, z, order in rows)
 
 

@@ -30,6 +30,7 @@ from nextview.geometry.viewsphere import (
     look_at_origin,
 )
 from nextview.recognition.inference import Features
+from nextview.recognition.model_card import Symmetry
 from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import unit
 from nextview.sensing.tabletop import LOWEST_TOP
@@ -40,7 +41,7 @@ from nextview.teaching.symmetries import named_symmetries
 from nextview.things.fusion import fuse
 from nextview.things.memory import AZIMUTHS, RINGS, joined
 from nextview.things.surface import FINEST_ERROR, Surface
-from nextview.things.symmetry import find_symmetries
+from nextview.things.symmetry import find_near_symmetries, find_symmetries
 from nextview.types import Float, Float32
 
 Arrays = dict[str, NDArray]
@@ -63,6 +64,7 @@ LEFT_OUT = "left_out"
 VERTICES = "vertices"
 FACES = "faces"
 SYMMETRIES = "symmetries"  # and the axis and order of each of its symmetries, (S, 4)
+NEAR_SYMMETRIES = "near_symmetries"  # and of each near symmetry
 # of the radius: a camera stands farther from a large thing, and measures it less exactly
 COARSER = 0.002
 EmbeddingParts = Iterator[Float32]  # of embeddings, (.., F) each, in order
@@ -135,7 +137,8 @@ def teach(path: Path, name: str, how: TeachingOptions, threads: int = 1) -> Arra
     Returns:
         Arrays by the names of the fields of ``things.memory.Memory``. If its size is known, also
         its surface in the frame of its file, metres: VERTICES, (V, 3) float32, FACES, (F, 3) int32,
-        and SYMMETRIES. Where some of the frames were not used, a phrase about them under LEFT_OUT.
+        SYMMETRIES and NEAR_SYMMETRIES. Where some of the frames were not used, a phrase about them
+        under LEFT_OUT.
 
     Raises:
         MeshError, DatasetError, ObservationError: why it cannot be looked at, in one sentence.
@@ -233,13 +236,19 @@ def of_surface(whole: Surface, error: float = 0.0) -> Arrays:
         whole: the surface as it was scanned, which its symmetries are those of.
         error: metres by which it may be off where it is simplified; 0 keeps it.
     """
-    symmetries = [(*one.axis, one.order) for one in find_symmetries(whole)]
     surface = whole.simplified(error) if error else whole
     return {
         VERTICES: surface.vertices,
         FACES: surface.faces,
-        SYMMETRIES: np.array(symmetries, np.float64).reshape(-1, 4),
+        SYMMETRIES: rows_of(find_symmetries(whole)),
+        NEAR_SYMMETRIES: rows_of(find_near_symmetries(whole)),
     }
+
+
+def rows_of(symmetries: Sequence[Symmetry]) -> Float:
+    """Symmetries as an array, axis and order of each, (S, 4) float64."""
+    rows = [(*one.axis, one.order) for one in symmetries]
+    return np.array(rows, np.float64).reshape(-1, 4)
 
 
 def _around(clean: EmbeddingParts, sensed: EmbeddingParts) -> Float32:

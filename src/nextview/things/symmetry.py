@@ -11,6 +11,7 @@ tolerance of people who look at pictures; a depth camera sees the holes of a fla
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +33,11 @@ USUAL_ERRORS = 8.0
 USUAL_SHARE = 0.1
 # and that hardly any of it may be off, as the inside of a cup that no scanner looks into
 LOCAL_ERRORS = 40.0
-LARGEST_LOCAL_ERROR = 0.07  # of the diameter
+LARGEST_LOCAL_ERROR = 0.08  # of the diameter
 MOVED_SHARE = 0.0075  # hardly any: the walls of a keyway are twice as much of a gear
+# the same of near symmetries, after which a part of a thing is elsewhere
+NEAR_MEDIAN = 0.025
+NEAR_SHARE = 0.15
 HIGHEST_ORDER = 40  # of a symmetry: as many teeth as a gear has
 # powers of primes up to that
 POWERS = (2, 3, 4, 5, 7, 8, 9, 11, 13, 16, 17, 19, 23, 25, 27, 29, 31, 32, 37)
@@ -75,7 +79,7 @@ def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
     compared = _Compared(surface)
     found = []
     for axis in _axes(surface):
-        order, deviation, fitted = _order(compared, axis)
+        order, deviation, fitted = _order(compared, axis, "same")
         if order != 1:
             found.append((order, deviation, fitted))
     if _is_ball([axis for order, _, axis in found if order == 0]):
@@ -88,6 +92,27 @@ def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
     return tuple(symmetries)
 
 
+def find_near_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
+    """Find axes about which a surface can be turned and hardly looks different.
+
+    Views that do not show where it differs leave open which of these poses it has.
+
+    Args:
+        surface: of a thing.
+
+    Returns:
+        Axes and orders as those of symmetries, which are among them.
+    """
+    compared = _Compared(surface)
+    found = []
+    for axis in _axes(surface):
+        order, deviation, fitted = _order(compared, axis, "nearly")
+        if order != 1:
+            found.append((order, deviation, fitted))
+    found.sort(key=lambda item: (item[0] != 0, -item[0], item[1]))
+    return tuple(_distinct((axis, order) for order, _, axis in found))
+
+
 @dataclass(frozen=True, eq=False)
 class _Turned:
     """A surface beside its turned copy.
@@ -95,11 +120,13 @@ class _Turned:
     Attributes:
         median: distance of the points of the copy from the surface, metres.
         same: whether hardly any of it lies beside.
+        nearly: whether little of it lies beside.
         axis: about which it was turned, corrected to where it fits best, (3,).
     """
 
     median: float
     same: bool
+    nearly: bool
     axis: Float
 
 
@@ -151,7 +178,7 @@ class _Compared:
         rotation = Rotation.from_rotvec(2 * np.pi * turn * axis)
         guess = self._tree.query(rotation.apply(self._points[:GUESSED_POINTS]))[0]
         if np.quantile(guess, GUESSED_SHARE) > GUESSED_DISTANCE * self.diameter:
-            return _Turned(float(np.median(guess)), False, axis)
+            return _Turned(float(np.median(guess)), False, False, axis)
 
         rotation = self._fitted(rotation, axis)
         distances = self._distances(rotation.apply(self._points[:COMPARED_POINTS]))
@@ -159,14 +186,19 @@ class _Compared:
         median = float(np.median(distances))
         usual = SYMMETRY_TOLERANCE + USUAL_ERRORS * median
         local = min(SYMMETRY_TOLERANCE + LOCAL_ERRORS * median, LARGEST_LOCAL_ERROR)
+        beside = float((distances > usual).mean())
         same = (
             median < LARGEST_MEDIAN
-            and (distances > usual).mean() < USUAL_SHARE
+            and beside < USUAL_SHARE
             and (distances > local).mean() < MOVED_SHARE
         )
+        nearly = median < NEAR_MEDIAN and beside < NEAR_SHARE
         vector = rotation.as_rotvec()
         return _Turned(
-            median * self.diameter, bool(same), vector / np.linalg.norm(vector)
+            median * self.diameter,
+            bool(same),
+            nearly,
+            vector / np.linalg.norm(vector),
         )
 
     def _fitted(self, rotation: Rotation, axis: Float) -> Rotation:
@@ -279,23 +311,29 @@ def _box_axes(surface: Surface) -> Float:
     return np.asarray(to_box, np.float64)[:3, :3]
 
 
-def _order(compared: _Compared, axis: Float) -> tuple[int, float, Float]:
+def _order(
+    compared: _Compared,
+    axis: Float,
+    kind: Literal["same", "nearly"],
+) -> tuple[int, float, Float]:
     """The highest order of a symmetry about an axis, how exact it is, metres, and the axis.
 
     The order is 0 for any angle, and 1 for none.
     """
-    worst = _all_same(compared, axis, ANY_TURNS)
+    worst = _all_same(compared, axis, ANY_TURNS, kind)
     if worst is not None:
         return 0, worst.median, worst.axis
 
     # Turns by 1/4 and 1/3 of a full one make one by 1/12: powers of primes are tried, and of what
     # they make up the highest order first.
-    finest = {power: compared.turned(axis, 1 / power).same for power in POWERS}
+    finest = {
+        power: getattr(compared.turned(axis, 1 / power), kind) for power in POWERS
+    }
     for order in range(HIGHEST_ORDER, 1, -1):
         if not all(same for power, same in finest.items() if _part(power, order)):
             continue
         # A turn back is as good as one forth.
-        worst = _all_same(compared, axis, np.arange(order // 2, 0, -1) / order)
+        worst = _all_same(compared, axis, np.arange(order // 2, 0, -1) / order, kind)
         if worst is not None:
             return order, worst.median, worst.axis
     return 1, np.inf, axis
@@ -306,18 +344,23 @@ def _part(power: int, order: int) -> bool:
     return order % power == 0 and np.gcd(power, order // power) == 1
 
 
-def _all_same(compared: _Compared, axis: Float, turns: Float) -> _Turned | None:
+def _all_same(
+    compared: _Compared,
+    axis: Float,
+    turns: Float,
+    kind: Literal["same", "nearly"],
+) -> _Turned | None:
     """The largest of some turns, with the worst median, where all are symmetries; else None."""
     largest = compared.turned(axis, float(turns[0]))
-    if not largest.same:
+    if not getattr(largest, kind):
         return None
     worst = largest.median
     for turn in turns[1:]:
         other = compared.turned(largest.axis, float(turn))
-        if not other.same:
+        if not getattr(other, kind):
             return None
         worst = max(worst, other.median)
-    return _Turned(worst, True, largest.axis)
+    return _Turned(worst, largest.same, largest.nearly, largest.axis)
 
 
 def _distinct(found: Iterable[tuple[Float, int]]) -> list[Symmetry]:
