@@ -82,8 +82,8 @@ def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
         order, deviation, fitted = _order(compared, axis, "same")
         if order != 1:
             found.append((order, deviation, fitted))
-    if _is_ball([axis for order, _, axis in found if order == 0]):
-        return tuple(_symmetry(axis, 0) for axis in np.eye(3))
+        if _is_ball([axis for order, _, axis in found if order == 0]):
+            return tuple(_symmetry(axis, 0) for axis in np.eye(3))
 
     found.sort(key=lambda item: (item[0] != 0, -item[0], item[1]))
     symmetries = _distinct((axis, order) for order, _, axis in found)
