@@ -8,9 +8,9 @@ from nextview.checks import one_line
 from nextview.errors import UsageError
 from nextview.recognition.model_card import LARGEST_ORDER, Symmetry
 
-NONE = "none"  # of a thing that has no symmetry
+NO_SYMMETRY = "none"  # of a thing that has no symmetry
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-BALL = tuple(Symmetry(axis, 0) for axis in AXES.values())
+EVERY_TURN = tuple(Symmetry(axis, 0) for axis in AXES.values())
 HOW = (
     "NAME=none, NAME=ball, or NAME=AXIS:ORDER,... where AXIS is x, y, z or three numbers such as"
     " 1/0/1, in the axes of the file; without an order any angle is meant"
@@ -37,10 +37,10 @@ def named_symmetries(given: Sequence[str]) -> dict[str, tuple[Symmetry, ...]]:
             raise UsageError(f"a symmetry is {HOW}, not {one_line(repr(text))}")
         if name in found:
             raise UsageError(f"the symmetries of {one_line(name)} are given twice")
-        if symmetries == NONE:
+        if symmetries == NO_SYMMETRY:
             found[name] = ()
         elif symmetries == "ball":
-            found[name] = BALL
+            found[name] = EVERY_TURN
         else:
             found[name] = tuple(_read(part, text) for part in symmetries.split(","))
     return found

@@ -27,7 +27,7 @@ from nextview.types import Float, Mask
 # of the diameter: facets of a circle with 16 corners, and what a camera sees from five radii away
 SYMMETRY_TOLERANCE = 0.01
 # of the diameter, median distance of a surface from its turned copy
-LARGEST_MEDIAN = 0.01
+SAME_MEDIAN = 0.01
 # median distances that a tenth of a scan may be off, as by bulges and seams
 USUAL_ERRORS = 8.0
 USUAL_SHARE = 0.1
@@ -45,15 +45,17 @@ POWERS = (2, 3, 4, 5, 7, 8, 9, 11, 13, 16, 17, 19, 23, 25, 27, 29, 31, 32, 37)
 ANY_TURNS = np.arange(23, 0, -2) / 48
 # of the surface: what is near is looked for among the triangles that they are on
 SAMPLE_POINTS = 20_000
-COMPARED_POINTS = 3000  # of its turned copy
+COPIED_POINTS = 3000  # of its turned copy
 GUESSED_POINTS = 400  # of it, that show quickly that a turn is no symmetry
 # of these, that lie near the surface however badly the axis is known
 GUESSED_SHARE = 0.9
 GUESSED_DISTANCE = 0.06  # of the diameter, that is near
 NEAREST_TRIANGLES = 4  # among which the nearest one is looked for
 FITTED_STEPS = 5  # in which a turned copy is moved to where it fits
-FREE = 1e-3  # share of the weights that holds a tilt of which the surface says nothing
-TINY = 1e-9  # metres
+FREE_TILT = (
+    1e-3  # share of the weights that holds a tilt of which the surface says nothing
+)
+LEAST_APART = 1e-9  # metres
 SEEN_FROM = 48  # directions from one of which a point has to be seen to count
 ABOVE = 1e-3  # of the diameter, that it is seen from above the surface
 MOST_AXES = 3  # that are named: all others of a cube follow from three
@@ -181,14 +183,14 @@ class _Compared:
             return _Turned(float(np.median(guess)), False, False, axis)
 
         rotation = self._fitted(rotation, axis)
-        distances = self._distances(rotation.apply(self._points[:COMPARED_POINTS]))
+        distances = self._distances(rotation.apply(self._points[:COPIED_POINTS]))
         distances /= self.diameter
         median = float(np.median(distances))
         usual = SYMMETRY_TOLERANCE + USUAL_ERRORS * median
         local = min(SYMMETRY_TOLERANCE + LOCAL_ERRORS * median, LARGEST_LOCAL_ERROR)
         beside = float((distances > usual).mean())
         same = (
-            median < LARGEST_MEDIAN
+            median < SAME_MEDIAN
             and beside < USUAL_SHARE
             and (distances > local).mean() < MOVED_SHARE
         )
@@ -206,7 +208,7 @@ class _Compared:
 
         Point to plane, by the nearest sampled points; what lies beside hardly counts.
         """
-        points = self._points[: COMPARED_POINTS // 3]
+        points = self._points[: COPIED_POINTS // 3]
         first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
         first /= np.linalg.norm(first)
         across = np.stack([first, np.cross(axis, first)])
@@ -215,11 +217,13 @@ class _Compared:
             apart, nearest = self._tree.query(copy)
             normals = self._normals[nearest]
             along = np.einsum("ni,ni->n", self._points[nearest] - copy, normals)
-            weights = np.asarray(1 / (1 + (apart / (np.median(apart) + TINY)) ** 2))
+            weights = np.asarray(
+                1 / (1 + (apart / (np.median(apart) + LEAST_APART)) ** 2)
+            )
             tilting = np.cross(copy, normals) @ across.T
             left = (tilting * weights[:, None]).T @ tilting
             # Of a ball nothing is drawn anywhere.
-            left += FREE * weights.sum() * self.diameter**2 * np.eye(2)
+            left += FREE_TILT * weights.sum() * self.diameter**2 * np.eye(2)
             change = np.linalg.solve(left, tilting.T @ (weights * along))
             rotation = Rotation.from_rotvec(change @ across) * rotation
         return rotation
