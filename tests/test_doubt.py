@@ -10,13 +10,15 @@ from small_tables import camera_over, meshes_of, view
 
 import nextview
 from nextview.data.samples import sample_mesh
-from nextview.errors import ModelError
+from nextview.errors import ModelError, UsageError
 from nextview.geometry.mesh import Mesh, make_mesh
+from nextview.recognition.model_card import Symmetry
 from nextview.recognition.protocol import JointBelief
 from nextview.sensing import ObservedObject
 from nextview.simulation.sensor import SENSORS
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.simulation.tables import PlacedThing, SimulatedTable, TableCamera
+from nextview.things.doubt import unknown_turn
 
 NAMES = ("chair", "table")
 
@@ -137,6 +139,39 @@ def test_a_can_upside_down_is_the_same_can_to_a_depth_camera(ycb):
     found = the_object(ycb, stretched("tomato_soup_can", 1, 1, 1))
     assert found.name == "tomato_soup_can"
     assert found.pose_uncertainty.degrees < 10
+
+
+def test_a_place_in_the_world_is_as_uncertain_as_the_place_of_the_camera(ycb):
+    exact = nextview.load("ycb", threads=1, camera_accuracy=(0.5, 0.0))
+    mesh = stretched("cracker_box", 1, 1, 1)
+    usual = the_object(ycb, mesh, distance=0.65).pose_uncertainty.millimetres
+    known = the_object(exact, mesh, distance=0.65).pose_uncertainty.millimetres
+    # Along each of three axes 3 mm, and 0.34 degrees at 0.65 m; and 0.5 mm.
+    aim = 650 * np.radians(0.344)
+    assert usual**2 - known**2 == pytest.approx(3 * (3**2 + aim**2 - 0.5**2), rel=0.15)
+
+
+@pytest.mark.parametrize("wrong", [3.0, (1.0,), (-1.0, 0.1), (1.0, np.nan), "ab"])
+def test_the_accuracy_of_cameras_is_two_lengths_of_errors(wrong):
+    with pytest.raises(UsageError, match="the accuracy of the cameras"):
+        nextview.load("ycb", threads=1, camera_accuracy=wrong)
+
+
+def test_the_accuracy_of_cameras_says_nothing_of_classes():
+    with pytest.raises(ModelError, match="taught things of known geometry alone"):
+        nextview.load(threads=1, camera_accuracy=(1.0, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("order", "degrees"), [(1, 30), (2, 30), (4, 19.49), (6, 12.99)]
+)
+def test_an_orientation_is_unknown_from_a_share_of_what_it_can_be_off(order, degrees):
+    # Spread evenly over +-180 degrees / order, it has that limit over the square root of three.
+    symmetries = [Symmetry((0.0, 0.0, 1.0), order)] if order > 1 else []
+    spread = np.linspace(-180 / order, 180 / order, 100_001)
+    found = unknown_turn(symmetries)
+    assert found == pytest.approx(degrees, abs=0.01)
+    assert found == pytest.approx(min(30, 0.75 * spread.std()), abs=0.01)
 
 
 class Doubtful:

@@ -17,6 +17,7 @@ from nextview.geometry.observation import Observation, SceneView
 from nextview.geometry.ray_caster import embree_scene
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import ViewSphere, look_at_origin, rotation_z
+from nextview.recognition.model_card import Symmetry
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.depth_view import (
     ELSEWHERE,
@@ -41,11 +42,11 @@ from nextview.things.registration import (
     start,
 )
 from nextview.things.surface import Surface, SurfaceCaster
-from nextview.things.symmetry import find_symmetries
+from nextview.things.symmetry import find_near_symmetries, find_symmetries
 from nextview.things.taught import TaughtThings
 from nextview.things.unknown import KnownResiduals
 from nextview.things.verification import likelihood
-from nextview.things.verifier import Verified, Verifier
+from nextview.things.verifier import Verified, Verifier, rival_turns
 from nextview.things.weighing import (
     VIEW_CORRELATIONS,
     EvidenceWeights,
@@ -569,6 +570,35 @@ def test_a_thing_is_named_by_its_geometry_alone(shown):
     )
     assert moved < 1.5
     assert turn < 1 or shown == 2  # the cup without a handle has four azimuths
+
+
+def test_a_pose_that_a_near_symmetry_leads_to_is_looked_at():
+    # A box with a knob near its upper end, which was taught upright alone, stands on its head.
+    mesh = mesh_of(
+        ((0.1, 0.06, 0.08), (0, 0, 0)), ((0.02, 0.02, 0.02), (0.06, 0, 0.02))
+    )
+    over = np.diag([1.0, -1.0, -1.0])
+    camera = SimulatedCamera(rotated(mesh, over))
+    views = [
+        camera.observe(look_at_origin(np.radians(30), np.radians(around)))
+        for around in (-20, 20)
+    ]
+    verifier = verifier_of(mesh)
+    near = find_near_symmetries(Surface.from_mesh(mesh, "box"))
+    assert {one.order for one in near} == {2}
+    verifier.rivals = (rival_turns(near),)
+    found = verifier(views, even_belief(1))
+    assert (np.trace(found.poses[0][:3, :3].T @ over) - 1) / 2 > np.cos(np.radians(2))
+    assert found.probabilities[0] > 0.9
+
+
+def test_the_turns_of_near_symmetries_are_those_of_their_orders():
+    turns = rival_turns([Symmetry((0.0, 0.0, 1.0), 6), Symmetry((1.0, 0.0, 0.0), 2)])
+    expected = Rotation.from_euler("z", np.arange(60, 360, 60)[:, None], degrees=True)
+    np.testing.assert_allclose(turns[:5], expected.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(turns[5], np.diag([1, -1, -1]), atol=1e-12)
+    assert len(turns) == 6
+    assert rival_turns([]).shape == (0, 3, 3)
 
 
 def test_two_things_of_the_same_geometry_share_the_belief():

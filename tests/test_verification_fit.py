@@ -9,7 +9,8 @@ import pytest
 import trimesh
 
 import nextview
-from nextview.recognition.model_card import read_card
+from nextview.errors import UsageError
+from nextview.recognition.model_card import Symmetry, read_card
 from nextview.teaching.verification_fit import (
     DEFAULT_THINGS,
     Shown,
@@ -257,7 +258,17 @@ def test_geometry_is_carried_over_and_only_new_things_are_shown(blocks, tmp_path
         assert before.residuals.usual[number] == after.residuals.usual[same]
     assert before.verifier.weights == after.verifier.weights
 
-    nextview.learn(models, models, remove=("can", "low"))
+    named = ("small=none", "large=z:6")
+    nextview.learn(models, models, remove=("can", "low"), symmetry=named)
     kept = TaughtThings.of(TaughtRecogniser(models / "memory.json"))
     assert sorted(kept.names) == ["high", "large", "small"]
     assert len(kept.residuals.usual) == 3
+    symmetries = dict(zip(kept.names, kept.symmetries, strict=True))
+    found = dict(zip(after.names, after.symmetries, strict=True))
+    assert symmetries == {
+        "high": found["high"],
+        "large": (Symmetry((0.0, 0.0, 1.0), 6),),
+        "small": (),
+    }
+    with pytest.raises(UsageError, match="nothing is called mug"):
+        nextview.learn(models, models, symmetry=("mug=none",))

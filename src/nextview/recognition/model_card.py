@@ -116,12 +116,14 @@ class Thing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         source: The file or folder that it was taught from.
         poses: In how many resting poses it was taught.
         symmetries: Of its surface; () for none, and where its geometry is not known.
+        near_symmetries: Turns after which it hardly looks different; its symmetries are among them.
     """
 
     name: Annotated[str, msgspec.Meta(min_length=1)]
     source: str
     poses: Annotated[int, msgspec.Meta(ge=1, le=MOST_TAUGHT_POSES)]
     symmetries: tuple[Symmetry, ...] = ()
+    near_symmetries: tuple[Symmetry, ...] = ()
 
 
 class Taught(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -42,7 +42,7 @@ from nextview.session.limits import Limits
 from nextview.session.result import Recognition
 from nextview.session.session import FrameCamera, Session
 from nextview.things.expected_views import Goal
-from nextview.things.recogniser import open_recogniser
+from nextview.things.recogniser import VerifiedRecogniser, open_recogniser
 from nextview.things.several import SeveralRecognisers
 
 if TYPE_CHECKING:
@@ -304,6 +304,7 @@ def load(
     unknown: float | None = None,
     stopping: Stopping | Rule | str | None = None,
     recogniser: Any = None,
+    camera_accuracy: tuple[float, float] | None = None,
 ) -> System:
     """Open models, and what belongs to them.
 
@@ -332,6 +333,10 @@ def load(
             replaces threshold, risk and max_views.
         recogniser: one of your own instead of that of the models: an object or "MODULE:NAME", see
             ``recognition.own_recogniser``. It is pickled with the system.
+        camera_accuracy: by how much the poses of the cameras are off, standard deviations along
+            and about each axis: (millimetres, degrees), as the calibration of hand and eye and the
+            data sheet of the arm tell. By default (3, 0.34). Poses of taught things in the world
+            are as uncertain as the cameras' poses, and views are aligned with each other by them.
 
     Returns:
         The system.
@@ -362,6 +367,8 @@ def load(
         if recogniser is None
         else own_recogniser(recogniser)
     )
+    if camera_accuracy is not None:
+        knows = _for_cameras(knows, camera_accuracy)
     policies = found.policies
     # the policy of a memory belongs to its things alone
     if recogniser is not None or len(names) > 1:
@@ -460,6 +467,24 @@ def _opened(collections: dict[str, Collection], threads: int) -> Recogniser:
     if len(opened) > 1:
         return SeveralRecognisers(opened)
     return next(iter(opened.values()))
+
+
+def _for_cameras(recogniser: Recogniser, accuracy: Any) -> Recogniser:
+    """The same recogniser for cameras of this accuracy, millimetres and degrees.
+
+    UsageError if these are no such numbers, ModelError where no geometry is known.
+    """
+    what = "the accuracy of the cameras"
+    if not isinstance(accuracy, tuple | list) or len(accuracy) != 2:
+        raise UsageError(
+            f"{what} is (millimetres, degrees), not {one_line(repr(accuracy))}"
+        )
+    place, aim = (number(value, what, 0) for value in accuracy)
+    if not isinstance(recogniser, VerifiedRecogniser | SeveralRecognisers):
+        raise ModelError(
+            f"{recogniser.name}: {what} counts for taught things of known geometry alone"
+        )
+    return recogniser.for_cameras(place / 1000, float(np.radians(aim)))
 
 
 def _unknown_share(asked: float | None, recogniser: Recogniser, called: str) -> float:

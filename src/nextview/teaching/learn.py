@@ -15,6 +15,7 @@ from msgspec.structs import replace as replace_record
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save_file
 
+from nextview.checks import one_line
 from nextview.data.pool import WorkerDied, each
 from nextview.data.pool import count as count_workers
 from nextview.data.progress import TrackProgress, in_lines, silently
@@ -48,14 +49,17 @@ from nextview.recognition.model_card import (
 from nextview.teaching.learned_picture import draw_learned
 from nextview.teaching.memory_fit import VIEWS_FITTED, Fit, fit_memory, size_evidence
 from nextview.teaching.sizes import check_sizes
+from nextview.teaching.symmetries import named_symmetries
 from nextview.teaching.thing_sources import Found, ThingSource, find_things
 from nextview.teaching.thing_views import (
     FACES,
     LEFT_OUT,
+    NEAR_SYMMETRIES,
     SYMMETRIES,
     VERTICES,
     Arrays,
     TeachingOptions,
+    rows_of,
     teach,
 )
 from nextview.teaching.verification_fit import (
@@ -183,6 +187,8 @@ class LearnOptions(TypedDict, total=False):
         largest_part: whether to keep only the largest connected part of each mesh.
         any_size: whether to accept things of very different sizes.
         one_class: whether things that are all in one folder are one class.
+        symmetry: of things for which it shall not be found, such as "flange=z:6", see
+            ``teaching.symmetries.named_symmetries``.
         turntable: direction in which a turntable turned, "ccw" or "cw", seen from above.
         depth_scale: metres per step of captured depth images; by default as their files say.
         depth_topic: topic of the depth images of ROS 2 bags with several.
@@ -203,6 +209,7 @@ class LearnOptions(TypedDict, total=False):
     largest_part: bool
     any_size: bool
     one_class: bool
+    symmetry: tuple[str, ...]
     turntable: Literal["ccw", "cw"] | None
     depth_scale: float | None
     depth_topic: str | None
@@ -272,7 +279,8 @@ def learn_things(
         out: folder of the memory to write.
         add: add the things to those that OUT knows, which are not processed again; FOLDER contains
             only the new things.
-        remove: names of things to remove from OUT; if FOLDER is OUT, nothing is added.
+        remove: names of things to remove from OUT; if FOLDER is OUT, nothing is added, and this
+            or --symmetry is what changes.
         workers: number of processes; by default one for each core; 0 uses this process.
         scheduler: address of a dask.distributed scheduler to use instead, whose workers see the
             same files.
@@ -287,9 +295,10 @@ def learn_things(
     out = Path(out)
     how.check()
     count_workers(workers)  # refuses a number that is none
-    keeps = add or bool(remove)
+    changes = bool(remove or how.symmetry)
+    nothing_new = changes and folder.resolve() == out.resolve()
+    keeps = add or bool(remove) or nothing_new
     _check_places(out, keeps, overwrite)
-    nothing_new = bool(remove) and folder.resolve() == out.resolve()
     found = (
         Found([], []) if nothing_new else find_things(folder, out, how.one_class or add)
     )
@@ -312,6 +321,7 @@ def learn_things(
                 f"{folder}: none of its things could be taught ({'; '.join(left_out[:3])})"
             )
         taught.sort(key=lambda pair: (pair[0].label, pair[0].name))
+        _name_symmetries(taught, how.symmetry)
         if not how.any_size:
             radii = np.concatenate([arrays["radii"] for _, arrays in taught])
             check_sizes([source.path for source, _ in taught], radii, how.unit)
@@ -376,17 +386,31 @@ def _known(card: ModelCard, memory: Memory, remove: Sequence[str]) -> list[Pair]
         arrays["radii"] = arrays["radii"].reshape(1)
         surface = memory.surfaces.surface(index, thing.name)
         if surface is not None:
-            symmetries = np.array(
-                [(*one.axis, one.order) for one in thing.symmetries],
-                np.float64,
-            )
             arrays |= {
                 VERTICES: surface.vertices,
                 FACES: surface.faces,
-                SYMMETRIES: symmetries.reshape(-1, 4),
+                SYMMETRIES: rows_of(thing.symmetries),
+                NEAR_SYMMETRIES: rows_of(thing.near_symmetries),
             }
         kept.append((ThingSource(thing.name, label, Path(thing.source)), arrays))
     return kept
+
+
+def _name_symmetries(taught: Sequence[Pair], given: Sequence[str]) -> None:
+    """Put the symmetries that a person gave in the place of those that were found.
+
+    Raises:
+        UsageError: one is of no thing, or of one whose size is not known.
+    """
+    known = {source.name: arrays for source, arrays in taught}
+    for name, symmetries in named_symmetries(given).items():
+        if name not in known:
+            raise UsageError(f"--symmetry: nothing is called {one_line(name)}")
+        if VERTICES not in known[name]:
+            raise UsageError(
+                f"--symmetry: {one_line(name)} has no pose without its size; give --unit"
+            )
+        known[name][SYMMETRIES] = rows_of(symmetries)
 
 
 PER_THING = ("held_out", "held_out_views", "radii", "pictures")
@@ -457,7 +481,7 @@ def _stamp(source: ThingSource, how: TeachingOptions) -> str:
         (
             str(source.path.resolve()),
             content.hexdigest(),
-            replace(how, any_size=False),
+            replace(how, any_size=False, symmetry=()),
             features,
         )
     )
@@ -757,7 +781,13 @@ def _card(
     """
     poses = np.bincount(memory.thing)
     things = tuple(
-        Thing(source.name, str(source.path), int(count), _symmetries_of(arrays))
+        Thing(
+            source.name,
+            str(source.path),
+            int(count),
+            _symmetries_of(arrays, SYMMETRIES),
+            _symmetries_of(arrays, NEAR_SYMMETRIES),
+        )
         for (source, arrays), count in zip(taught, poses, strict=True)
     )
 
@@ -800,9 +830,9 @@ def _card(
     ).made_by(command())
 
 
-def _symmetries_of(arrays: Arrays) -> tuple[Symmetry, ...]:
-    """The symmetries of a thing; () where its geometry is not known."""
-    rows = arrays.get(SYMMETRIES, np.zeros((0, 4))).tolist()
+def _symmetries_of(arrays: Arrays, name: str) -> tuple[Symmetry, ...]:
+    """The symmetries of a thing under this name; () where its geometry is not known."""
+    rows = arrays.get(name, np.zeros((0, 4))).tolist()
     return tuple(Symmetry((x, y, z), int(order)) for x, y, z, order in rows)
 
 

@@ -30,16 +30,18 @@ from nextview.geometry.viewsphere import (
     look_at_origin,
 )
 from nextview.recognition.inference import Features
+from nextview.recognition.model_card import Symmetry
 from nextview.recognition.network_input import from_observations
 from nextview.recognition.novelty import unit
 from nextview.sensing.tabletop import LOWEST_TOP
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
+from nextview.teaching.symmetries import named_symmetries
 from nextview.things.fusion import fuse
 from nextview.things.memory import AZIMUTHS, RINGS, joined
 from nextview.things.surface import FINEST_ERROR, Surface
-from nextview.things.symmetry import find_symmetries
+from nextview.things.symmetry import find_near_symmetries, find_symmetries
 from nextview.types import Float, Float32
 
 Arrays = dict[str, NDArray]
@@ -62,6 +64,7 @@ LEFT_OUT = "left_out"
 VERTICES = "vertices"
 FACES = "faces"
 SYMMETRIES = "symmetries"  # and the axis and order of each of its symmetries, (S, 4)
+NEAR_SYMMETRIES = "near_symmetries"  # and of each near symmetry
 # of the radius: a camera stands farther from a large thing, and measures it less exactly
 COARSER = 0.002
 EmbeddingParts = Iterator[Float32]  # of embeddings, (.., F) each, in order
@@ -81,6 +84,9 @@ class TeachingOptions:
         largest_part: keep only the largest connected part of each mesh.
         any_size: accept things of very different sizes.
         one_class: things that are all in one folder are one class; --add assumes this.
+        symmetry: symmetries of things for which they shall not be found, in the axes of their
+            files: NAME=none, NAME=z (any angle), NAME=z:6 (order 6), NAME=z:4,x:2, NAME=1/0/1:2,
+            NAME=ball.
         turntable: the depth frames have no poses: the camera stood still, and the thing made one
             full turn in equal steps, counter-clockwise (ccw) or clockwise (cw) seen from above;
             camera-intrinsics.txt is beside them.
@@ -98,6 +104,7 @@ class TeachingOptions:
     largest_part: bool = False
     any_size: bool = False
     one_class: bool = False
+    symmetry: tuple[str, ...] = ()
     turntable: Literal["ccw", "cw"] | None = None
     depth_scale: float | None = None
     depth_topic: str | None = None
@@ -111,6 +118,7 @@ class TeachingOptions:
             UsageError: a value that makes no sense.
         """
         sensor_named(self.sensor)
+        named_symmetries(self.symmetry)
         whole(self.seed, "the seed", most=2**63 - 1)
         one_of(self.unit, (None, *UNITS), "the unit")
         one_of(self.up, (None, "y", "z"), "the up axis")
@@ -129,7 +137,8 @@ def teach(path: Path, name: str, how: TeachingOptions, threads: int = 1) -> Arra
     Returns:
         Arrays by the names of the fields of ``things.memory.Memory``. If its size is known, also
         its surface in the frame of its file, metres: VERTICES, (V, 3) float32, FACES, (F, 3) int32,
-        and SYMMETRIES. Where some of the frames were not used, a phrase about them under LEFT_OUT.
+        SYMMETRIES and NEAR_SYMMETRIES. Where some of the frames were not used, a phrase about them
+        under LEFT_OUT.
 
     Raises:
         MeshError, DatasetError, ObservationError: why it cannot be looked at, in one sentence.
@@ -217,17 +226,29 @@ def _surface(mesh: Mesh, to_mesh: Float) -> Arrays:
 
     whole = Surface.from_mesh(mesh, mesh.name)
     in_file = replace(whole, vertices=(whole.vertices @ to_mesh).astype(np.float32))
-    return of_surface(in_file.simplified(max(FINEST_ERROR, COARSER * mesh.metres)))
+    return of_surface(in_file, max(FINEST_ERROR, COARSER * mesh.metres))
 
 
-def of_surface(surface: Surface) -> Arrays:
-    """What is remembered of a surface: itself and its symmetries."""
-    symmetries = [(*one.axis, one.order) for one in find_symmetries(surface)]
+def of_surface(whole: Surface, error: float = 0.0) -> Arrays:
+    """What is remembered of a surface: itself and its symmetries.
+
+    Args:
+        whole: the surface as it was scanned, which its symmetries are those of.
+        error: metres by which it may be off where it is simplified; 0 keeps it.
+    """
+    surface = whole.simplified(error) if error else whole
     return {
         VERTICES: surface.vertices,
         FACES: surface.faces,
-        SYMMETRIES: np.array(symmetries, np.float64).reshape(-1, 4),
+        SYMMETRIES: rows_of(find_symmetries(whole)),
+        NEAR_SYMMETRIES: rows_of(find_near_symmetries(whole)),
     }
+
+
+def rows_of(symmetries: Sequence[Symmetry]) -> Float:
+    """Symmetries as an array, axis and order of each, (S, 4) float64."""
+    rows = [(*one.axis, one.order) for one in symmetries]
+    return np.array(rows, np.float64).reshape(-1, 4)
 
 
 def _around(clean: EmbeddingParts, sensed: EmbeddingParts) -> Float32:

@@ -7,15 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nextview.geometry.observation import Observation
-from nextview.recognition.poses import (
-    UNKNOWN_TURN,
-    PoseCandidate,
-    distinct,
-    turn_apart,
-)
+from nextview.recognition.poses import PoseCandidate, distinct
 from nextview.things.depth_view import DepthView, depth_view
 from nextview.things.registration import pose_covariances
-from nextview.things.symmetry import coincide
 from nextview.things.taught import TaughtThings
 from nextview.things.verifier import FINE_SIDE, Verified, Verifier
 from nextview.types import Index
@@ -39,8 +33,9 @@ def candidates_of(
         labels: class of each of the things, (T,).
 
     Returns:
-        Poses that a depth camera tells apart, of one or several things; and by how much errors of
-        the cameras' places displace them all, millimetres, one standard deviation.
+        Different poses of one or several things, also those in which a nearly symmetric thing looks
+        almost the same; and by how much errors of the cameras' places displace them all,
+        millimetres, one standard deviation.
     """
     shown = [depth_view(observation, FINE_SIDE) for observation in observations]
     views = [view for view in shown if view is not None]
@@ -71,7 +66,6 @@ def candidates_of(
         for row in distinct(candidates)
         if row == 0 or candidates[row].probability > LEAST_PROBABILITY
     ]
-    rows = _told_apart(things.verifier, found, candidates, rows)
     total = sum(candidates[row].probability for row in rows)
     deviations = _deviations(things.verifier, found, views, np.array(rows))
     kept = []
@@ -85,33 +79,6 @@ def candidates_of(
         )
         kept.append(candidate)
     return tuple(kept), _camera_error(things.verifier, observations, views)
-
-
-def _told_apart(
-    verifier: Verifier,
-    found: Verified,
-    candidates: Sequence[PoseCandidate],
-    rows: Sequence[int],
-) -> list[int]:
-    """Leave out poses in which a depth camera sees the same surface as in the likeliest one.
-
-    A can upside down is such a pose, though its rims differ by a millimetre and so no symmetry
-    leads there.
-    """
-    first = candidates[rows[0]]
-    turned = [
-        row
-        for row in rows[1:]
-        if candidates[row].thing == first.thing
-        and turn_apart(first, candidates[row]) >= UNKNOWN_TURN
-    ]
-    if not turned:
-        return list(rows)
-    back = np.linalg.inv(first.pose)
-    motions = np.stack([back @ candidates[row].pose for row in turned])
-    same = coincide(verifier.caster.surfaces[found.things[rows[0]]], motions)
-    left_out = {row for row, alike in zip(turned, same, strict=True) if alike}
-    return [row for row in rows if row not in left_out]
 
 
 def _camera_error(

@@ -19,10 +19,12 @@ from nextview.things.doubt import doubt_of
 from nextview.things.expected_views import Outlook
 from nextview.things.memory import TaughtRecogniser, open_memory
 from nextview.things.pose_candidates import candidates_of
+from nextview.things.registration import RegistrationPrior
 from nextview.things.taught import TaughtThings
 from nextview.things.verifier import Verified
 from nextview.types import Float, Floats, Index
 
+MADE = ("things", "in_any_orientation")  # of the memory, and lead back to it
 NO_SCALE = "the scale of the views is not known in metres"
 
 
@@ -43,14 +45,14 @@ class VerifiedRecogniser(TaughtRecogniser):
             ModelError: see ``open_memory``, or the memory knows no geometry.
         """
         super().__init__(model, threads)
+        self.prior = RegistrationPrior()
         assert len(
             self.things.names
         )  # made now: what is wrong with it is said when it is opened
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what is made of the memory, and leads back to it."""
-        made = ("things", "in_any_orientation")
-        return {name: value for name, value in vars(self).items() if name not in made}
+        return {name: value for name, value in vars(self).items() if name not in MADE}
 
     @cached_property
     def things(self) -> TaughtThings:
@@ -58,7 +60,21 @@ class VerifiedRecogniser(TaughtRecogniser):
         found = TaughtThings.of(self)
         if found is None:
             raise ModelError(f"{self.card.card_path}: knows no geometry of its things")
+        found.verifier.prior = self.prior
         return found
+
+    def for_cameras(self, place: float, aim: float) -> VerifiedRecogniser:
+        """The same for cameras whose poses are known this well.
+
+        Args:
+            place: standard deviation of a camera's place along each axis, metres.
+            aim: of the direction in which it looks, radians.
+        """
+        other = copy(self)
+        for made in MADE:
+            vars(other).pop(made, None)
+        other.prior = self.prior.for_cameras(place, aim)
+        return other
 
     @cached_property
     def in_any_orientation(self) -> VerifiedRecogniser:

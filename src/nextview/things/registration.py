@@ -33,6 +33,10 @@ PLACE_TOLERANCE = 0.03  # radii
 """Hypotheses of one thing that are not farther apart are one."""
 
 
+# metres: a camera that stands as exactly as that is held in its place
+LEAST_CAMERA_ERROR = 1e-4
+
+
 @dataclass(frozen=True)
 class RegistrationPrior:
     """How far off things may be before anything was aligned: standard deviations.
@@ -51,6 +55,15 @@ class RegistrationPrior:
     camera: float = 0.003
     aim: float = 0.006
     pixels: float = 60.0
+
+    def for_cameras(self, place: float, aim: float) -> "RegistrationPrior":
+        """The same for cameras of another accuracy.
+
+        Args:
+            place: standard deviation of the place of each camera along each axis, metres.
+            aim: of the direction in which it looks, radians.
+        """
+        return replace(self, camera=max(place, LEAST_CAMERA_ERROR), aim=aim)
 
     def displaced(self, views: Sequence[DepthView]) -> Float:
         """How far off each view may see the thing along each axis, (V,) float64, metres."""

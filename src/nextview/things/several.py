@@ -112,6 +112,21 @@ class SeveralRecognisers:
                 tilted[name] = member
         return SeveralRecognisers(tilted)
 
+    def for_cameras(self, place: float, aim: float) -> SeveralRecognisers:
+        """The same for cameras whose poses are known this well.
+
+        Args:
+            place: standard deviation of a camera's place along each axis, metres.
+            aim: of the direction in which it looks, radians.
+        """
+        members: dict[str, NetworkRecogniser] = {}
+        for name, member in self._collections.items():
+            if isinstance(member, VerifiedRecogniser):
+                members[name] = member.for_cameras(place, aim)
+            else:
+                members[name] = member
+        return SeveralRecognisers(members)
+
     def __call__(self, observations: Sequence[Observation]) -> Evidence:
         """What each view speaks for, each collection being as likely: for policies alone."""
         directions = np.stack(

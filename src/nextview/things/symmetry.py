@@ -1,42 +1,76 @@
 """Symmetries of a surface: axes about which it can be turned and stays the same.
 
-A turn is a symmetry where the surface and its turned copy are nowhere farther apart than a
-tolerance, as in the BOP toolkit (Hodan et al., "BOP Challenge 2020 on 6D Object Localization",
-ECCV workshops 2020: the Hausdorff distance is below the larger of 15 mm and a tenth of the
-diameter). Its tolerance is that of people who look at pictures; the one here is what a depth camera
-can tell apart.
+A turn is a symmetry where hardly any of the surface lies beside its turned copy. How far beside is
+a small part of the diameter, and as much more as the surface itself is inexact: an exact mesh comes
+back to itself to within its facets, a scan to within its errors, and these show in the median of
+the distances. What remains is judged by its area and not by a quantile that a hole or a keyway
+escapes. The BOP toolkit (Hodan et al., "BOP Challenge 2020 on 6D Object Localization", ECCV
+workshops 2020) allows the larger of 15 mm and a tenth of the diameter everywhere, which is the
+tolerance of people who look at pictures; a depth camera sees the holes of a flange.
 """
 
 from collections.abc import Iterable, Sequence
-from fractions import Fraction
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import QhullError, cKDTree
+from scipy.spatial.transform import Rotation
 
+from nextview.geometry.ray_caster import embree_scene
 from nextview.recognition.model_card import Symmetry
 from nextview.things.surface import Surface
+from nextview.things.view_templates import spread_directions
 from nextview.types import Float, Mask
 
-# metres: three deviations of edges that a stereo camera sees at arm's length
-LEAST_TOLERANCE = 0.005
-SYMMETRY_TOLERANCE = 0.02  # of the diameter: a camera stands farther from a large thing
-COMPARED_SHARE = 0.95  # share of the surface that has to be that near: scans have spurs
-HIGHEST_ORDER = 8
+# of the diameter: facets of a circle with 16 corners, and what a camera sees from five radii away
+SYMMETRY_TOLERANCE = 0.01
+# of the diameter, median distance of a surface from its turned copy
+SAME_MEDIAN = 0.01
+# median distances that a tenth of a scan may be off, as by bulges and seams
+USUAL_ERRORS = 8.0
+USUAL_SHARE = 0.1
+# and that hardly any of it may be off, as the inside of a cup that no scanner looks into
+LOCAL_ERRORS = 40.0
+LARGEST_LOCAL_ERROR = 0.08  # of the diameter
+MOVED_SHARE = 0.0075  # hardly any: the walls of a keyway are twice as much of a gear
+# the same of near symmetries, after which a part of a thing is elsewhere
+NEAR_MEDIAN = 0.025
+NEAR_SHARE = 0.15
+HIGHEST_ORDER = 40  # of a symmetry: as many teeth as a gear has
+# powers of primes up to that
+POWERS = (2, 3, 4, 5, 7, 8, 9, 11, 13, 16, 17, 19, 23, 25, 27, 29, 31, 32, 37)
 # of a full turn, that are tried for a symmetry of any angle
-ANY_TURNS = np.arange(1, 24, 2) / 48
-SYMMETRY_POINTS = 20_000  # of the surface that is compared with
-TURNED_POINTS = 500  # of its turned copy
+ANY_TURNS = np.arange(23, 0, -2) / 48
+# of the surface: what is near is looked for among the triangles that they are on
+SAMPLE_POINTS = 20_000
+COPIED_POINTS = 3000  # of its turned copy
+GUESSED_POINTS = 400  # of it, that show quickly that a turn is no symmetry
+# of these, that lie near the surface however badly the axis is known
+GUESSED_SHARE = 0.9
+GUESSED_DISTANCE = 0.06  # of the diameter, that is near
+NEAREST_TRIANGLES = 4  # among which the nearest one is looked for
+FITTED_STEPS = 5  # in which a turned copy is moved to where it fits
+FREE_TILT = (
+    1e-3  # share of the weights that holds a tilt of which the surface says nothing
+)
+LEAST_APART = 1e-9  # metres
+SEEN_FROM = 48  # directions from one of which a point has to be seen to count
+ABOVE = 1e-3  # of the diameter, that it is seen from above the surface
+MOST_AXES = 3  # that are named: all others of a cube follow from three
 STEP_ACROSS = np.radians(5)  # between axes that are tried across one of a symmetry
 AXIS_TOLERANCE = np.radians(20)  # axes within this angle are one
+SAME_CANDIDATE = np.radians(1)  # axes to be tried within this angle are one
 
 
 def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
     """Find the axes and orders of a surface's symmetries.
 
     The candidate axes pass through the centroid of the surface, which every symmetry leaves fixed.
-    They are the axes of the file, the principal axes and those of the smallest bounding box. If the
-    surface is symmetric by any angle about one axis, only one of the axes perpendicular to it is
-    returned, because the others follow.
+    They are the axes of the file, the principal axes and those of the smallest bounding box; each
+    is corrected to where the turned copy fits best. If the surface is symmetric by any angle about
+    one axis, only one of the axes perpendicular to it is returned, because the others follow.
 
     Args:
         surface: of a thing.
@@ -44,74 +78,202 @@ def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
     Returns:
         Its symmetries: first those of any angle, then the others by their order.
     """
-    rng = np.random.default_rng(0)
-    whole = surface.sample(SYMMETRY_POINTS, rng)
-    centroid = whole.mean(0)
-    whole -= centroid
-    tree = cKDTree(whole)
-    points = surface.sample(TURNED_POINTS, rng) - centroid
-    tolerance = _tolerance(surface)
-
+    compared = _Compared(surface)
     found = []
-    for axis in _axes(surface, whole):
-        order, deviation = _order(tree, points, axis, tolerance)
+    for axis in _axes(surface):
+        order, deviation, fitted = _order(compared, axis, "same")
         if order != 1:
-            found.append((order, deviation, axis))
-    if _is_ball([axis for order, _, axis in found if order == 0]):
-        return tuple(_symmetry(axis, 0) for axis in np.eye(3))
+            found.append((order, deviation, fitted))
+        if _is_ball([axis for order, _, axis in found if order == 0]):
+            return tuple(_symmetry(axis, 0) for axis in np.eye(3))
 
     found.sort(key=lambda item: (item[0] != 0, -item[0], item[1]))
     symmetries = _distinct((axis, order) for order, _, axis in found)
     if len(symmetries) == 1:
-        symmetries += _half_turn_across(
-            tree,
-            points,
-            np.array(symmetries[0].axis),
-            tolerance,
-        )
+        symmetries += _half_turn_across(compared, np.array(symmetries[0].axis))
     return tuple(symmetries)
 
 
-def coincide(surface: Surface, motions: Float) -> Mask:
-    """Whether a surface and its moved copies are the same to a depth camera.
+def find_near_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
+    """Find axes about which a surface can be turned and hardly looks different.
+
+    Views that do not show where it differs leave open which of these poses it has.
 
     Args:
         surface: of a thing.
-        motions: of the copies, in the frame of the surface, (N, 4, 4), metres.
 
     Returns:
-        (N,) bool.
+        Axes and orders as those of symmetries, which are among them.
     """
-    rng = np.random.default_rng(0)
-    tree = cKDTree(surface.sample(SYMMETRY_POINTS, rng))
-    points = surface.sample(TURNED_POINTS, rng)
-    there = points @ motions[:, :3, :3].swapaxes(1, 2) + motions[:, None, :3, 3]
-    back = (points - motions[:, None, :3, 3]) @ motions[:, :3, :3]
-    apart = np.stack([tree.query(moved)[0] for moved in (there, back)])
-    worst = np.quantile(apart, COMPARED_SHARE, axis=2).max(0)
-    return np.asarray(worst < _tolerance(surface))
+    compared = _Compared(surface)
+    found = []
+    for axis in _axes(surface):
+        order, deviation, fitted = _order(compared, axis, "nearly")
+        if order != 1:
+            found.append((order, deviation, fitted))
+    found.sort(key=lambda item: (item[0] != 0, -item[0], item[1]))
+    return tuple(_distinct((axis, order) for order, _, axis in found))
 
 
-def _tolerance(surface: Surface) -> float:
-    """Distance of two surfaces that a depth camera does not see, metres."""
-    return max(LEAST_TOLERANCE, SYMMETRY_TOLERANCE * surface.diameter)
+@dataclass(frozen=True, eq=False)
+class _Turned:
+    """A surface beside its turned copy.
+
+    Attributes:
+        median: distance of the points of the copy from the surface, metres.
+        same: whether hardly any of it lies beside.
+        nearly: whether little of it lies beside.
+        axis: about which it was turned, corrected to where it fits best, (3,).
+    """
+
+    median: float
+    same: bool
+    nearly: bool
+    axis: Float
 
 
-def _half_turn_across(
-    tree: cKDTree,
-    points: Float,
-    axis: Float,
-    tolerance: float,
-) -> list[Symmetry]:
+class _Compared:
+    """What can be seen of a surface, which its turned copies are compared with.
+
+    Its centroid is the origin.
+    """
+
+    def __init__(self, surface: Surface) -> None:
+        rng = np.random.default_rng(0)
+        self.diameter = surface.diameter
+        self._triangles = surface.triangles_by_area(SAMPLE_POINTS, rng)
+        self._corners = (
+            surface.vertices[surface.faces].astype(np.float64) - surface.centroid
+        )
+        shares = rng.dirichlet(np.ones(3), SAMPLE_POINTS)
+        self._points = np.einsum("nk,nki->ni", shares, self._corners[self._triangles])
+        corners = self._corners[self._triangles]
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        lengths = np.linalg.norm(across, axis=1, keepdims=True)
+        self._normals = across / lengths.clip(1e-30)
+
+        seen = self._seen(surface)
+        self._triangles = self._triangles[seen]
+        self._points = self._points[seen]
+        self._normals = self._normals[seen]
+        self._tree = cKDTree(self._points)
+
+    def _seen(self, surface: Surface) -> Mask:
+        """Which of the points a camera can see from outside, (N,): not faces inside of a solid."""
+        scene = embree_scene(
+            [(self._corners.reshape(-1, 3), _each_on_its_own(surface))]
+        )
+        seen = np.zeros(len(self._points), bool)
+        above = ABOVE * self.diameter * self._normals
+        for direction in spread_directions(SEEN_FROM):
+            side = np.sign(self._normals @ direction)[:, None]
+            hidden = scene.run(
+                (self._points + side * above).astype(np.float32),
+                np.tile(direction.astype(np.float32), (len(self._points), 1)),
+                output=1,
+            )["primID"]
+            seen |= hidden < 0
+        return seen if seen.any() else ~seen
+
+    def turned(self, axis: Float, turn: float) -> _Turned:
+        """Compare with the copy that is turned about an axis by a part of a full turn."""
+        rotation = Rotation.from_rotvec(2 * np.pi * turn * axis)
+        guess = self._tree.query(rotation.apply(self._points[:GUESSED_POINTS]))[0]
+        if np.quantile(guess, GUESSED_SHARE) > GUESSED_DISTANCE * self.diameter:
+            return _Turned(float(np.median(guess)), False, False, axis)
+
+        rotation = self._fitted(rotation, axis)
+        distances = self._distances(rotation.apply(self._points[:COPIED_POINTS]))
+        distances /= self.diameter
+        median = float(np.median(distances))
+        usual = SYMMETRY_TOLERANCE + USUAL_ERRORS * median
+        local = min(SYMMETRY_TOLERANCE + LOCAL_ERRORS * median, LARGEST_LOCAL_ERROR)
+        beside = float((distances > usual).mean())
+        same = (
+            median < SAME_MEDIAN
+            and beside < USUAL_SHARE
+            and (distances > local).mean() < MOVED_SHARE
+        )
+        nearly = median < NEAR_MEDIAN and beside < NEAR_SHARE
+        vector = rotation.as_rotvec()
+        return _Turned(
+            median * self.diameter,
+            bool(same),
+            nearly,
+            vector / np.linalg.norm(vector),
+        )
+
+    def _fitted(self, rotation: Rotation, axis: Float) -> Rotation:
+        """Tilt a turned copy to where it fits best, without turning it farther about the axis.
+
+        Point to plane, by the nearest sampled points; what lies beside hardly counts.
+        """
+        points = self._points[: COPIED_POINTS // 3]
+        first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+        first /= np.linalg.norm(first)
+        across = np.stack([first, np.cross(axis, first)])
+        for _ in range(FITTED_STEPS):
+            copy = rotation.apply(points)
+            apart, nearest = self._tree.query(copy)
+            normals = self._normals[nearest]
+            along = np.einsum("ni,ni->n", self._points[nearest] - copy, normals)
+            weights = np.asarray(
+                1 / (1 + (apart / (np.median(apart) + LEAST_APART)) ** 2)
+            )
+            tilting = np.cross(copy, normals) @ across.T
+            left = (tilting * weights[:, None]).T @ tilting
+            # Of a ball nothing is drawn anywhere.
+            left += FREE_TILT * weights.sum() * self.diameter**2 * np.eye(2)
+            change = np.linalg.solve(left, tilting.T @ (weights * along))
+            rotation = Rotation.from_rotvec(change @ across) * rotation
+        return rotation
+
+    def _distances(self, points: Float) -> Float:
+        """Distances of points from the surface, (N,), metres."""
+        nearest = self._tree.query(points, k=NEAREST_TRIANGLES)[1]
+        corners = self._corners[self._triangles[nearest]]
+        return _from_triangles(points[:, None], corners).min(1)
+
+
+def _each_on_its_own(surface: Surface) -> NDArray[np.int32]:
+    """Triangles, (F, 3), of as many corners one after the other."""
+    return np.arange(3 * len(surface.faces), dtype=np.int32).reshape(-1, 3)
+
+
+def _from_triangles(points: Float, corners: Float) -> Float:
+    """Distances of points, (N, 1, 3), from triangles, (N, K, 3, 3): (N, K)."""
+    first = corners[..., 0, :]
+    edges = corners[..., 1:, :] - corners[..., :1, :]
+    normal = np.cross(edges[..., 0, :], edges[..., 1, :])
+    square = np.maximum((normal**2).sum(-1), 1e-30)
+    to_point = points - first
+    # Barycentric coordinates of the foot of the perpendicular.
+    second = (np.cross(to_point, edges[..., 1, :]) * normal).sum(-1) / square
+    third = (np.cross(edges[..., 0, :], to_point) * normal).sum(-1) / square
+    inside = (second >= 0) & (third >= 0) & (second + third <= 1)
+    above = np.abs((to_point * normal).sum(-1)) / np.sqrt(square)
+
+    beside = np.full(above.shape, np.inf)
+    for start, end in ((0, 1), (1, 2), (2, 0)):
+        edge = corners[..., end, :] - corners[..., start, :]
+        from_start = points - corners[..., start, :]
+        length = np.maximum((edge**2).sum(-1), 1e-30)
+        share = np.clip((from_start * edge).sum(-1) / length, 0, 1)
+        apart = np.linalg.norm(from_start - share[..., None] * edge, axis=-1)
+        beside = np.minimum(beside, apart)
+    return np.where(inside, above, beside)
+
+
+def _half_turn_across(compared: _Compared, axis: Float) -> list[Symmetry]:
     """A symmetry of half a turn about an axis across another one; its direction may be any."""
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     first /= np.linalg.norm(first)
     angles = np.arange(0, np.pi, STEP_ACROSS)[:, None]
     across = np.cos(angles) * first + np.sin(angles) * np.cross(axis, first)
-    deviations = [_deviation(tree, points, direction, 0.5) for direction in across]
+    turned = [compared.turned(direction, 0.5) for direction in across]
 
-    best = int(np.argmin(deviations))
-    return [_symmetry(across[best], 2)] if deviations[best] < tolerance else []
+    best = min(turned, key=lambda one: (not one.same, one.median))
+    return [_symmetry(best.axis, 2)] if best.same else []
 
 
 def _is_ball(axes: Sequence[Float]) -> bool:
@@ -119,10 +281,24 @@ def _is_ball(axes: Sequence[Float]) -> bool:
     return any(abs(axis @ axes[0]) < np.cos(AXIS_TOLERANCE) for axis in axes)
 
 
-def _axes(surface: Surface, points: Float) -> Float:
-    """Unit vectors that are tried, (N, 3)."""
-    principal = np.linalg.eigh(np.cov(points.T))[1].T
-    return np.concatenate([np.eye(3), principal, _box_axes(surface)])
+def _axes(surface: Surface) -> list[Float]:
+    """Unit vectors that are tried, (3,) each."""
+    tried: list[Float] = []
+    for axis in np.concatenate([np.eye(3), _box_axes(surface), _principal(surface)]):
+        if all(abs(axis @ other) < np.cos(SAME_CANDIDATE) for other in tried):
+            tried.append(axis)
+    return tried
+
+
+def _principal(surface: Surface) -> Float:
+    """The principal axes of a surface, (3, 3), exactly: also where two moments nearly agree."""
+    corners = surface.vertices[surface.faces].astype(np.float64) - surface.centroid
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(across, axis=1)
+    total = corners.sum(1)
+    moments = np.einsum("f,fki,fkj->ij", areas, corners, corners)
+    moments += np.einsum("f,fi,fj->ij", areas, total, total)
+    return np.linalg.eigh(moments)[1].T
 
 
 def _box_axes(surface: Surface) -> Float:
@@ -140,40 +316,55 @@ def _box_axes(surface: Surface) -> Float:
 
 
 def _order(
-    tree: cKDTree,
-    points: Float,
+    compared: _Compared,
     axis: Float,
-    tolerance: float,
-) -> tuple[int, float]:
-    """The highest order of a symmetry about an axis, and how exact it is, metres.
+    kind: Literal["same", "nearly"],
+) -> tuple[int, float, Float]:
+    """The highest order of a symmetry about an axis, how exact it is, metres, and the axis.
 
     The order is 0 for any angle, and 1 for none.
     """
-    deviations: dict[Fraction, float] = {}
-    found = (1, np.inf)
-    for order in range(2, HIGHEST_ORDER + 1):
+    worst = _all_same(compared, axis, ANY_TURNS, kind)
+    if worst is not None:
+        return 0, worst.median, worst.axis
+
+    # Turns by 1/4 and 1/3 of a full one make one by 1/12: powers of primes are tried, and of what
+    # they make up the highest order first.
+    finest = {
+        power: getattr(compared.turned(axis, 1 / power), kind) for power in POWERS
+    }
+    for order in range(HIGHEST_ORDER, 1, -1):
+        if not all(same for power, same in finest.items() if _part(power, order)):
+            continue
         # A turn back is as good as one forth.
-        turns = [Fraction(k, order) for k in range(1, order // 2 + 1)]
-        for turn in turns:
-            if turn not in deviations:
-                deviations[turn] = _deviation(tree, points, axis, float(turn))
-        worst = max(deviations[turn] for turn in turns)
-        if worst < tolerance:
-            found = (order, worst)
-
-    if max(deviations.values()) < tolerance:
-        worst = max(_deviation(tree, points, axis, turn) for turn in ANY_TURNS)
-        if worst < tolerance:
-            return 0, worst
-    return found
+        worst = _all_same(compared, axis, np.arange(order // 2, 0, -1) / order, kind)
+        if worst is not None:
+            return order, worst.median, worst.axis
+    return 1, np.inf, axis
 
 
-def _deviation(tree: cKDTree, points: Float, axis: Float, turn: float) -> float:
-    """How far a surface and its copy, by a part of a full turn, are apart, metres."""
-    from scipy.spatial.transform import Rotation
+def _part(power: int, order: int) -> bool:
+    """Whether a power of a prime is one of the factors of an order that have no part in common."""
+    return order % power == 0 and np.gcd(power, order // power) == 1
 
-    rotation = Rotation.from_rotvec(2 * np.pi * turn * axis).as_matrix()
-    return float(np.quantile(tree.query(points @ rotation.T)[0], COMPARED_SHARE))
+
+def _all_same(
+    compared: _Compared,
+    axis: Float,
+    turns: Float,
+    kind: Literal["same", "nearly"],
+) -> _Turned | None:
+    """The largest of some turns, with the worst median, where all are symmetries; else None."""
+    largest = compared.turned(axis, float(turns[0]))
+    if not getattr(largest, kind):
+        return None
+    worst = largest.median
+    for turn in turns[1:]:
+        other = compared.turned(largest.axis, float(turn))
+        if not getattr(other, kind):
+            return None
+        worst = max(worst, other.median)
+    return _Turned(worst, largest.same, largest.nearly, largest.axis)
 
 
 def _distinct(found: Iterable[tuple[Float, int]]) -> list[Symmetry]:
@@ -181,6 +372,8 @@ def _distinct(found: Iterable[tuple[Float, int]]) -> list[Symmetry]:
     kept: list[Symmetry] = []
     across = False  # whether an axis across one of any angle is there already
     for axis, order in found:
+        if len(kept) == MOST_AXES:
+            break
         alike = np.abs([axis @ np.array(other.axis) for other in kept])
         if (alike > np.cos(AXIS_TOLERANCE)).any():
             continue

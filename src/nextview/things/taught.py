@@ -14,7 +14,7 @@ from nextview.recognition.model_card import Verification
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
 from nextview.things.unknown import KnownResiduals
-from nextview.things.verifier import Verified, Verifier
+from nextview.things.verifier import Verified, Verifier, rival_turns
 from nextview.things.weighing import EvidenceWeights
 from nextview.types import Float, Floats
 
@@ -79,6 +79,10 @@ class TaughtThings:
             about.things[known[name]].symmetries for name in self.names
         )
         self.verifier = Verifier(surfaces, owners, memory.rotations[self.rows], weights)
+        self.verifier.rivals = tuple(
+            rival_turns(about.things[known[name]].near_symmetries)
+            for name in self.names
+        )
         self.any_orientation = False
 
     @classmethod

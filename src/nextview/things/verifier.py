@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from nextview.errors import ModelError, ObservationError
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import rotation_z
+from nextview.recognition.model_card import Symmetry
 from nextview.things.below_ground import BelowGround, below_ground
 from nextview.things.depth_view import DepthView, MetricImage
 from nextview.things.ground import levelling
@@ -27,6 +28,7 @@ from nextview.things.registration import (
     different_poses,
     joined,
     render,
+    rotations_of,
     start,
 )
 from nextview.things.stranger import Comparison, log_odds_of_stranger
@@ -53,6 +55,8 @@ AROUND_STEPS = 24  # azimuths: a small part of a round body shows at one of them
 AROUND_PEAKS = 2  # of these azimuths that are aligned, for each thing
 
 
+RIVAL_STEPS = 24  # in which a thing of which any turn is nearly a symmetry is turned
+
 UNUSUAL = 0.01  # as likely beforehand as a known resting pose is any other orientation
 
 
@@ -67,6 +71,8 @@ class Stage:
         hopeless: a hypothesis that is by so much less likely than the best one, as a logarithm, is
             given up.
         around: whether the likeliest things are also tried at azimuths all around afterwards.
+        rivals: whether the likeliest hypothesis is also tried in the poses that a near symmetry
+            leads to.
     """
 
     side: int
@@ -74,12 +80,13 @@ class Stage:
     most: int
     hopeless: float
     around: bool = False
+    rivals: bool = False
 
 
 FINE_SIDE = 40  # rows and columns of pixels that survivors are judged by
 VERIFICATION_STAGES = (
     Stage(16, FIRST, 24, 50.0, around=True),
-    Stage(24, COARSE_LEVELS, 12, 25.0),
+    Stage(24, COARSE_LEVELS, 12, 25.0, rivals=True),
     Stage(FINE_SIDE, FINE, 12, np.inf),
 )
 TILTED_STAGES = tuple(
@@ -240,6 +247,8 @@ class Verifier:
         owners: thing of each hypothesis, (H,) int64. A hypothesis is a thing in a resting pose.
         rotations: from the axes of the scan file into the resting pose, (H, 3, 3) float64.
         weights: how much each kind of evidence counts.
+        rivals: of each thing the turns about its centroid after which it hardly looks different,
+            (N, 3, 3) float64; () where none are known.
     """
 
     def __init__(
@@ -276,6 +285,7 @@ class Verifier:
         self.weights = weights
         self.pixels = pixels
         self.prior = prior
+        self.rivals: tuple[Float, ...] = ()
 
     def __call__(self, observations: Sequence[Observation], joint: Float) -> Verified:
         """Align what is likely with all views, and judge it.
@@ -467,6 +477,12 @@ class Verifier:
                 proposed = proposed.select(
                     np.concatenate([np.arange(len(rows)), source])
                 )
+            if stage.rivals and self.rivals:
+                turned = self._rivals(alignment)
+                alignment = joined(alignment, turned)
+                proposed = proposed.select(
+                    np.r_[np.arange(len(rows)), np.zeros(len(turned), int)]
+                )
 
         return self._verified(
             proposed,
@@ -529,6 +545,20 @@ class Verifier:
         ]
         return some.select(rows), source[rows]
 
+    def _rivals(self, alignment: Alignment) -> Alignment:
+        """The first hypothesis in the poses in which its thing hardly looks different."""
+        thing = int(alignment.things[0])
+        turns = self.rivals[thing]
+        some = alignment.select(np.zeros(len(turns), np.int64))
+        surface = self.caster.surfaces[thing]
+        arm = surface.centroid - surface.centre
+        rotations = some.rotations @ turns
+        fixed = some.centres + some.rotations @ arm
+        ups = np.einsum("nji,nj->ni", turns, some.ups)
+        return replace(
+            some, ups=ups, rotations=rotations, centres=fixed - rotations @ arm
+        )
+
     def _judge(
         self,
         alignment: Alignment,
@@ -584,6 +614,17 @@ class Verifier:
             seen_behind=behind / np.maximum(visible, 1),
             below=self._below(alignment, views).depth,
         )
+
+
+def rival_turns(symmetries: Sequence[Symmetry]) -> Float:
+    """Turns that near symmetries lead to, without that by nothing, (N, 3, 3)."""
+    vectors = [
+        2 * np.pi * step / steps * np.array(one.axis)
+        for one in symmetries
+        for steps in [one.order or RIVAL_STEPS]
+        for step in range(1, steps)
+    ]
+    return rotations_of(np.array(vectors)) if vectors else np.zeros((0, 3, 3))
 
 
 def _levelled(
