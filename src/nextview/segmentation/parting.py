@@ -21,7 +21,7 @@ THING_CLASS = OUTPUT_CLASSES.index("thing")
 BACKGROUND_CLASS = OUTPUT_CLASSES.index("background")
 SURFACE_CLASS = OUTPUT_CLASSES.index("surface")
 # added to all log-odds: the training counts pairs of different things four times
-JOINING_ODDS = 0.7
+JOINING_ODDS = 1.05
 # of a pair, below which the network is in doubt whether to join: pieces are joined above it
 DOUBTFUL_ODDS = 2.0
 LIMIT_OF_ODDS = 4.0  # log-odds of one pair beyond which it says no more

@@ -69,6 +69,7 @@ class ObjectState:
         warnings: about the latest frame.
         revision: how often the object frame changed.
         parting: what of the segmentation is the object.
+        partings: by which the latest frame shows it in other pixels.
     """
 
     frame: ObjectFrame | None = None
@@ -77,6 +78,7 @@ class ObjectState:
     warnings: tuple[ViewWarning, ...] = ()
     revision: int = 0
     parting: Parting = "instance"
+    partings: tuple[Parting, ...] = ()
 
 
 class ObservedObject:
@@ -184,21 +186,15 @@ class ObservedObject:
         Args:
             p_value: of some views of it as views of a known thing.
         """
-        if self.known is not None or not self.support:
-            return
-        others = [
-            parting for parting in get_args(Parting) if parting != self.state.parting
-        ]
         found = [self.state]
-        for parting in others:
+        for parting in self.state.partings:
             other = copy(self)
             revision = self.revision + 1
             other.state = ObjectState(self.known, revision=revision, parting=parting)
             with suppress(ObservationError):
                 for sighting in self.sightings:
                     other.add(sighting.frame_as_given)
-                if _differ(other.sightings, self.sightings):
-                    found.append(other.state)
+                found.append(other.state)
         if len(found) > 1:
             values = [p_value(state.observations) for state in found]
             self.state = found[int(np.argmax(values))]
@@ -216,7 +212,14 @@ class ObservedObject:
         if self.support:
             instances = self._instances(frame, up)
             supports = Supports.of(frame, instances.masks, instances.surface, noise, up)
-        pixels = self._pixels(frame, supports, instances)
+        parting = before.parting
+        pixels = self._pixels(frame, supports, instances, parting)
+        partings = tuple(
+            other
+            for other in get_args(Parting)
+            if other != parting
+            and _differ(pixels, self._pixels(frame, supports, instances, other))
+        )
         plane = self._plane_under(pixels, frame, noise, supports, up)
         if up is None and plane is None:
             raise ObservationError(
@@ -241,7 +244,7 @@ class ObservedObject:
         if not any(warning.holds for warning in warnings):
             warnings += plausibility.check_last_view(after.observations)
         warnings += plausibility.check_place(displaced)
-        return replace(after, warnings=tuple(warnings))
+        return replace(after, warnings=tuple(warnings), partings=partings)
 
     def take_sightings(self, sightings: Sequence[Sighting], up: Float) -> None:
         """Know the object by some sightings, whatever was known of it before.
@@ -307,6 +310,7 @@ class ObservedObject:
         frame: Frame,
         supports: Supports | None,
         instances: Instances | None,
+        parting: Parting,
     ) -> Mask:
         """Where the object is: in the mask, in its box or sphere, or an instance, (H, W) bool.
 
@@ -323,10 +327,8 @@ class ObservedObject:
             )
         if supports is None or instances is None:
             raise ObservationError(NO_OUTLINE)
-        state = self.state
-        return choose_instance(
-            supports, self.point, state.frame, state.parting, instances.pieces
-        )
+        known = self.state.frame
+        return choose_instance(supports, self.point, known, parting, instances.pieces)
 
     def _plane_under(
         self,
@@ -447,11 +449,6 @@ def _same(new: ObjectFrame, old: ObjectFrame) -> bool:
     )
 
 
-def _differ(some: Sequence[Sighting], others: Sequence[Sighting]) -> bool:
-    """Whether some frames show an object in other pixels."""
-    pairs = zip(some, others, strict=True)
-    return any(
-        np.count_nonzero(one.mask != other.mask)
-        > OTHER_SHARE * np.count_nonzero(other.mask)
-        for one, other in pairs
-    )
+def _differ(one: Mask, other: Mask) -> bool:
+    """Whether two sets of pixels, (H, W) bool, differ by more than noise."""
+    return bool(np.count_nonzero(one != other) > OTHER_SHARE * np.count_nonzero(one))

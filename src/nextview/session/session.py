@@ -669,7 +669,7 @@ class Session:
                 object.state = repeated
             else:
                 object.add(frame)
-                if self.unknown and frame.mask is None:
+                if self.unknown and object.state.partings:
                     self._part(object)
 
             self._refuse_disagreement(object)
