@@ -273,8 +273,23 @@ class ObservedObject:
         warnings += plausibility.check_observation(observations[number])
         if not any(warning.holds for warning in warnings):
             last = range(len(observations))[number]
-            warnings += plausibility.check_last_view(observations[: last + 1])
+            found = plausibility.check_last_view(observations[: last + 1])
+            if found:  # errors of the poses alone are no contradiction
+                found = plausibility.check_last_view(self._without_displacements(last))
+            warnings += found
         return tuple(warnings)
+
+    def _without_displacements(self, last: int) -> list[Observation]:
+        """The observations up to one, as if no pose displaced the object."""
+        first, *others = self.state.sightings[: last + 1]
+        mended = [first]
+        for sighting in others:
+            displaced = displacement(sighting, mended)
+            if displaced is not None and displaced.mended:
+                sighting = sighting.shifted(-displaced.shift)
+            mended.append(sighting)
+        frame = self.object_frame
+        return [observation_of(one, frame, self.life_size) for one in mended]
 
     @property
     def _known_frames(self) -> KnownFrames:
