@@ -97,8 +97,8 @@ def test_what_is_learned_of_a_picture():
     assert example.features.shape[1:] == example.classes.shape == (32, 32)
     assert (example.classes[20:] == -1).all()
     assert example.classes[[0, 4, 4], [0, 5, 11]].tolist() == [1, 2, 2]
-    right = AFFINITY_STEPS.index((0, 3))
-    assert example.same[right, 5, 5:11].tolist() == [1, 1, 1, 0, 0, 0]
+    right = AFFINITY_STEPS.index((0, 4))
+    assert example.same[right, 5, 5:11].tolist() == [1, 1, 0, 0, 0, 0]
     large, small = (
         24**-0.5,
         12**-0.5,

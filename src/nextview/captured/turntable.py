@@ -68,7 +68,7 @@ def read_turntable(folder: Path, turn: str) -> Capture:
     ]
     shown = []
     for frame in frames:
-        thing = ObservedObject()
+        thing = ObservedObject(parting="touching")
         try:
             thing.add(Frame(frame.read().depth, k))
         except ObservationError as error:

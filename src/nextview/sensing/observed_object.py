@@ -107,6 +107,8 @@ class ObservedObject:
             evidence of the class.
         segmentation: that tells the things in frames, see ``nextview.Scene``; None for the bundled
             network.
+        parting: what of the segmentation is the object: an "instance"; or, as for a thing that
+            stands alone, one with all that is "touching" it; or a "piece" of one.
     """
 
     def __init__(
@@ -119,6 +121,7 @@ class ObservedObject:
         denoise: bool = True,
         life_size: bool = True,
         segmentation: Segmenter | None = None,
+        parting: Parting = "instance",
     ) -> None:
         if sum(asked is not None for asked in (point, box, known)) > 1:
             raise UsageError(
@@ -133,7 +136,7 @@ class ObservedObject:
         self.denoise = denoise
         self.life_size = life_size
         self.segmentation = segmentation
-        self.state = ObjectState(self.known)
+        self.state = ObjectState(self.known, parting=parting)
 
     @property
     def object_frame(self) -> ObjectFrame:
