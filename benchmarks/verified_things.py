@@ -66,9 +66,8 @@ Float = NDArray[np.float64]
 
 SPHERE = ViewSphere((0.0, 18.0, 36.0, 54.0, 72.0), 8)
 Poses = Literal["scanned", "thrown", "stood"]
-STABLE = (
-    0.001  # share of the throws that end in a pose in which people can stand a thing
-)
+# share of the throws that end in a pose in which people can stand a thing
+STABLE = 0.001
 CONFIDENT = 0.97
 REJECTED = 0.02  # p-value below which a thing is called unknown
 POINTS = 1000  # of a surface, for symmetries and ADD-S

@@ -14,7 +14,7 @@ from nextview.captured.frames import Capture, CapturedFrame
 from nextview.errors import DatasetError, NoViewLeftError, ObservationError, UsageError
 from nextview.geometry.axes import upright_axes
 from nextview.geometry.viewsphere import angle_between
-from nextview.sensing.choosing import Parting
+from nextview.sensing.choosing import ALONE
 from nextview.sensing.frame import Frame
 from nextview.sensing.object_frame import Box, ObjectFrame
 from nextview.sensing.observed_object import ObservedObject
@@ -26,7 +26,6 @@ UP = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 PIXELS_AROUND_CENTRE = 3
 # object radii before its centre from which something else hides it
 HIDING_DISTANCE = 1.5
-CAPTURED_PARTING: Parting = "touching"  # what is captured stands alone
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ class CapturedCamera:
         same: dict[str, Any] = {
             "denoise": denoise,
             "life_size": life_size,
-            "parting": CAPTURED_PARTING,
+            "parting": ALONE,
         }
         if box is not None:
             up = box.axes[2] if up is None else up
@@ -195,7 +194,7 @@ class CapturedCamera:
         """About where the object is."""
         reason = ""
         for frame in self.capture.frames:
-            thing = ObservedObject(up, point, parting=CAPTURED_PARTING)
+            thing = ObservedObject(up, point, parting=ALONE)
             try:
                 thing.add(frame.read(self._masked))
             except (DatasetError, ObservationError) as error:

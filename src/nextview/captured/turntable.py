@@ -21,6 +21,7 @@ from nextview.errors import DatasetError, ObservationError
 from nextview.geometry.axes import upright_axes
 from nextview.geometry.viewsphere import rotation_z
 from nextview.sensing import Frame, ObservedObject
+from nextview.sensing.choosing import ALONE
 from nextview.sensing.object_frame import smallest_circle
 from nextview.types import Float
 
@@ -68,7 +69,7 @@ def read_turntable(folder: Path, turn: str) -> Capture:
     ]
     shown = []
     for frame in frames:
-        thing = ObservedObject(parting="touching")
+        thing = ObservedObject(parting=ALONE)
         try:
             thing.add(Frame(frame.read().depth, k))
         except ObservationError as error:

@@ -25,9 +25,8 @@ JOINING_ODDS = 1.05
 # of a pair, below which the network is in doubt whether to join: pieces are joined above it
 DOUBTFUL_ODDS = 2.0
 LIMIT_OF_ODDS = 4.0  # log-odds of one pair beyond which it says no more
-EDGE_SHARPNESS = (
-    60.0  # steps of a sixtieth of the depth count as much as a pixel of the picture
-)
+# steps of a sixtieth of the depth count as much as a pixel of the picture
+EDGE_SHARPNESS = 60.0
 SCRAP_PIXELS = 16  # of an instance that is none of its own, but a piece of an edge
 # of all neighbours around a pixel, to be joined before all others; and of what is background
 CERTAIN_ODDS = 2.0

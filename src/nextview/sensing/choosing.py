@@ -20,6 +20,8 @@ Parting = Literal["instance", "touching", "piece"]
 """What of the segmentation is one object: an instance; an instance with all that touches it; or a
 piece of one."""
 
+# of a thing that stands alone: what touches it belongs to it
+ALONE: Parting = "touching"
 NO_INSTANCE = (
     "the segmentation finds nothing {where} in this frame: check its pose, aim the camera at the"
     " object, or give a mask"

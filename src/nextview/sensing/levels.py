@@ -33,17 +33,14 @@ from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
 from nextview.types import Float, Mask
 
 MOST_LEVELS = 6
-LEAST_LEFT = (
-    0.003  # share of all surface pixels below which no further level is looked for
-)
+# share of all surface pixels below which no further level is looked for
+LEAST_LEFT = 0.003
 OUTLINE_MARGIN = 0.05  # metres around what is seen of a surface that may be hidden
 INSTANCE_POINTS = 500  # points of an instance that are compared with levels
-MOST_INSIDE = (
-    0.5  # share of an instance's points that lie over what carries it, at least
-)
-BOTTOM_SHARE = (
-    0.04  # share of an instance's points that may lie lower than its bottom: noise
-)
+# share of an instance's points that lie over what carries it, at least
+MOST_INSIDE = 0.5
+# share of an instance's points that may lie lower than its bottom: noise
+BOTTOM_SHARE = 0.04
 # height over a plane of the bottom of what stands on it, as a part of the distance, at most
 BOTTOM_MARGIN = 0.02
 # neighbouring pixels of one surface differ by at most this part of their depth, and noise

@@ -217,12 +217,14 @@ class ObservedObject:
             supports = Supports.of(frame, instances.masks, instances.surface, noise, up)
         parting = before.parting
         pixels = self._pixels(frame, supports, instances, parting)
-        partings = tuple(
-            other
-            for other in get_args(Parting)
-            if other != parting
-            and _differ(pixels, self._pixels(frame, supports, instances, other))
-        )
+        partings: tuple[Parting, ...] = ()
+        if frame.mask is None and self.known is None:
+            partings = tuple(
+                other
+                for other in get_args(Parting)
+                if other != parting
+                and _differ(pixels, self._pixels(frame, supports, instances, other))
+            )
         plane = self._plane_under(pixels, frame, noise, supports, up)
         if up is None and plane is None:
             raise ObservationError(

@@ -24,23 +24,19 @@ from nextview.simulation.sensor import SENSORS, Sensor
 from nextview.simulation.solids import Solid, moved, random_solid, tube
 from nextview.types import Float, Float32, Index, Mask
 
-SURFACE = (
-    -1
-)  # label of what carries things: table tops, floors, boards, the bottoms of bins
-BACKGROUND = (
-    -2
-)  # label of all else that is no thing: walls, sides of bins, people, grippers
+# label of what carries things: table tops, floors, boards, the bottoms of bins
+SURFACE = -1
+# label of all else that is no thing: walls, sides of bins, people, grippers
+BACKGROUND = -2
 HOLE = -3  # label of a pixel without depth
 
 MAP_CELLS = 160  # cells on each side of a height map
 DROPS_TRIED = 25
-CONTACT_RAYS = (
-    1500  # by which it is found how far a solid can be pushed, from each side
-)
+# by which it is found how far a solid can be pushed, from each side
+CONTACT_RAYS = 1500
 STACKED = 0.5  # share of piled things that are put on the last one
-ALIGNED = (
-    0.4  # share of levels whose things are turned by quarters, so that their sides meet
-)
+# share of levels whose things are turned by quarters, so that their sides meet
+ALIGNED = 0.4
 STEPS_OUTWARDS = 60
 SMALL_FURNITURE = 0.8  # metres: a monitor or a night stand
 RAISED = 0.7  # share of small furniture that stands on other furniture, if there is any

@@ -44,12 +44,10 @@ from nextview.types import Float
 
 # of the things that a scan explains best: so many are another thing of its shape
 STRANGERS = 1 / 3
-UNLIKE = (
-    0.2  # deviation of the logarithm by which a stranger is stretched along each axis
-)
-CAMERA_SCALE = (
-    0.015  # by which part of its size a camera sees everything larger or smaller
-)
+# deviation of the logarithm by which a stranger is stretched along each axis
+UNLIKE = 0.2
+# by which part of its size a camera sees everything larger or smaller
+CAMERA_SCALE = 0.015
 # metres by which a thing that stands on the ground is seen above or below it
 BOTTOM_NOISE = 0.004
 ON_OTHERS = 0.1  # share of the things that stand on something else

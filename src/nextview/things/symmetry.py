@@ -52,9 +52,8 @@ GUESSED_SHARE = 0.9
 GUESSED_DISTANCE = 0.06  # of the diameter, that is near
 NEAREST_TRIANGLES = 4  # among which the nearest one is looked for
 FITTED_STEPS = 5  # in which a turned copy is moved to where it fits
-FREE_TILT = (
-    1e-3  # share of the weights that holds a tilt of which the surface says nothing
-)
+# share of the weights that holds a tilt of which the surface says nothing
+FREE_TILT = 1e-3
 LEAST_APART = 1e-9  # metres
 SEEN_FROM = 48  # directions from one of which a point has to be seen to count
 ABOVE = 1e-3  # of the diameter, that it is seen from above the surface
@@ -79,16 +78,10 @@ def find_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
         Its symmetries: first those of any angle, then the others by their order.
     """
     compared = _Compared(surface)
-    found = []
-    for axis in _axes(surface):
-        order, deviation, fitted = _order(compared, axis, "same")
-        if order != 1:
-            found.append((order, deviation, fitted))
-        if _is_ball([axis for order, _, axis in found if order == 0]):
-            return tuple(_symmetry(axis, 0) for axis in np.eye(3))
-
-    found.sort(key=lambda item: (item[0] != 0, -item[0], item[1]))
-    symmetries = _distinct((axis, order) for order, _, axis in found)
+    found = _found(compared, surface, "same")
+    if _is_ball([axis for axis, order in found if order == 0]):
+        return tuple(_symmetry(axis, 0) for axis in np.eye(3))
+    symmetries = _distinct(found)
     if len(symmetries) == 1:
         symmetries += _half_turn_across(compared, np.array(symmetries[0].axis))
     return tuple(symmetries)
@@ -105,14 +98,7 @@ def find_near_symmetries(surface: Surface) -> tuple[Symmetry, ...]:
     Returns:
         Axes and orders as those of symmetries, which are among them.
     """
-    compared = _Compared(surface)
-    found = []
-    for axis in _axes(surface):
-        order, deviation, fitted = _order(compared, axis, "nearly")
-        if order != 1:
-            found.append((order, deviation, fitted))
-    found.sort(key=lambda item: (item[0] != 0, -item[0], item[1]))
-    return tuple(_distinct((axis, order) for order, _, axis in found))
+    return tuple(_distinct(_found(_Compared(surface), surface, "nearly")))
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,6 +265,24 @@ def _half_turn_across(compared: _Compared, axis: Float) -> list[Symmetry]:
 def _is_ball(axes: Sequence[Float]) -> bool:
     """Whether some axes of symmetries of any angle are not all one."""
     return any(abs(axis @ axes[0]) < np.cos(AXIS_TOLERANCE) for axis in axes)
+
+
+def _found(
+    compared: _Compared,
+    surface: Surface,
+    kind: Literal["same", "nearly"],
+) -> list[tuple[Float, int]]:
+    """Axes and orders of a kind of symmetry: any angle first, then high orders, then exact ones."""
+    found = []
+    for axis in _axes(surface):
+        order, deviation, fitted = _order(compared, axis, kind)
+        if order != 1:
+            found.append((order, deviation, fitted))
+        if kind == "same" and _is_ball([axis for order, _, axis in found if not order]):
+            break  # no axis of a ball differs from another one
+
+    found.sort(key=lambda item: (item[0] != 0, -item[0], item[1]))
+    return [(axis, order) for order, _, axis in found]
 
 
 def _axes(surface: Surface) -> list[Float]:

@@ -38,13 +38,11 @@ from nextview.things.view_templates import ViewTemplates
 from nextview.things.weighing import EvidenceWeights, JudgedEpisode
 from nextview.types import Float, Floats, Index
 
-ANY_TILT = (
-    0.3  # radians by which a thing in any orientation is off its proposal: hardly held
-)
+# radians by which a thing in any orientation is off its proposal: hardly held
+ANY_TILT = 0.3
 TILTED_PROPOSALS = 120  # of things in any orientation, of all views together
-AGAINST_FEATURES = (
-    0.1  # misfit for each unit of log-belief that features hold against a thing
-)
+# misfit for each unit of log-belief that features hold against a thing
+AGAINST_FEATURES = 0.1
 TINY = 1e-300  # belief that has a logarithm
 LEAST_BY_FEATURES = 0.01  # belief by features below which it does not matter
 AROUND_LEVELS = (
