@@ -9,11 +9,12 @@ union, depths by the mean squared difference where both show, and sizes by the r
 outlines. All of it is a few matrix products.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.geometry.viewsphere import rotation_z
@@ -29,6 +30,7 @@ RENDERING_PIXELS = 28  # rows and columns of pixels of a rendering
 TEMPLATE_DISTANCE = 5.0  # of the camera from the centre, radii
 MOST_ORIENTATIONS = 16  # of one thing that are proposed
 FEWEST_OUTLINE_PIXELS = 12  # of an outline that can be compared
+SPECK = 0.05  # of the largest part of an outline, below which a part is noise
 
 OUTLINE_WEIGHT = 8.0
 DEPTH_WEIGHT = 4.0
@@ -103,42 +105,61 @@ class ViewTemplates:
             np.array([one[2] for one in found]),
         )
 
-    def propose(self, image: MetricImage, count: int) -> OrientedProposals:
-        """The likeliest things and orientations, given what one view shows.
+    def propose(self, images: Sequence[MetricImage], count: int) -> OrientedProposals:
+        """The likeliest things and orientations, given what some views show.
+
+        Each view proposes orientations, of things that suit all of the views.
 
         Args:
-            image: the view.
-            count: number of proposals. One thing has at most MOST_ORIENTATIONS of them.
+            images: the views, of one thing.
+            count: number of proposals of all views together, of which at most MOST_ORIENTATIONS
+                are of one thing.
 
         Returns:
             The proposals; none where too little is seen.
         """
         known = int(self.things.max()) + 1
-        turned, look = seen(image)
-        if turned is None:
-            return OrientedProposals(
-                np.zeros(0, np.int64),
-                np.zeros((0, 3, 3)),
-                np.zeros(known),
-            )
+        views = [one for one in map(seen, images) if one is not None]
+        if not views:
+            nothing = np.zeros(0, np.int64)
+            return OrientedProposals(nothing, np.zeros((0, 3, 3)), np.zeros(known))
 
-        costs = mismatch(turned, self.pictures)
-        turn = costs.argmin(0)
-        best = costs[turn, np.arange(len(turn))]
-        of_things = np.full(known, np.inf)
-        np.minimum.at(of_things, self.things, best)
+        fits = [self._fit(pictures) for pictures, _ in views]
+        of_things = np.full((len(views), known), np.inf)
+        for row, (best, _) in enumerate(fits):
+            np.minimum.at(of_things[row], self.things, best)
+        together = of_things.sum(0)
 
-        order = np.argsort(best, kind="stable")
-        rank = _rank_within(self.things[order])
-        order = order[rank < MOST_ORIENTATIONS][:count]
-        rotations = (
-            look @ rotation_z(2 * np.pi * turn[order] / TURNS) @ self.rotations[order]
+        of_one = max(1, MOST_ORIENTATIONS // len(views))
+        things = []
+        rotations = []
+        for (best, turn), own, (_, look) in zip(fits, of_things, views, strict=True):
+            others = (together - own)[self.things]
+            order = np.argsort(best + others, kind="stable")
+            rank = rank_within(self.things[order])
+            order = order[rank < of_one][: max(1, count // len(views))]
+            turns = rotation_z(2 * np.pi * turn[order] / TURNS)
+            things.append(self.things[order])
+            rotations.append(look @ turns @ self.rotations[order])
+        return OrientedProposals(
+            np.concatenate(things),
+            np.concatenate(rotations),
+            -together / len(views),
         )
-        return OrientedProposals(self.things[order], rotations, -of_things)
+
+    def _fit(self, pictures: Pictures) -> tuple[Float32, Index]:
+        """Least cost of each template, and the turn in the image plane that has it, (N,) each."""
+        costs = mismatch(pictures, self.pictures)
+        turn = costs.argmin(0)
+        return costs[turn, np.arange(len(turn))], turn
 
 
-def _rank_within(things: Index) -> Index:
-    """How many earlier elements are the same, for each element, (N,)."""
+def rank_within(things: Index) -> Index:
+    """How many earlier elements are the same, for each element, (N,).
+
+    Args:
+        things: numbers, (N,).
+    """
     order = np.argsort(things, kind="stable")
     first = np.searchsorted(things[order], things[order])
     rank = np.empty(len(things), np.int64)
@@ -197,18 +218,18 @@ def _rendered(
             yield look, (picture[0][0], picture[1][0], picture[2])
 
 
-def seen(image: MetricImage) -> tuple[Pictures | None, Float]:
-    """What a view shows of the thing, turned in the image plane by so many angles.
+def seen(image: MetricImage) -> tuple[Pictures, Float] | None:
+    """What a view shows of the thing, turned in the image plane by TURNS angles.
 
     Returns:
-        The pictures, None where too little is seen; and the axes of a camera in the same place that
-        looks at the middle of the outline, columns, (3, 3), object frame.
+        The pictures; and the axes of a camera in the same place that looks at the middle of the
+        outline, columns, (3, 3), object frame. None where too little is seen.
     """
-    shown = image.kind == THING
+    shown = without_specks(image.kind == THING)
     focal = float(image.intrinsics[[0, 1], [0, 1]].mean())
     found = _picture(image.depth, shown, focal, 2 * np.pi * np.arange(TURNS) / TURNS)
     if found is None:
-        return None, np.eye(3)
+        return None
     outline, depth, size = found
 
     rows, columns = np.nonzero(shown)
@@ -217,6 +238,23 @@ def seen(image: MetricImage) -> tuple[Pictures | None, Float]:
     ahead = np.array([x, y, 1.0]) / np.sqrt(x**2 + y**2 + 1)
     look = image.pose[:3, :3] @ _from_z_to(ahead)
     return Pictures(outline, depth, np.full(TURNS, size)), look
+
+
+def without_specks(shown: Mask) -> Mask:
+    """Leave out parts of an outline that are far smaller than its largest: noise of the surface.
+
+    Args:
+        shown: pixels of a thing, (H, W).
+
+    Returns:
+        Pixels of its larger parts, (H, W).
+    """
+    parts, count = ndimage.label(shown, np.ones((3, 3), int))
+    if count < 2:
+        return shown
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    return (sizes >= SPECK * sizes.max())[parts]
 
 
 def _from_z_to(direction: Float) -> Float:
