@@ -194,6 +194,29 @@ def surface_view(frame: Frame, rng: np.random.Generator) -> SurfaceView:
     return SurfaceView(pictures, points, by_noise, standing)
 
 
+def quick_view(frame: Frame) -> SurfaceView:
+    """Prepare a frame for a comparison that has to be quick, by a small picture of it.
+
+    Args:
+        frame: its pose is not used; its mask neither, as all that it shows is compared.
+    """
+    side = max(1, frame.shape[1] // ROUGH.columns)
+    # The pixels that are kept lie in the corners of squares that become one pixel.
+    intrinsics = frame.intrinsics.copy()
+    intrinsics[:2, 2] -= 0.5
+    intrinsics[:2] /= side
+    intrinsics[:2, 2] += 0.5
+    small = Frame(frame.depth[::side, ::side].copy(), intrinsics, pixel_centre=0.5)
+
+    noise = noise_of(small)
+    points = _some(_surface_points(small), AGREEMENT_POINTS, np.random.default_rng(0))
+    depth = points[:, 2]
+    by_noise = NOISE_TOLERANCE * noise.at(depth) * depth**2
+    pictures = {ROUGH: _picture(small, ROUGH.columns)}
+    pictures[SHARP] = pictures[ROUGH]
+    return SurfaceView(pictures, points, by_noise, np.ones(len(points), bool))
+
+
 def compare(
     views: Sequence[SurfaceView],
     poses: Float,

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from nextview.sensing.agreement import Agreement, SurfaceView, compare
-from nextview.sensing.frame import CAMERA_AXES
+from nextview.sensing.agreement import Agreement, SurfaceView, compare, quick_view
+from nextview.sensing.frame import CAMERA_AXES, Frame
 from nextview.types import Float, Index, Mask
 
 # A mistake explains contradictions if so much of their share is left without it ...
@@ -29,6 +29,9 @@ NO_OVERLAP = 0.25
 # Share of the judgements that has to confirm without a mistake. The errors of a usual calibration
 # leave .88; of real frames whose poses are in any order, no mistake makes more than .2 confirm.
 WELL_EXPLAINED = 0.75
+HALF_AGREES = (
+    0.5  # of two frames: share that confirms if most of what they show stands still
+)
 ONE_PLACE = 0.1  # cameras within this part of the depth stand in one place: rotations do not show
 SAME_POSE = 1e-3  # metres, and parts of a rotation, up to which two poses are the same
 
@@ -119,16 +122,20 @@ class Mistake:
     """A kind of mistake, with the transformation of the input that undoes it.
 
     Attributes:
-        name: short. Two mistakes with the same first word are not made at once.
+        name: short.
+        kind: what it is a mistake in; two of one kind are not made at once.
         sentence: what it looks like, the end of a sentence.
         undone: makes the right input of the wrong one.
         alone: whether it is not tried together with another mistake.
+        scale: by which the depth is too large, or the translations are too small.
     """
 
     name: str
+    kind: str
     sentence: str
     undone: Callable[[PosedViews], PosedViews]
     alone: bool = False
+    scale: float = 1.0
 
     def right_pose(self, pose: Float) -> Float:
         """The right pose if this mistake was made in one, camera-to-world, (4, 4)."""
@@ -209,6 +216,41 @@ def likeliest(
             best = mistake
             most_confirmed = confirmed
     return best
+
+
+def mistake_between(
+    frame: Frame, last: Frame, scales: Sequence[float]
+) -> Mistake | None:
+    """Return the mistake without which a frame agrees with the one before.
+
+    It may be in the depth of both frames, or in the pose of the latter. Frames that agree by half
+    have none: what stands in view may move.
+
+    Args:
+        frame: a frame with a pose.
+        last: the one before.
+        scales: by which the depth may be too large.
+
+    Returns:
+        The mistake; None if the frames agree, or none explains why they do not.
+    """
+    views = [quick_view(one) for one in (last, frame)]
+    poses = np.stack([last.camera_to_world, frame.camera_to_world])
+    posed = PosedViews(views, poses)
+    as_read = compare(views, poses)
+    if as_read.judged >= LEAST_EXPLAINED and as_read.share > HALF_AGREES:
+        return None
+
+    in_depth = _scales(posed, scales)
+    in_pose = [
+        *mistakes_in_poses(),
+        *_mistakes_in_quaternions(),
+        *_mirrored_pictures(),
+    ]
+    of_last = np.array([False, True])
+    return likeliest(posed, in_depth, as_read) or likeliest(
+        posed, in_pose, as_read, of_last
+    )
 
 
 def explains(before: Agreement, after: Agreement) -> bool:
@@ -313,10 +355,11 @@ def _pairs(single: Sequence[Mistake]) -> Iterator[Mistake]:
     single = [mistake for mistake in single if not mistake.alone]
     for i, first in enumerate(single):
         for second in single[i + 1 :]:
-            if first.name.split()[0] == second.name.split()[0]:
+            if first.kind == second.kind:
                 continue
             yield Mistake(
                 f"{first.name}, {second.name}",
+                f"{first.kind}, {second.kind}",
                 f"{first.sentence} and {second.sentence}",
                 _one_after_the_other(first, second),
             )
@@ -344,7 +387,7 @@ def usual_mistakes(posed: PosedViews) -> list[Mistake]:
         *mistakes_in_poses(posed.stored.to_world),
         *_mistakes_in_quaternions(),
         *_mirrored_pictures(),
-        *_scales(posed),
+        *_scales(posed, _all_scales(posed.stored)),
     ]
 
 
@@ -385,24 +428,30 @@ def mistakes_in_poses(to_world: bool = True) -> list[Mistake]:
     ros = "the camera's axes are those of a ROS body (x forward, y left, z up)"
     return [
         Mistake(
-            "inverse poses",
+            "inverse pose",
+            "inverse",
             f"the poses are inverse: {wrong} these are {other}",
             _posed(_inverted),
         ),
         Mistake(
-            "inverse rotations",
+            "inverse rotation",
+            "inverse",
             f"the rotations are inverse: {wrong} only the translations are",
             _posed(_in_stored(_rotation_inverted, to_world)),
         ),
         Mistake(
-            "inverse translations",
+            "inverse translation",
+            "inverse",
             f"the translations are those of inverse poses: {wrong} only the rotations are",
             _posed(_in_stored(_translation_inverted, to_world)),
         ),
         Mistake(
-            "axes of OpenGL", f"{opengl}, {opencv}", _turned_by(CAMERA_AXES["opengl"])
+            "opengl axes",
+            "axes",
+            f"{opengl}, {opencv}",
+            _turned_by(CAMERA_AXES["opengl"]),
         ),
-        Mistake("axes of ROS", f"{ros}, {opencv}", _turned_by(CAMERA_AXES["ros"])),
+        Mistake("ros axes", "axes", f"{ros}, {opencv}", _turned_by(CAMERA_AXES["ros"])),
         *_turned_pictures(),
     ]
 
@@ -411,12 +460,23 @@ def _turned_pictures() -> list[Mistake]:
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     by_a_quarter = "the picture is turned to the {} by a quarter turn"
     return [
-        Mistake("turned left", by_a_quarter.format("left"), _turned_by(quarter), True),
         Mistake(
-            "turned right", by_a_quarter.format("right"), _turned_by(quarter.T), True
+            "turned left",
+            "picture",
+            by_a_quarter.format("left"),
+            _turned_by(quarter),
+            True,
+        ),
+        Mistake(
+            "turned right",
+            "picture",
+            by_a_quarter.format("right"),
+            _turned_by(quarter.T),
+            True,
         ),
         Mistake(
             "turned over",
+            "picture",
             "the picture stands on its head, turned by half a turn",
             _turned_by(quarter @ quarter),
             True,
@@ -428,6 +488,7 @@ def _mirrored_pictures() -> list[Mistake]:
     return [
         Mistake(
             f"mirrored {way}",
+            "picture",
             f"the picture is flipped {way}",
             _turned_by(np.diag(signs)),
             True,
@@ -444,6 +505,7 @@ def _mistakes_in_quaternions() -> list[Mistake]:
     return [
         Mistake(
             "quaternions",
+            "quaternions",
             f"the quaternions are in the order {wrong}, and were taken for {right}",
             _posed(_in_stored(_quaternion_rolled(steps), to_world)),
         )
@@ -455,21 +517,24 @@ def _mistakes_in_quaternions() -> list[Mistake]:
     ]
 
 
-def _scales(posed: PosedViews) -> list[Mistake]:
+def _all_scales(stored: Stored) -> list[float]:
+    """Ratios of the units of length and of the steps of depth images."""
+    units = {round(unit / stored.unit, 6) for unit in UNIT_NAMES if unit != stored.unit}
+    return sorted(units | set(DEPTH_SCALES))
+
+
+def _scales(posed: PosedViews, scales: Sequence[float]) -> list[Mistake]:
     """Another unit of the translations, or another step of the depth: the same but for a scale."""
-    units = {
-        round(unit / posed.stored.unit, 6)
-        for unit in UNIT_NAMES
-        if unit != posed.stored.unit
-    }
     return [
         Mistake(
             f"scale {scale:g}",
+            "scale",
             _scale_in_words(scale, posed),
             _posed(_scaled(scale)),
             alone=scale not in COMMON_SCALES,
+            scale=scale,
         )
-        for scale in sorted(units | set(DEPTH_SCALES))
+        for scale in scales
     ]
 
 
@@ -516,7 +581,7 @@ def _wrong_focal_length(log_times: float, given: float) -> Mistake:
         views = [view.with_focal_length(times) for view in posed.views]
         return replace(posed, views=views)
 
-    return Mistake("focal length", sentence, undone)
+    return Mistake("focal length", "intrinsics", sentence, undone)
 
 
 def _offset_camera(offset: Float) -> Mistake:
@@ -533,7 +598,7 @@ def _offset_camera(offset: Float) -> Mistake:
         poses[:, :3, 3] += poses[:, :3, :3] @ offset
         return poses
 
-    return Mistake("offset", sentence, _posed(moved))
+    return Mistake("offset", "calibration", sentence, _posed(moved))
 
 
 def _offset_of_middles(posed: PosedViews) -> Float:
