@@ -27,6 +27,7 @@ from nextview.types import Float, Float32, Index, Mask
 
 POINT_GRID = 160  # columns of the grid from which surface points are drawn
 AGREEMENT_POINTS = 200  # points of each frame that are looked up in the others
+QUICK_POINTS = 500  # the same of a frame that is compared with the last one only
 NOISE_TOLERANCE = 3.0  # standard deviations of the noise
 # part of the depth by which it may vary around a point that is looked up: no edges
 SMOOTH_STEP = 0.05
@@ -209,7 +210,9 @@ def quick_view(frame: Frame) -> SurfaceView:
     small = Frame(frame.depth[::side, ::side].copy(), intrinsics, pixel_centre=0.5)
 
     noise = noise_of(small)
-    points = _some(_surface_points(small), AGREEMENT_POINTS, np.random.default_rng(0))
+    rows, columns = np.nonzero(_is_smooth(small.depth) & (small.depth > 0))
+    points = small.positions_in_camera(rows, columns)
+    points = _some(points, QUICK_POINTS, np.random.default_rng(0))
     depth = points[:, 2]
     by_noise = NOISE_TOLERANCE * noise.at(depth) * depth**2
     pictures = {ROUGH: _picture(small, ROUGH.columns)}

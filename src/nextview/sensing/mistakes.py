@@ -12,7 +12,13 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from nextview.sensing.agreement import Agreement, SurfaceView, compare, quick_view
+from nextview.sensing.agreement import (
+    ROUGH,
+    Agreement,
+    SurfaceView,
+    compare,
+    quick_view,
+)
 from nextview.sensing.frame import CAMERA_AXES, Frame
 from nextview.types import Float, Index, Mask
 
@@ -32,7 +38,8 @@ WELL_EXPLAINED = 0.75
 HALF_AGREES = (
     0.5  # of two frames: share that confirms if most of what they show stands still
 )
-ONE_PLACE = 0.1  # cameras within this part of the depth stand in one place: rotations do not show
+# Cameras stand in one place within this part of the depth: less of a move does not show.
+ONE_PLACE = ROUGH.depth_tolerance
 SAME_POSE = 1e-3  # metres, and parts of a rotation, up to which two poses are the same
 
 UNIT_NAMES = {
