@@ -5,40 +5,31 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nextview.captured.camera_mistakes import find_camera_mistake, find_offset
 from nextview.captured.frames import Capture, CapturedFrame
-from nextview.captured.pose_mistakes import (
-    FEWEST_JUDGED,
-    UNIT_NAMES,
-    Posed,
-    PoseMistake,
-    find_mistake,
-)
-from nextview.captured.shifted_poses import Shift, find_shifts
+from nextview.captured.late_poses import Shift, find_shifts
 from nextview.errors import DatasetError, ObservationError
-from nextview.sensing.agreement import (
-    SHARP,
-    Agreement,
-    SurfaceView,
-    compare,
-    surface_view,
-)
+from nextview.sensing.agreement import Agreement, SurfaceView, compare, surface_view
 from nextview.sensing.frame import Frame
+from nextview.sensing.mistakes import (
+    LEAST_EXPLAINED,
+    PosedViews,
+    Stored,
+    find_fitted,
+    find_mistake,
+    fitted_mistakes,
+)
 
 # frames of a capture that are compared with each other, evenly spread
 MOST_COMPARED_FRAMES = 60
 MOST_REFUSED = 0.1  # share of the frames that may be left out; a single one always may
-CONTRADICTED_SHARE = 0.5  # a frame of which less is confirmed contradicts the others
-# the same, looked at sharply, if it is also so many times what is usual
-CONTRADICTED_SHARPLY = 0.3
+# A frame contradicts the others if more of it is contradicted than this share, ...
+MUCH_CONTRADICTED = 0.5
+# ... or than this one, if that is also so many times what is usual.
+UNUSUALLY_CONTRADICTED = 0.3
 TIMES_USUAL = 4.0
 # share of what stands on the plane that is contradicted where frames disagree altogether
 CONTRADICTED_IN_ALL = 0.3
 FEWEST_TO_BLAME = 5  # frames of which one may be blamed if they disagree
-# metres that a capture of an object may have as its median depth
-PLAUSIBLE_DEPTH = (0.05, 15.0)
-# times by which a depth scale is hardly ever wrong, and a unit of length often
-NEVER_A_DEPTH = 25
 NAMED_FRAMES = 3  # frames that are named in a sentence; of others the number is told
 DEPTH_SOURCES = {
     "BOP": "depth_scale in scene_camera.json",
@@ -158,18 +149,12 @@ def _contradicting(
     rng = np.random.default_rng(0)
     views = [surface_view(frame, rng) for frame in frames]
     poses = np.stack([frame.pose for frame in capture.frames])
-    unit = 0.001 if capture.layout == "BOP" else 1.0
-    posed = Posed(views, compared, poses, capture.layout != "BOP", unit)
+    posed = PosedViews(views, poses[compared], _stored(capture))
+    fitted = fitted_mistakes(float(capture.frames[0].intrinsics[0, 0]))
 
-    mistake = find_mistake(posed, compare(views, posed.as_read()))
+    mistake = find_mistake(posed) or find_fitted(posed, fitted["focal length"])
     if mistake is not None:
-        depth = float(
-            np.median([np.median(v.points[:, 2]) for v in views if len(v.points)])
-        )
-        raise _disagree(capture, _in_words(capture, mistake, depth, unit))
-    looks = find_camera_mistake(views, posed.as_read(), capture.frames[0].intrinsics)
-    if looks:
-        raise _disagree(capture, looks)
+        raise _disagree(capture, mistake.sentence)
 
     most = max(1, int(MOST_REFUSED * len(frames)))
     shifts = find_shifts(views, compared, poses)
@@ -189,13 +174,13 @@ def _contradicting(
     left = np.setdiff1d(np.arange(len(kept)), list(blamed))
     most_blamed = most - int(late.sum()) if len(frames) >= FEWEST_TO_BLAME else 0
     too_many = len(blamed) > most_blamed
-    if too_many or (len(left) > 1 and _disagreeing(evidence, left)):
-        looks = find_offset(views, posed.as_read())
-        raise (
-            _disagree(capture, looks)
-            if looks
-            else _unexplained(capture, compared[kept], evidence)
-        )
+    too_many |= len(left) > 1 and _disagreeing(evidence, left)
+    if too_many or blamed:
+        offset = find_fitted(posed, fitted["offset"])
+        if offset is not None:
+            raise _disagree(capture, offset.sentence)
+    if too_many:
+        raise _unexplained(capture, compared[kept], evidence)
 
     for i, share in blamed.items():
         what = (
@@ -206,6 +191,21 @@ def _contradicting(
     return refused
 
 
+def _stored(capture: Capture) -> Stored:
+    """How the layout of a capture stores its frames."""
+    of_bop = capture.layout == "BOP"
+    return Stored(
+        to_world=not of_bop,
+        unit=0.001 if of_bop else 1.0,
+        step=capture.frames[0].scale,
+        step_told_by=(
+            "--depth-scale"
+            if capture.scale_given
+            else DEPTH_SOURCES.get(capture.layout, "in its files")
+        ),
+    )
+
+
 def _disagree(capture: Capture, looks: str) -> DatasetError:
     """The error where a mistake explains what the frames contradict."""
     problem = "its frames do not agree about one rigid object, and without this mistake they would"
@@ -214,17 +214,15 @@ def _disagree(capture: Capture, looks: str) -> DatasetError:
 
 @dataclass(frozen=True)
 class PoseEvidence:
-    """Agreement of N frames, by what is judged and how closely.
+    """Agreement of N frames, by what is judged.
 
     Attributes:
-        all: of all points, roughly.
-        standing: of the points that stand out of the largest plane, roughly.
-        sharp: of the same points, sharply.
+        all: of all points.
+        standing: of the points that stand out of the largest plane.
     """
 
     all: Agreement
     standing: Agreement
-    sharp: Agreement
 
     @classmethod
     def of(cls, views: Sequence[SurfaceView], poses: np.ndarray) -> "PoseEvidence":
@@ -238,38 +236,27 @@ class PoseEvidence:
             The evidence.
         """
         standing = [view.some(view.standing) for view in views]
-        return cls(
-            compare(views, poses),
-            compare(standing, poses),
-            compare(standing, poses, sharpness=SHARP),
-        )
+        return cls(compare(views, poses), compare(standing, poses))
 
 
 def _to_blame(evidence: PoseEvidence) -> dict[int, float]:
-    """Return frames that contradict the others most, worst first, with confirmed shares.
-
-    A frame is blamed where most of its points are contradicted, or most of those that stand out of
-    the largest plane; or, looked at sharply, many times as many of them as in the other frames.
-    """
+    """Return frames that contradict the others most, worst first, with confirmed shares."""
     kept = np.ones(len(evidence.all.confirmed), bool)
     blamed: dict[int, float] = {}
     while kept.sum() > 1:
         pairs = kept[:, None] & kept
-        share = np.ones(len(kept))
-        for rough in (evidence.all, evidence.standing):
-            share = np.minimum(
-                share,
-                np.where(kept, _enough_judged(rough.among(pairs)), 1.0),
-            )
-        sharp = np.where(kept, _enough_judged(evidence.sharp.among(pairs)), 1.0)
-        usual = float(np.median(1 - sharp[kept]))
-        outlier = 1 - sharp > max(CONTRADICTED_SHARPLY, TIMES_USUAL * usual)
+        share = np.minimum(
+            _enough_judged(evidence.all.among(pairs)),
+            _enough_judged(evidence.standing.among(pairs)),
+        )
+        share = np.where(kept, share, 1.0)
 
-        to_blame = (share < CONTRADICTED_SHARE) | outlier
-        if not to_blame.any():
+        usual = float(np.median(1 - share[kept]))
+        limit = np.clip(TIMES_USUAL * usual, UNUSUALLY_CONTRADICTED, MUCH_CONTRADICTED)
+        worst = int(share.argmin())
+        if 1 - share[worst] <= limit:
             break
-        worst = int(np.where(to_blame, np.minimum(share, sharp), 1.0).argmin())
-        blamed[worst] = float(sharp[worst] if outlier[worst] else share[worst])
+        blamed[worst] = float(share[worst])
         kept[worst] = False
     return blamed
 
@@ -277,7 +264,7 @@ def _to_blame(evidence: PoseEvidence) -> dict[int, float]:
 def _enough_judged(agreement: Agreement) -> np.ndarray:
     """The confirmed share of each frame, (N,); 1 where too few of its points could be judged."""
     share, judged = agreement.of_each()
-    return np.where(judged >= FEWEST_JUDGED, share, 1.0)
+    return np.where(judged >= LEAST_EXPLAINED, share, 1.0)
 
 
 def _disagreeing(evidence: PoseEvidence, left: np.ndarray) -> bool:
@@ -286,7 +273,7 @@ def _disagreeing(evidence: PoseEvidence, left: np.ndarray) -> bool:
     All of them do, or those from one frame on contradict those before.
     """
     standing = evidence.standing.of_frames(left)
-    if standing.judged >= FEWEST_JUDGED and 1 - standing.share > CONTRADICTED_IN_ALL:
+    if standing.judged >= LEAST_EXPLAINED and 1 - standing.share > CONTRADICTED_IN_ALL:
         return True
     first = _break(standing)
     return first > 0 and 1 - _across(standing, first).share > CONTRADICTED_IN_ALL
@@ -321,7 +308,7 @@ def _break(agreement: Agreement) -> int:
         later = np.arange(count) >= first
         across = _across(agreement, first)
         within = agreement.among(later[:, None] == later)
-        if min(across.judged, within.judged) < FEWEST_JUDGED:
+        if min(across.judged, within.judged) < LEAST_EXPLAINED:
             continue
 
         wrong_across = 1 - across.share
@@ -374,38 +361,3 @@ def _frames_late(shift: Shift) -> str:
     if shift.frames > 0:
         return f"{many} late: each frame has the pose of an earlier one"
     return f"{many} early: each frame has the pose of a later one"
-
-
-def _in_words(capture: Capture, mistake: PoseMistake, depth: float, unit: float) -> str:
-    """Return what a mistake looks like, in words."""
-    if mistake.scale == 1:
-        return mistake.sentence
-    said = [mistake.sentence] if mistake.sentence else []
-    return " and ".join([*said, _scale_in_words(capture, mistake.scale, depth, unit)])
-
-
-def _scale_in_words(capture: Capture, scale: float, depth: float, unit: float) -> str:
-    """Translations have to be multiplied by a scale, or depths, of some median, divided by it."""
-    other = min(UNIT_NAMES, key=lambda each: abs(np.log(each / (unit * scale))))
-    translations = ""
-    if abs(np.log(other / (unit * scale))) < 0.01:
-        expected = "millimetres" if capture.layout == "BOP" else "metres"
-        translations = f"the translations are in {UNIT_NAMES[other]}, where {expected} are expected"
-
-    times = scale if scale > 1 else 1 / scale
-    step = 1000 * capture.frames[0].scale
-    depths = (
-        f"the depth is {times:g} times too {'large' if scale > 1 else 'small'}: "
-        "its steps are of "
-    )
-    source = DEPTH_SOURCES.get(capture.layout, "in its files")
-    if capture.scale_given:
-        source = "--depth-scale"
-    depths += f"{step / scale:.3g} mm, not of {step:.3g} mm ({source})"
-
-    plausible = PLAUSIBLE_DEPTH[0] <= depth <= PLAUSIBLE_DEPTH[1]
-    if translations and plausible and times >= NEVER_A_DEPTH:
-        return translations
-    if translations and plausible:
-        return f"{depths}; or {translations}"
-    return depths

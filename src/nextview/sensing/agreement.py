@@ -4,6 +4,10 @@ Points on the surfaces of each frame are looked up in the pictures of all others
 confirmed where another frame measures the same depth, and contradicted where another frame looks
 through it. Points that are hidden, outside of the picture or not measured say nothing.
 
+Every point is judged twice, roughly and sharply: roughly, the errors of a usual calibration are no
+contradiction; sharply, poses differ that are a few degrees apart. The score of frames is the share
+of all these judgements that confirm.
+
 Points that stand out of the largest plane of a frame can be judged on their own: a table looks the
 same after any turn about its normal, so its points agree where the object's do not.
 """
@@ -23,6 +27,7 @@ from nextview.types import Float, Float32, Index, Mask
 
 POINT_GRID = 160  # columns of the grid from which surface points are drawn
 AGREEMENT_POINTS = 200  # points of each frame that are looked up in the others
+QUICK_POINTS = 500  # the same of a frame that is compared with the last one only
 NOISE_TOLERANCE = 3.0  # standard deviations of the noise
 # part of the depth by which it may vary around a point that is looked up: no edges
 SMOOTH_STEP = 0.05
@@ -125,8 +130,8 @@ class Agreement:
     """How often points of a frame (row) are confirmed or contradicted by another (column).
 
     Attributes:
-        confirmed: number of points, (N, N).
-        contradicted: number of points, (N, N).
+        confirmed: number of judgements, (N, N).
+        contradicted: number of judgements, (N, N).
     """
 
     confirmed: Float
@@ -134,12 +139,12 @@ class Agreement:
 
     @property
     def judged(self) -> float:
-        """How many points could be judged in all."""
+        """How many judgements there are in all."""
         return float(self.confirmed.sum() + self.contradicted.sum())
 
     @property
     def share(self) -> float:
-        """Share of the judged points that are confirmed; 1 if none could be judged."""
+        """Share of the judgements that confirm; 1 if there are none."""
         return 1.0 if self.judged == 0 else float(self.confirmed.sum()) / self.judged
 
     def among(self, pairs: Mask) -> "Agreement":
@@ -157,7 +162,7 @@ class Agreement:
         )
 
     def of_each(self) -> tuple[Float, Float]:
-        """Confirmed share and number of judged points of each frame, both ways, (N,) each."""
+        """Confirmed share and number of judgements of each frame, both ways, (N,) each."""
         confirmed = self.confirmed.sum(0) + self.confirmed.sum(1)
         judged = confirmed + self.contradicted.sum(0) + self.contradicted.sum(1)
         share = np.where(judged > 0, confirmed / np.maximum(judged, 1), 1.0)
@@ -190,50 +195,77 @@ def surface_view(frame: Frame, rng: np.random.Generator) -> SurfaceView:
     return SurfaceView(pictures, points, by_noise, standing)
 
 
+def quick_view(frame: Frame) -> SurfaceView:
+    """Prepare a frame for a comparison that has to be quick, by a small picture of it.
+
+    Args:
+        frame: its pose is not used; its mask neither, as all that it shows is compared.
+    """
+    side = max(1, frame.shape[1] // ROUGH.columns)
+    # The pixels that are kept lie in the corners of squares that become one pixel.
+    intrinsics = frame.intrinsics.copy()
+    intrinsics[:2, 2] -= 0.5
+    intrinsics[:2] /= side
+    intrinsics[:2, 2] += 0.5
+    small = Frame(frame.depth[::side, ::side].copy(), intrinsics, pixel_centre=0.5)
+
+    noise = noise_of(small)
+    rows, columns = np.nonzero(_is_smooth(small.depth) & (small.depth > 0))
+    points = small.positions_in_camera(rows, columns)
+    points = _some(points, QUICK_POINTS, np.random.default_rng(0))
+    depth = points[:, 2]
+    by_noise = NOISE_TOLERANCE * noise.at(depth) * depth**2
+    pictures = {ROUGH: _picture(small, ROUGH.columns)}
+    pictures[SHARP] = pictures[ROUGH]
+    return SurfaceView(pictures, points, by_noise, np.ones(len(points), bool))
+
+
 def compare(
     views: Sequence[SurfaceView],
     poses: Float,
-    scale: float = 1.0,
-    sharpness: Sharpness = ROUGH,
     looked_up_with: Float | None = None,
 ) -> Agreement:
-    """Look up the points of every frame in all others.
+    """Look up the points of every frame in all others, roughly and sharply.
 
     Args:
         views: N frames.
         poses: of their cameras, camera-to-world, (N, 4, 4), metres.
-        scale: by which all depths are multiplied.
-        sharpness: how closely the frames have to agree.
         looked_up_with: poses of the cameras in whose pictures the points are looked up, (N, 4, 4);
             by default the same.
     """
     count = len(views)
     owner = np.repeat(np.arange(count), [len(view.points) for view in views])
-    tolerance = np.concatenate([view.tolerance(sharpness) for view in views])
     world = np.concatenate(
         [
-            scale * v.points @ pose[:3, :3].T + pose[:3, 3]
-            for v, pose in zip(views, poses, strict=True)
+            view.points @ pose[:3, :3].T + pose[:3, 3]
+            for view, pose in zip(views, poses, strict=True)
         ]
     )
+    tolerances = {
+        sharpness: np.concatenate([view.tolerance(sharpness) for view in views])
+        for sharpness in (ROUGH, SHARP)
+    }
 
     confirmed = np.zeros((count, count))
     contradicted = np.zeros((count, count))
     there = poses if looked_up_with is None else looked_up_with
     for j, (view, pose) in enumerate(zip(views, there, strict=True)):
-        seen_from = (world - pose[:3, 3]) @ pose[:3, :3] / scale
-        which, agrees, looks_through = _looked_up(
-            view.pictures[sharpness],
-            seen_from,
-            tolerance,
-        )
-        other = owner[which] != j
-        confirmed[:, j] = np.bincount(owner[which], agrees & other, minlength=count)
-        contradicted[:, j] = np.bincount(
-            owner[which],
-            looks_through & other,
-            minlength=count,
-        )
+        seen_from = (world - pose[:3, 3]) @ pose[:3, :3]
+        for sharpness, tolerance in tolerances.items():
+            which, agrees, looks_through = _looked_up(
+                view.pictures[sharpness],
+                seen_from,
+                tolerance,
+            )
+            other = owner[which] != j
+            confirmed[:, j] += np.bincount(
+                owner[which], agrees & other, minlength=count
+            )
+            contradicted[:, j] += np.bincount(
+                owner[which],
+                looks_through & other,
+                minlength=count,
+            )
     return Agreement(confirmed, contradicted)
 
 

@@ -11,7 +11,7 @@ from nextview.errors import ObservationError
 from nextview.geometry.axes import upright_axes
 from nextview.sensing.frame import Frame
 from nextview.sensing.lean import lean_of
-from nextview.sensing.planes import Plane
+from nextview.sensing.planes import POSE_SHIFT, Plane
 from nextview.sensing.plausibility import (
     check_frame,
     check_lean,
@@ -105,10 +105,27 @@ class KnownFrames:
             for own, one in zip(planes, frames, strict=True)
             if own is not None
         ]
+        shown = self._of_one_surface(shown)
         if self.up is None or len(shown) < 2:
             return []
         own, poses = zip(*shown, strict=True)
         return check_lean(lean_of(own, poses, upright_axes(self.up)))
+
+    def _of_one_surface(
+        self, shown: list[tuple[Plane, Float]]
+    ) -> list[tuple[Plane, Float]]:
+        """Planes, with poses, that are the lowest of them where the object is expected.
+
+        By its box the seat of a chair may be found in one frame, and in another one the floor.
+        """
+        if self.target is None or not shown:
+            return shown
+        below = [float(plane.height(self.target)) for plane, _ in shown]
+        return [
+            one
+            for one, height in zip(shown, below, strict=True)
+            if height > max(below) - POSE_SHIFT
+        ]
 
 
 def _same_mask(one: Frame, other: Frame) -> bool:

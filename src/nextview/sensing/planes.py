@@ -1,4 +1,4 @@
-"""Planes in a frame, found by RANSAC and refined by least squares; likely mistakes in its pose."""
+"""Planes in a frame, found by RANSAC and refined by least squares."""
 
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -8,7 +8,7 @@ from numpy.random import Generator
 from scipy import ndimage
 
 from nextview.sensing.facets import Noise
-from nextview.sensing.frame import CAMERA_AXES, Frame
+from nextview.sensing.frame import Frame
 from nextview.types import Float, Floats, Index, Mask
 
 # planes that are tried: with one point in ten on the plane, 0.8 of all draws hit it at least once
@@ -17,10 +17,6 @@ TRIALS = 200
 TILT = np.cos(np.radians(12.0))
 # the same, at which a plane counts nothing when planes are compared
 STEEPEST_SUPPORT = np.cos(np.radians(15.0))
-# a quarter turn of a camera about its optical axis
-QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-# radians by which a plane may be less level by one mistake than by another that explains it as well
-AS_LEVEL = np.radians(3.0)
 # share of what is seen that lies on a support plane, at least; more if gravity is not known
 LEAST_SUPPORT = 0.04
 LEAST_ALONE = 0.15
@@ -382,40 +378,3 @@ def _share_held(samples: Samples, on: Mask, normal: Float) -> float:
     middle = np.median(samples.points[on] @ normal)
     plane = refine_plane(Plane(normal, -float(middle)), samples, loose=2)
     return float(refine_plane(plane, samples).holds(samples).mean())
-
-
-def mistake_in_pose(plane: Plane, pose: Float, up: Float) -> str | None:
-    """Return the mistake in a pose without which the largest plane would be level.
-
-    Floors and tables are level and walls upright. A plane that leans in between indicates a wrong
-    pose; so does one that is level but lies over the camera. A wall indicates nothing: seen from
-    the side it would pass for a floor.
-
-    Args:
-        plane: the largest plane in view.
-        pose: camera-to-world, (4, 4).
-        up: direction against gravity, (3,).
-
-    Returns:
-        The mistake, in words, or all that explain the plane as well; None if there is none.
-    """
-    if plane.normal @ up > TILT or abs(plane.normal @ up) < np.sqrt(1 - TILT**2):
-        return None
-
-    rotation = pose[:3, :3]
-    mistakes = {
-        "the camera's axes are OpenGL's": rotation @ CAMERA_AXES["opengl"],
-        "the camera's axes are those of a ROS body": rotation @ CAMERA_AXES["ros"],
-        "the pose is inverse, world-to-camera": rotation.T,
-        "the picture is turned to the left": rotation @ QUARTER,
-        "the picture is turned to the right": rotation @ QUARTER.T,
-        "the picture stands on its head": rotation @ QUARTER @ QUARTER,
-    }
-    seen = rotation.T @ plane.normal
-    rises = {mistake: float(right @ seen @ up) for mistake, right in mistakes.items()}
-    most = max(rises.values())
-    if most <= TILT:
-        return None
-    # one frame may be explained by several: which of them it is, a level plane does not tell
-    least = np.cos(np.arccos(min(most, 1.0)) + AS_LEVEL)
-    return ", or ".join(name for name, rise in rises.items() if rise >= least) + "?"

@@ -8,8 +8,9 @@ from nextview.errors import ObservationError
 from nextview.geometry.observation import Observation
 from nextview.geometry.pinhole import PinholeCamera
 from nextview.sensing.displacement import Displacement
-from nextview.sensing.frame import CAMERA_AXES, Frame
+from nextview.sensing.frame import Frame
 from nextview.sensing.lean import Lean
+from nextview.sensing.mistakes import mistake_between, mistakes_in_poses
 from nextview.sensing.view_warning import ViewWarning
 from nextview.types import Float, Index
 
@@ -44,13 +45,6 @@ MUCH_FARTHER = 1.7
 """Times the distance of a target: nothing is nearer, and what is seen in its place is so far, if
 depth is too large.
 """
-HALF_AGREES = 0.5
-MOST_AGREES = 0.8
-"""Share of the surface on which two frames agree: from which their depth scale is right, and
-that names another one.
-"""
-# points on which two frames have to agree or not before a depth scale is named
-FEWEST_SHARED = 50
 # metres from the origin of the world, within which robots work; where positions in millimetres
 # begin
 FAR_ORIGIN = 30.0
@@ -104,7 +98,7 @@ def refuse_far(
             f"{what}: is the pose in millimetres, or are target and pose of different worlds?"
         )
 
-    refuse_depth_scale(frame, last, target, radius)
+    refuse_mistake(frame, last, target, radius)
 
 
 def refuse_millimetres(pose: Float, height: float, up: Float) -> None:
@@ -153,17 +147,17 @@ def check_steps(frame: Frame, height: float, up: Float) -> list[ViewWarning]:
     return []
 
 
-def refuse_depth_scale(
+def refuse_mistake(
     frame: Frame,
     last: Frame | None,
     target: Float | None,
     radius: float,
 ) -> None:
-    """Refuse depth that is several times too large.
+    """Refuse depth that is several times too large, and a pose without whose mistake frames agree.
 
-    16-bit depth in steps of less than a millimetre is. Either everything visible lies behind the
-    target, at a multiple of its distance; or the frame and the last one contradict each other, and
-    would not if the depth of both were smaller.
+    16-bit depth in steps of less than a millimetre is too large. Either everything visible lies
+    behind the target, at a multiple of its distance; or the frame and the last one contradict each
+    other, and would not if the depth of both were smaller.
 
     Args:
         frame: the frame.
@@ -172,13 +166,21 @@ def refuse_depth_scale(
         radius: of the object, metres.
 
     Raises:
-        ObservationError: the depth is too large, with the likely factor.
+        ObservationError: the depth is too large, with the likely factor; or the mistake.
     """
     times = 0.0
     if target is not None and frame.mask is None:
         times = _times_behind(frame, target, radius)
     if not times and last is not None:
-        times = _times_too_large(frame, last)
+        mistake = mistake_between(frame, last, TIMES_TOO_LARGE)
+        if mistake is None:
+            return
+        if mistake.kind != "scale":
+            raise ObservationError(
+                f"the frame does not agree with the last one, and without this mistake it would:"
+                f" {mistake.sentence}"
+            )
+        times = mistake.scale
     if not times:
         return
     steps = (
@@ -219,44 +221,6 @@ def _times_behind(frame: Frame, target: Float, radius: float) -> float:
         return 0.0
 
     return min(TIMES_TOO_LARGE, key=lambda times: abs(np.log(times * z / there)))
-
-
-def _times_too_large(frame: Frame, last: Frame) -> float:
-    """Return by how much two depths are too large to agree; 0 if they agree or never do."""
-    as_given, share = _agreeing(last, frame, 1.0)
-    if as_given >= FEWEST_SHARED and share > HALF_AGREES:
-        return 0.0
-    found = {times: _agreeing(last, frame, 1 / times) for times in TIMES_TOO_LARGE}
-    best = max(found, key=lambda times: found[times][0])
-    confirmed, share = found[best]
-    return (
-        best
-        if share > MOST_AGREES and confirmed > 2 * max(as_given, FEWEST_SHARED)
-        else 0.0
-    )
-
-
-def _agreeing(first: Frame, second: Frame, scale: float) -> tuple[int, float]:
-    """Return the number and the share of the points of a frame that another confirms."""
-    step = max(1, int(np.sqrt(first.depth.size / PIXELS_SAMPLED)))
-    rows, columns = np.nonzero(first.depth[::step, ::step])
-    points = scale * first.positions_in_camera(step * rows, step * columns)
-    there = second.camera_to_world
-    here = first.camera_to_world
-    points = (points @ here[:3, :3].T + here[:3, 3] - there[:3, 3]) @ there[:3, :3]
-    points = points[points[:, 2] > 1e-3]
-    k = second.intrinsics
-    height, width = second.shape
-    column, row = (points[:, i] / points[:, 2] * k[i, i] + k[i, 2] for i in (0, 1))
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    row = row[inside].astype(int)
-    column = column[inside].astype(int)
-    z = points[inside, 2]
-    seen = scale * second.depth[row, column]
-    confirmed = int(((seen > 0) & (np.abs(seen - z) < CHANGED * z)).sum())
-    seen_through = int((seen > (1 + CHANGED) * z).sum())
-
-    return confirmed, confirmed / max(confirmed + seen_through, 1)
 
 
 def check_frame(frame: Frame) -> list[ViewWarning]:
@@ -455,23 +419,11 @@ def _diagnose(points: Float, pose: Float) -> tuple[str, str]:
             f"{what}: lengths in metres? Divide depth and camera position by the object radius",
         )
 
-    for name, said in (
-        ("opengl", "OpenGL's (x right, y up, z backward)"),
-        ("ros", "a ROS body's (x forward, z up)"),
-    ):
-        turned = pose.copy()
-        turned[:3, :3] = pose[:3, :3] @ CAMERA_AXES[name]
-        if _plausible(points, turned):
-            wrong = (
-                f"the camera's axes are {said}, OpenCV's (x right, "
-                "y down, z forward) are expected"
-            )
-            return f"{name} axes", f"the view looks away from the object: {wrong}"
-    if _plausible(points, np.asarray(np.linalg.inv(pose), np.float64)):
-        return (
-            "inverse pose",
-            "the pose is inverse: camera-to-world is expected, this is world-to-camera",
-        )
+    mistakes = {mistake.name: mistake for mistake in mistakes_in_poses()}
+    for name in ("opengl axes", "ros axes", "inverse pose"):
+        mistake = mistakes[name]
+        if _plausible(points, mistake.right_pose(pose)):
+            return name, f"the view looks away from the object: {mistake.sentence}"
 
     middle = float(np.median(np.linalg.norm(points, axis=1)))
     factor = distance / middle if middle > 0 else 1.0

@@ -12,24 +12,19 @@ from itertools import pairwise
 
 import numpy as np
 
-from nextview.sensing.agreement import SHARP, Agreement, SurfaceView, compare
+from nextview.sensing.agreement import Agreement, SurfaceView, compare
+from nextview.sensing.mistakes import LEAST_EXPLAINED, explains, relative_change
 from nextview.types import Float, Index, Mask
 
 FRAME_SHIFTS = (1, -1, 2, -2)  # frames by which the poses of a part may be late
 MOST_SHIFTED = 4  # frames by which poses may be late after several parts
 # parts that are searched for, one inside the other or one after the other
 MOST_PARTS = 3
-# the shift is named if at most this part of the contradictions is left without it
-FEWER_CONTRADICTIONS = 0.5
-LEAST_EXPLAINED = 100  # contradictions that a shift has to explain
 LEAST_OF_ALL = 0.1  # part of all contradictions that each further part has to explain
-LEAST_CONCERNED = 0.01  # ... and the share of the points that it concerns
-LEAST_OVERLAP = 0.5  # part of these points that can still be judged without it
 SAME_EXPLAINED = 1e-3  # contradictions that one more frame in a part has to explain
 # part of what parts explain that the same parts explain where the first frames are taken to be
 # right
 AS_GOOD = 0.5
-SAME_POSE = 1e-3  # metres, and parts of a rotation, up to which two poses are the same
 
 
 @dataclass(frozen=True)
@@ -101,7 +96,6 @@ class Shifted:
             found = compare(
                 self.views,
                 self.poses_of(late),
-                sharpness=SHARP,
                 looked_up_with=looked_up_with,
             )
             usable = self.has_pose(late)[:, None] & self.has_pose(late_there)
@@ -248,26 +242,7 @@ def _is_explained(shifted: Shifted, as_read: Index, late: Index) -> bool:
     changed = relative_change(shifted.poses_of(as_read), shifted.poses_of(late))
     changed &= usable[:, None] & usable
     before = shifted.agreement(as_read, as_read).among(changed)
-    after = shifted.agreement(late, late).among(changed)
-    explained = before.contradicted.sum() - after.contradicted.sum()
-    return bool(
-        explained >= LEAST_EXPLAINED
-        and explained >= LEAST_CONCERNED * before.judged
-        and after.judged >= LEAST_OVERLAP * before.judged
-        and 1 - after.share <= FEWER_CONTRADICTIONS * (1 - before.share)
-    )
-
-
-def relative_change(poses: Float, others: Float) -> Mask:
-    """Of which two cameras the pose relative to each other differs, (N, N).
-
-    Args:
-        poses: camera-to-world, (N, 4, 4).
-        others: the same cameras with other poses, (N, 4, 4).
-    """
-    relative = np.linalg.inv(poses)[:, None] @ poses[None]
-    other_relative = np.linalg.inv(others)[:, None] @ others[None]
-    return np.abs(relative - other_relative).max((2, 3)) > SAME_POSE
+    return explains(before, shifted.agreement(late, late).among(changed))
 
 
 def _parts(late: Index) -> list[Shift]:
