@@ -1,19 +1,29 @@
-"""Real frames of things on a table, one view each: what they are called, and where their scans lie.
+"""Real frames of things on a table, one view each: things that were taught, or none of which was.
 
-    python benchmarks/real_frames.py FOLDER SCANS [--models ycb] [--network CARD]
+    python benchmarks/real_frames.py taught FOLDER SCANS [--models ycb] [--network CARD]
+    python benchmarks/real_frames.py untaught FOLDER [--models ycb] [--show] [--network CARD]
 
-FOLDER holds frames: NAME.depth.png (uint16, millimetres), NAME.labels.png (uint8, what each pixel
-shows) and names.txt, a line a label, the first of what is none. No pose of the camera is known: up
-is the normal of the table. SCANS holds the scans of the things that the memory knows, in metres, by
-their names.
+No camera pose is known: up is the normal of the table. Nothing is drawn at random. ``--network``
+is the card of a network of ``nextview train segmentation`` in place of the bundled one.
 
-Each thing is given once by a point, the median of what its label shows, and once by its label as a
-mask. Printed are the answer by features and size alone and with the geometry, whether the thing is
-among the first three, the belief in the answer, its residual, and the intersection over union of
-the label with the outline of the posed scan (of the true thing, if it is among the hypotheses; what
-stands before it is not taken off). Labels of few pixels are left out.
+``taught``: FOLDER holds frames: NAME.depth.png (uint16, millimetres), NAME.labels.png (uint8, the
+label of each pixel) and names.txt, a line for each label, the first for the background. SCANS holds
+the scans of the things that the memory knows, in metres, by their names. Each thing is selected
+once by a point, the median of the positions under its label, and once by its label as a mask.
+Printed are the answer by features and size alone and with the geometry, whether the thing is among
+the first three, the belief in the answer, its residual, and the intersection over union of the
+label with the outline of the posed scan (of the true thing, if it is among the hypotheses; what
+stands before it is not taken off). Labels of few pixels are left out. Then a scene looks at each
+frame; printed are its right and wrong names.
+
+``untaught``: FOLDER holds a folder for each frame: depth.png (uint16, millimetres) and K.json (fx,
+fy, cx, cy, with the middle of the first pixel at 0). Each frame is given to a scene of its own.
+Every name is wrong, so none of them should be confident. Printed are the objects that were found,
+those with a name, and those with a confident one; with ``--show`` each confident name, its pixels
+and how uncertain its pose is.
 """
 
+import json
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,12 +33,14 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 from PIL import Image
+from rich.progress import track
+from tyro.extras import subcommand_cli_from_dict
 
 import nextview
 from nextview.errors import ObservationError, UsageError
 from nextview.geometry.mesh import load_mesh
 from nextview.geometry.observation import Observation
-from nextview.scene.objects import UNKNOWN_NAME
+from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.segmentation.instances import LearnedSegmenter, Segmenter
 from nextview.sensing import Frame, ObservedObject
 from nextview.things.memory import TaughtRecogniser
@@ -70,6 +82,25 @@ class Named:
     residual: float
     overlap: float
     seconds: float
+
+
+@dataclass
+class Counts:
+    """What was found in some frames.
+
+    Attributes:
+        frames: that were taken in.
+        refused: frames in which no table was seen.
+        objects: that were found.
+        named: of these, those with a name.
+        confident: of these, those whose name is confident.
+    """
+
+    frames: int = 0
+    refused: int = 0
+    objects: int = 0
+    named: int = 0
+    confident: int = 0
 
 
 def memory_with_surfaces(models: str, scans: Path) -> TaughtThings:
@@ -246,7 +277,7 @@ def print_scenes(
     )
 
 
-def main(
+def taught(
     folder: tyro.conf.Positional[Path],
     scans: tyro.conf.Positional[Path],
     models: str = "ycb",
@@ -299,5 +330,64 @@ def main(
     print_scenes(nextview.load(models), paths, names, matrix, learned)
 
 
+def frame_in(folder: Path) -> Frame:
+    """The frame that a folder holds, without a pose."""
+    fx, fy, cx, cy = json.loads((folder / "K.json").read_text())
+    depth = np.asarray(Image.open(folder / "depth.png"))
+    return Frame(depth, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]))
+
+
+def in_words(name: str, thing: SceneObject) -> str:
+    """A row of a table on a confident name."""
+    pixels = max(int(mask.sum()) for mask in thing.pixels.values())
+    return f"| {name} | {thing.name} | {pixels} | {thing.pose_uncertainty} |"
+
+
+def untaught(
+    folder: tyro.conf.Positional[Path],
+    models: str = "ycb",
+    show: bool = False,
+    network: Path | None = None,
+) -> None:
+    """Count what is found in the frames of a folder, and what gets a name.
+
+    Args:
+        folder: of the frames.
+        models: memory of things, none of which is in the frames.
+        show: whether each confident name is printed.
+        network: card of a segmentation network; None for the bundled one.
+    """
+    frames = sorted(path.parent for path in folder.glob("*/depth.png"))
+    if not frames:
+        raise UsageError(f"{folder}: holds no folder with a depth.png")
+    system = nextview.load(models=models)
+    learned = None if network is None else LearnedSegmenter(network)
+    counts = Counts()
+    rows = []
+    for path in track(frames, f"frames of {folder.name}"):
+        scene = nextview.Scene(system, up=None, segmentation=learned)
+        try:
+            scene.update(frame_in(path))
+        except ObservationError as error:
+            counts.refused += 1
+            print(f"{path.name}: {error}")
+            continue
+        sure = [thing for thing in scene.objects if thing.confident]
+        counts.frames += 1
+        counts.objects += len(scene.objects)
+        counts.named += sum(thing.name != UNKNOWN_NAME for thing in scene.objects)
+        counts.confident += len(sure)
+        rows += [in_words(path.name, thing) for thing in sure]
+
+    if show:
+        print("| frame | name | pixels | uncertainty |", "|---|---|---|---|", sep="\n")
+        print("\n".join(rows))
+    share = counts.confident / max(counts.objects, 1)
+    print(
+        f"{counts.frames} frames taken in, {counts.refused} refused: {counts.objects} objects,"
+        f" {counts.named} with a name, {counts.confident} with a confident one ({share:.3f})"
+    )
+
+
 if __name__ == "__main__":
-    tyro.cli(main)
+    subcommand_cli_from_dict({"taught": taught, "untaught": untaught})

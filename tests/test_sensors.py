@@ -12,7 +12,7 @@ from scipy.stats import norm
 
 import nextview
 from nextview import SimulatedCamera, ViewSphere
-from nextview.data.rendering import Deform, RenderOptions, render
+from nextview.data.rendering import Deform, RenderOptions, render, rotations
 from nextview.data.samples import sample_mesh
 from nextview.data.store import ViewStore
 from nextview.errors import DatasetError, UsageError
@@ -430,6 +430,27 @@ def test_what_has_no_unit_and_what_a_mix_looks_at_is_as_large_as_the_sensor_says
         SensedCamera(ball, "mix", rng(31)).sensor
         == SensedCamera(BALL, "mix", rng(31)).sensor
     )
+
+
+def test_another_seed_of_the_noise_shows_the_same_turns_with_other_errors(
+    furniture,
+    tmp_path,
+):
+    stores = []
+    for seed in (None, 1):
+        options = RenderOptions(
+            split="test",
+            sensor="wrist",
+            deform=Deform(rotated=True),
+            noise_seed=seed,
+        )
+        path = tmp_path / f"{seed}.zarr"
+        list(render(furniture, path, FEW, workers=0, options=options))
+        stores.append(ViewStore.open(path))
+
+    np.testing.assert_array_equal(*map(rotations, stores))
+    first, again = (store.depth(0) for store in stores)
+    assert not np.array_equal(first, again)
 
 
 def test_a_store_of_a_sensor_shows_true_sizes_and_resumes_with_no_other_unit(

@@ -63,6 +63,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"examples/arm_over_table": (
         "needs the YCB scans; research/tests/test_arm_over_table.py has files of a few"
     ),
+    r"benchmarks/(real_frames|segmentation)\.py": "needs real frames, which are not part of this",
     r"^python benchmarks/tables\.py": "needs scans of all things that the bundled memory knows",
     r"^make ": "the workflow is run by tests/test_workflow.py",
     r"^(pip|python3 -m pip) ": "installs; tests/test_wheel.py installs the wheel with each extra",
@@ -85,7 +86,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
         "needs a recording of the reader's; tests/test_recordings.py writes such and reads them"
     ),
     r"-m zipfile|efficientnet|resnet34-b627a593": "weights of others, which are fetched first",
-    r"research\.(film|real_things|touching_things|growth|point_pairs)|(verified|many)_things": (
+    r"research\.(film|growth|point_pairs)|(verified|many)_things": (
         "needs the YCB scans, and minutes"
     ),
     r"look_alikes|benchmark-things (YCB|HALF_SCANS)|joined_things": (
@@ -114,7 +115,7 @@ NOT_RUN = {  # commands by how they begin, or what is in them; the reason
 NEEDS = {  # what a command or a Python block needs besides the base installation, by what is in it
     r"nextview (train|export) ": "nextview[train]",
     r"nextview (benchmark|benchmark-things|evaluate|report) ": "nextview[benchmark]",
-    r"benchmarks/(ablations|things|views)\.py|research\.(measure_study|example_maps)": (
+    r"benchmarks/(ablations|views)\.py|research\.(measure_study|example_maps)": (
         "nextview[benchmark]"
     ),
     r"benchmarks/ablations\.py": "nextview[train]",
@@ -143,7 +144,6 @@ SMALL = {  # options that make a command quick
     "python -m research.measure": "--workers 1",
     "python -m research.plan": "--workers 1",
     "python benchmarks/views.py": "--runs 2",
-    "python benchmarks/things.py": "--runs 1",
 }
 FEWER = {  # what a page says of the published runs, and how many it is here
     r"--scenes \d+": "--scenes 4",

@@ -23,7 +23,7 @@ from nextview.session.style import ACCENT, BLUE, FAINT, FIGURE_STYLE, INK, Plain
 from nextview.session.view import View
 
 IMAGES = Path(__file__).parents[1] / "images"
-RESULTS = Path(__file__).parents[1] / "results.md"
+RESULTS = Path(__file__).parents[1] / "results_classes.md"
 START = 33
 """A view from above, in which a table could be a desk."""
 SPHERE = ViewSphere.named("40")
@@ -253,7 +253,7 @@ def gain(view: View) -> Figure:
 
 def calibration() -> Figure:
     """Mean belief in the answer and how often it is right, by views fused: the measurements of
-    docs/results.md.
+    docs/results_classes.md.
     """
     part = RESULTS.read_text().split("\n## Calibration\n")[1].split("\n## ")[0]
     rows = re.findall(

@@ -1,0 +1,60 @@
+"""The sentences on the page of error messages are those of the source."""
+
+import ast
+import re
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import nextview
+from nextview.files import OVERWRITE
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs/error_messages.md").read_text(encoding="utf-8")
+SENTENCES = re.findall(r"^\| `([^`]+)` \|", PAGE, re.M)
+
+
+@cache
+def texts() -> str:
+    """All texts of the source and of the ROS node, a line each.
+
+    What an f-string puts in is left out, except for ``OVERWRITE``.
+    """
+    found = []
+    for top in ("src/nextview", "ros2/nextview_ros/nextview_ros"):
+        for path in sorted((ROOT / top).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.JoinedStr):
+                    found.append("".join(map(_part, node.values)))
+                elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                    found.append(node.value.replace("{where}", "\n"))
+    return "\n".join(found)
+
+
+def _part(value: ast.expr) -> str:
+    if isinstance(value, ast.Constant):
+        return str(value.value)
+    inserted = value.value if isinstance(value, ast.FormattedValue) else None
+    is_overwrite = isinstance(inserted, ast.Name) and inserted.id == "OVERWRITE"
+    return OVERWRITE if is_overwrite else "\n"
+
+
+@pytest.mark.parametrize("sentence", SENTENCES)
+def test_a_sentence_of_the_page_is_one_of_the_source(sentence):
+    for part in sentence.split("…"):
+        assert part.strip() in texts(), part
+
+
+def test_the_page_has_a_sentence_for_each_door():
+    doors = re.split(r"^## ", PAGE, flags=re.M)[1:]
+    assert len(doors) == 7
+    for door in doors:
+        assert len(re.findall(r"^\| `", door, re.M)) >= 5, door.splitlines()[0]
+
+
+def test_a_sentence_of_the_page_is_what_a_user_gets(tmp_path):
+    with pytest.raises(nextview.NextviewError) as raised:
+        nextview.load(str(tmp_path / "missing"))
+    (begin,) = [text for text in SENTENCES if "neither a folder with models" in text]
+    assert begin.strip("…: ") in str(raised.value)
