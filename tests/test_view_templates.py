@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 from test_verification import (
     VIEWS,
@@ -20,6 +21,7 @@ from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.depth_view import MetricImage
+from nextview.things.standing import is_stable
 from nextview.things.view_templates import (
     MOST_ORIENTATIONS,
     TEMPLATE_SIDE,
@@ -82,7 +84,7 @@ def test_a_thing_that_is_turned_about_all_axes_is_named_and_placed(
 def test_one_of_the_first_proposals_is_near_the_truth(templates, seed):
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
     observations, _ = turned_views(THINGS[0], turn)
-    proposals = templates.propose([MetricImage.of(observations[0])], 8)
+    proposals = templates.propose([MetricImage.of(observations[0])])
     own = proposals.rotations[proposals.things == 0]
     off = Rotation.from_matrix(own @ turn.T).magnitude()
     assert np.degrees(off.min()) < 20
@@ -153,7 +155,7 @@ def test_where_almost_nothing_is_seen_nothing_is_proposed(verifier, templates):
     depth = np.zeros_like(observations[0].depth)
     depth[64:66, 64:67] = 3
     speck = replace(observations[0], depth=depth, scene=None)
-    assert not len(templates.propose([MetricImage.of(speck)], 8).things)
+    assert not len(templates.propose([MetricImage.of(speck)]).things)
     with pytest.raises(ObservationError, match="enough of the thing"):
         verifier([speck])
 
@@ -194,9 +196,19 @@ def test_a_thing_is_found_however_it_stands(
     assert (np.diff(found.probabilities) <= 0).all()
 
 
-def test_one_thing_leaves_room_for_others_in_the_proposals_of_several_views(templates):
+def test_several_views_share_the_orientations_of_a_thing(templates):
     observations, _ = turned_views(THINGS[1], np.eye(3))
     images = [MetricImage.of(each) for each in observations]
-    found = templates.propose(images, 60)
-    assert np.bincount(found.things).max() <= MOST_ORIENTATIONS
+    found = templates.propose(images)
     assert set(found.things.tolist()) == {0, 1, 2}
+    assert np.bincount(found.things).max() <= MOST_ORIENTATIONS
+    assert np.bincount(found.things[found.ranks == 0]).tolist() == [len(images)] * 3
+
+
+def test_a_body_stands_where_its_centroid_lies_above_what_touches_the_ground():
+    corners = np.array(trimesh.creation.box((0.1, 0.06, 0.04)).vertices)
+    assert is_stable(corners.T, 0.001)
+    on_an_edge = Rotation.from_euler("x", 30, degrees=True).apply(corners)
+    assert not is_stable(on_an_edge.T, 0.001)
+    off_centre = corners - (0.08, 0, 0)  # its weight is far out on one side
+    assert not is_stable(off_centre.T, 0.001)

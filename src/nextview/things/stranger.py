@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nextview.things.below_ground import ground_height
 from nextview.things.depth_view import DepthView
 from nextview.things.registration import (
     FINE,
@@ -37,6 +36,7 @@ from nextview.things.registration import (
     rotations_of,
     scan_errors,
 )
+from nextview.things.standing import ground_height
 from nextview.things.surface import SurfaceCaster
 from nextview.things.verification import PixelModel, likelihood
 from nextview.things.weighing import EvidenceWeights

@@ -14,7 +14,7 @@ from nextview.recognition.model_card import Verification
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
 from nextview.things.unknown import KnownResiduals
-from nextview.things.verifier import Verified, Verifier, rival_turns
+from nextview.things.verifier import UNUSUAL, Verified, Verifier, rival_turns
 from nextview.things.weighing import EvidenceWeights
 from nextview.types import Float, Floats
 
@@ -214,7 +214,8 @@ class TaughtThings:
         """Share of known things that are explained as badly by the likeliest hypothesis.
 
         What is of another order of size than the likeliest thing is none of them, whatever its
-        few pixels say: it gets the least p-value that there is.
+        few pixels say: it gets the least p-value that there is. Few things do not stand on the
+        ground that is seen below them.
 
         Args:
             observations: the views.
@@ -236,13 +237,14 @@ class TaughtThings:
 
         explained = float(found.explained[0].mean())
         noise_share = float(found.noise_share[0].mean())
-        return self.residuals.of_real_camera(
+        p_value = self.residuals.of_real_camera(
             found.residual,
             likeliest,
             views,
             explained,
             noise_share,
         )
+        return p_value if found.stands[0] else UNUSUAL * p_value
 
 
 def weights_of(verification: Verification, where: str) -> EvidenceWeights:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from nextview.errors import ObservationError
 from nextview.geometry.observation import Observation
 from nextview.recognition.model_card import Symmetry
-from nextview.things.below_ground import BelowGround, below_ground
 from nextview.things.depth_view import DepthView, MetricImage
 from nextview.things.ground import levelling
 from nextview.things.registration import (
@@ -29,14 +28,17 @@ from nextview.things.registration import (
     rotations_of,
     start,
 )
+from nextview.things.standing import Standing, standing
 from nextview.things.stranger import Comparison, log_odds_of_stranger
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.verification import PixelModel, ViewLikelihood, likelihood
 from nextview.things.view_templates import ViewTemplates, rank_within
 from nextview.things.weighing import EvidenceWeights, JudgedEpisode
-from nextview.types import Float, Index
+from nextview.types import Float, Index, Mask
 
-PROPOSALS = 120  # orientations of things that are aligned, of all views together
+# share of things that do not stand on what is seen below them: they lean on something, or hang
+UNUSUAL = 0.1
+THINGS_TRIED = 8  # likeliest things of which all proposed orientations are aligned
 RIVAL_STEPS = 24  # in which a thing of which any turn is nearly a symmetry is turned
 RIVAL_THINGS = 2  # likeliest things that are turned
 
@@ -93,6 +95,8 @@ class Verified:
             of all views together, (M,) float64.
         below: by how much each hypothesis reaches below the ground, (M,) float64, metres; 0 where
             noise, tilt and errors of the scan explain it.
+        stands: whether each hypothesis touches the ground, and would not fall over, (M,) bool;
+            True where no view shows the ground.
     """
 
     belief: Float
@@ -109,6 +113,7 @@ class Verified:
     noise_share: Float
     seen_behind: Float
     below: Float
+    stands: Mask
 
     def select(self, rows: NDArray) -> "Verified":
         """Some of the hypotheses, by index or mask."""
@@ -164,6 +169,7 @@ OF_HYPOTHESES = (
     "noise_share",
     "seen_behind",
     "below",
+    "stands",
 )
 """What ``Verified`` holds of each hypothesis, beside its probability and prior belief."""
 
@@ -185,12 +191,21 @@ class _Proposed:
     by_outline: Float
 
     def select(self, rows: NDArray) -> "_Proposed":
-        """Some of the hypotheses, by index."""
+        """Some of the hypotheses, by index or mask."""
         return replace(
             self,
             things=self.things[rows],
             rotations=self.rotations[rows],
             log_belief=self.log_belief[rows],
+        )
+
+    def followed_by(self, others: "_Proposed") -> "_Proposed":
+        """These hypotheses, and others after them."""
+        return replace(
+            self,
+            things=np.concatenate([self.things, others.things]),
+            rotations=np.concatenate([self.rotations, others.rotations]),
+            log_belief=np.concatenate([self.log_belief, others.log_belief]),
         )
 
 
@@ -250,7 +265,7 @@ class Verifier:
         else:
             images, level = _levelled(observations)
 
-        found = self.templates.propose(images, PROPOSALS)
+        found = self.templates.propose(images)
         if not len(found.things):
             raise ObservationError(
                 "no view shows enough of the thing to be compared with others"
@@ -264,7 +279,9 @@ class Verifier:
             log_belief=by_outline[found.things],
             by_outline=belief / belief.sum(),
         )
-        return self._settled(proposed, images, level)
+        return self._settled(
+            *self._started(proposed, found.ranks, images), images, level
+        )
 
     def log_odds_of_stranger(
         self,
@@ -299,26 +316,50 @@ class Verifier:
         """Pictures of the things from all around, which propose orientations."""
         return ViewTemplates(self.caster)
 
+    def _started(
+        self,
+        proposed: _Proposed,
+        ranks: Index,
+        images: Sequence[MetricImage],
+    ) -> tuple[_Proposed, Alignment]:
+        """The first orientation of each thing, and all of the things that explain the views best.
+
+        Args:
+            proposed: orientations of things.
+            ranks: how many orientations of the same thing come before each, (M,).
+            images: the views.
+
+        Returns:
+            What is worth aligning, and where it starts.
+        """
+        stage = STAGES[0]
+        views = [image.view(stage.side) for image in images]
+        first = proposed.select(ranks == 0)
+        tried = start(first.things, first.rotations, len(views))
+        tried = centred(self.caster, tried, views)
+        tried = align(self.caster, tried, views, stage.levels, self.prior)
+        order = np.argsort(-self._scores(first, tried, views)[0], kind="stable")
+
+        best = list(dict.fromkeys(first.things[order].tolist()))[:THINGS_TRIED]
+        others = proposed.select((ranks > 0) & np.isin(proposed.things, best))
+        alignment = start(others.things, others.rotations, len(views))
+        alignment = centred(self.caster, alignment, views)
+        return first.followed_by(others), joined(tried, alignment)
+
     def _settled(
         self,
         proposed: _Proposed,
+        alignment: Alignment,
         images: Sequence[MetricImage],
         level: Float,
     ) -> Verified:
         """The proposals aligned and judged, coarse to fine, in a frame that was turned to be
         level.
         """
-        views = [image.view(STAGES[0].side) for image in images]
-        alignment = start(proposed.things, proposed.rotations, len(views))
-        alignment = centred(self.caster, alignment, views)
-
         for stage in STAGES:
             views = [image.view(stage.side) for image in images]
             alignment = align(self.caster, alignment, views, stage.levels, self.prior)
-            judged = self._judge(alignment, views)
-            mean = np.stack([view.mean for view in judged], 1)
-            costs = camera_cost(alignment, views, self.prior)
-            scores = self.weights.scores(mean, costs, proposed.log_belief)
+            scores, costs, judged = self._scores(proposed, alignment, views)
 
             order = np.argsort(-scores, kind="stable")
             order = order[scores[order] >= scores[order[0]] - stage.hopeless]
@@ -343,6 +384,20 @@ class Verifier:
             level,
         )
 
+    def _scores(
+        self,
+        proposed: _Proposed,
+        alignment: Alignment,
+        views: Sequence[DepthView],
+    ) -> tuple[Float, Float, list[ViewLikelihood]]:
+        """Log-likelihoods of hypotheses, (M,), and the cameras' costs and pixels behind them."""
+        ground = self._standing(alignment, views)
+        judged = self._judge(alignment, views, ground)
+        mean = np.stack([view.mean for view in judged], 1)
+        costs = camera_cost(alignment, views, self.prior)
+        scores = self.weights.scores(mean, costs, proposed.log_belief)
+        return scores + np.where(ground.stands, 0, np.log(UNUSUAL)), costs, judged
+
     def _rivals(self, alignment: Alignment) -> tuple[Alignment, Index]:
         """The likeliest hypotheses in the poses in which their things hardly look different.
 
@@ -366,20 +421,20 @@ class Verifier:
         self,
         alignment: Alignment,
         views: Sequence[DepthView],
+        ground: Standing,
     ) -> list[ViewLikelihood]:
-        below = self._below(alignment, views).share
         return [
             likelihood(
                 view,
                 render(self.caster, alignment, view, number),
                 self.pixels,
-                below,
+                ground.below,
             )
             for number, view in enumerate(views)
         ]
 
-    def _below(self, alignment: Alignment, views: Sequence[DepthView]) -> BelowGround:
-        return below_ground(self.caster, alignment, views, self.prior.tilt)
+    def _standing(self, alignment: Alignment, views: Sequence[DepthView]) -> Standing:
+        return standing(self.caster, alignment, views, self.prior.tilt)
 
     def _verified(
         self,
@@ -398,6 +453,7 @@ class Verifier:
         visible = np.sum([view.visible for view in judged], axis=0)
         behind = np.sum([view.seen_behind for view in judged], axis=0)
         aligned = alignment.turned(level.T)
+        ground = self._standing(alignment, views)
         shares = np.exp(scores - scores.max())
         return Verified(
             belief=self.weights.belief(scores, alignment.things, proposed.by_outline),
@@ -413,7 +469,8 @@ class Verifier:
             misfit=np.stack([view.misfit for view in judged], 1),
             noise_share=np.stack([view.noise_share for view in judged], 1),
             seen_behind=behind / np.maximum(visible, 1),
-            below=self._below(alignment, views).depth,
+            below=ground.depth,
+            stands=ground.stands,
         )
 
 

@@ -29,6 +29,7 @@ TEMPLATE_REACH = 2.2  # from its centre to its borders, root mean squares of the
 RENDERING_PIXELS = 28  # rows and columns of pixels of a rendering
 TEMPLATE_DISTANCE = 5.0  # of the camera from the centre, radii
 MOST_ORIENTATIONS = 16  # of one thing that are proposed
+THINGS_PROPOSED = 40  # things that are proposed, the likeliest by their outlines
 FEWEST_OUTLINE_PIXELS = 12  # of an outline that can be compared
 SPECK = 0.05  # of the largest part of an outline, below which a part is noise
 
@@ -58,16 +59,18 @@ class Pictures:
 
 @dataclass(frozen=True, eq=False)
 class OrientedProposals:
-    """Hypotheses of things in any orientation, the likeliest first.
+    """Hypotheses of things in any orientation.
 
     Attributes:
         things: thing of each, (M,) int64.
+        ranks: how many orientations of its thing suit its view better, (M,) int64.
         rotations: from the axes of the scan files to the object frame, (M, 3, 3) float64.
         log_belief: in each thing by outline, size and the shape of the depth, up to a constant,
             (T,) float64.
     """
 
     things: Index
+    ranks: Index
     rotations: Float
     log_belief: Float
 
@@ -105,47 +108,48 @@ class ViewTemplates:
             np.array([one[2] for one in found]),
         )
 
-    def propose(self, images: Sequence[MetricImage], count: int) -> OrientedProposals:
-        """The likeliest things and orientations, given what some views show.
+    def propose(self, images: Sequence[MetricImage]) -> OrientedProposals:
+        """Orientations of the likeliest things, given what some views show.
 
         Each view proposes orientations, of things that suit all of the views.
 
         Args:
             images: the views, of one thing.
-            count: number of proposals of all views together, of which at most MOST_ORIENTATIONS
-                are of one thing.
 
         Returns:
-            The proposals; none where too little is seen.
+            Up to MOST_ORIENTATIONS of each of THINGS_PROPOSED things; none where too little is
+            seen.
         """
         known = int(self.things.max()) + 1
         views = [one for one in map(seen, images) if one is not None]
         if not views:
             nothing = np.zeros(0, np.int64)
-            return OrientedProposals(nothing, np.zeros((0, 3, 3)), np.zeros(known))
+            return OrientedProposals(
+                nothing, nothing, np.zeros((0, 3, 3)), np.zeros(known)
+            )
 
         fits = [self._fit(pictures) for pictures, _ in views]
         of_things = np.full((len(views), known), np.inf)
         for row, (best, _) in enumerate(fits):
             np.minimum.at(of_things[row], self.things, best)
         together = of_things.sum(0)
+        likely = np.zeros(known, bool)
+        likely[np.argsort(together, kind="stable")[:THINGS_PROPOSED]] = True
 
         of_one = max(1, MOST_ORIENTATIONS // len(views))
-        things = []
-        rotations = []
-        for (best, turn), own, (_, look) in zip(fits, of_things, views, strict=True):
-            others = (together - own)[self.things]
-            order = np.argsort(best + others, kind="stable")
+        proposed = []
+        for (best, turn), (_, look) in zip(fits, views, strict=True):
+            order = np.argsort(best, kind="stable")
+            order = order[likely[self.things[order]]]
             rank = rank_within(self.things[order])
-            order = order[rank < of_one][: max(1, count // len(views))]
+            order = order[rank < of_one]
             turns = rotation_z(2 * np.pi * turn[order] / TURNS)
-            things.append(self.things[order])
-            rotations.append(look @ turns @ self.rotations[order])
-        return OrientedProposals(
-            np.concatenate(things),
-            np.concatenate(rotations),
-            -together / len(views),
+            rotations = look @ turns @ self.rotations[order]
+            proposed.append((self.things[order], rank[rank < of_one], rotations))
+        things, ranks, rotations = (
+            np.concatenate(parts) for parts in zip(*proposed, strict=True)
         )
+        return OrientedProposals(things, ranks, rotations, -together / len(views))
 
     def _fit(self, pictures: Pictures) -> tuple[Float32, Index]:
         """Least cost of each template, and the turn in the image plane that has it, (N,) each."""
