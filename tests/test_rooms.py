@@ -15,7 +15,7 @@ from nextview.sensing.facets import Noise, fit_facets
 from nextview.sensing.object_frame import enclose
 from nextview.sensing.outliers import without_outliers
 from nextview.sensing.planes import Plane, sample
-from nextview.sensing.walls import before_walls, find_walls
+from nextview.sensing.walls import find_walls
 
 UP = np.array([0, 0, 1.0])
 EXACT = Noise(np.ones(1), np.zeros(1))
@@ -133,9 +133,11 @@ def test_walls_are_found_and_no_side_of_a_cupboard_is_one(walls, sigma):
     noise = Noise(np.array([1.0]), np.array([sigma]))
     samples = sample(seen, seen.depth > 0, noise)
     found = find_walls(samples, Plane(UP, 0.0), np.random.default_rng(0))
-    before = before_walls(seen, found, noise) & (seen.depth > 0)
-    assert before[which >= 2].sum() <= 0.03 * (which >= 2).sum()
-    assert before[(which == 0) & (seen.depth > 0)].mean() > 0.8
+    of_walls = (which >= 2) & (seen.depth > 0)
+    if found:
+        apart = np.abs([seen.along(wall.normal, wall.offset) for wall in found]).min(0)
+        # noise moves a point along its ray, so that some are farther off
+        assert (apart[of_walls] < 0.02 + 3 * sigma * 3.0**2).mean() > 0.9
     assert len(found) == sum(
         (which == 2 + k).mean() > 0.03 for k in range(len(ROOMS[walls]))
     )

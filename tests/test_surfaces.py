@@ -132,6 +132,11 @@ def test_what_stands_on_nothing_seen_is_left_out(ycb, table_and_distant_box):
     assert "1 thing" in look.warnings[-1].message
     assert all(warning.name != "unexplained" for warning in look.warnings)
 
+    scene = Scene(ycb, segmentation=lambda _: (camera.owner == 4)[None])
+    look = scene.update(frame)
+    assert not scene.objects
+    assert "empty" not in [warning.name for warning in look.warnings]
+
 
 def test_further_views_keep_to_the_ground(ycb, small_table):
     camera = LabelledCamera(small_table)

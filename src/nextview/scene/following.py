@@ -26,8 +26,6 @@ FEWEST_TESTED = 30  # pixels in which an object should show before it is called 
 GONE = 0.6  # share of these through which something behind it is seen
 STEP_BEHIND = 0.02  # metres by which that lies behind it, at least
 THERE = 0.6  # share of the pixels in which it should show, from which an object is seen again
-# share of the pixels of two objects that are of both, above which they are one
-SAME_PIXELS = 0.5
 FEWEST_AGAINST = 2  # objects that a frame with a wrong pose contradicts, at least
 
 

@@ -83,7 +83,8 @@ class SceneState:
                 ViewWarning("left unknown", f"{what}, the largest first", holds=False)
             )
 
-        if self.tops and (left_out := len(self.tops[-1].carried_by_none)):
+        left_out = len(self.tops[-1].carried_by_none) if self.tops else 0
+        if left_out:
             things = number_of(left_out, "thing")
             what = f"{things} in the last frame left out: no surface that is seen carries them"
             remarks.append(ViewWarning("left out", what, holds=False))
@@ -93,6 +94,6 @@ class SceneState:
             what = f"{area:.0f} square centimetres in view are neither ground nor an object"
             why = "is the ground another plane, or is much of a thing not told apart?"
             remarks.append(ViewWarning("unexplained", f"{what}: {why}", holds=False))
-        elif self.tops and not self.tracks:
+        elif self.tops and not self.tracks and not left_out:
             remarks.append(EMPTY_WARNING if self.ground_seen else UNSEEN_GROUND)
         return tuple(remarks)

@@ -12,10 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.random import Generator
-from scipy import ndimage
 
-from nextview.sensing.facets import Noise
-from nextview.sensing.frame import Frame
 from nextview.sensing.planes import Plane, Samples, steep
 from nextview.types import Float, Index, Mask
 
@@ -34,12 +31,6 @@ OVER_CAMERA = 0.3  # metres of a ceiling over the camera, at least
 CEILINGS_TRIED = 50  # heights
 # cosine of the angle up to which two planes are parallel
 PARALLEL_WALLS = np.cos(np.radians(25.0))
-COARSE_WIDTH = 320  # columns of the picture in which pixels are compared with walls
-# pixels of that picture across the square over which the distance from a wall is averaged
-MEAN_SIDE = 3
-WALL_NOISE = 2.0  # standard deviations of one pixel up to which a mean is on the wall
-# distance from a wall up to which a pixel is on it without noise, as a part of its depth
-WALL_ERROR = 0.006
 # how far behind a wall noise may put the camera, as a part of the distance of what it sees
 CAMERA_BEHIND = 0.1
 # from the next wall to a sample of a wall that meets it, as a part of its distance, at most
@@ -127,53 +118,6 @@ def _ceiling(samples: Samples, plane: Plane, place: Float | None) -> Plane | Non
         return None
     beyond = ceiling.height(samples.points) < -2 * samples.tolerance
     return None if beyond.sum() > MOST_SAMPLES_BEHIND * len(on) else ceiling
-
-
-def before_walls(frame: Frame, walls: Sequence[Plane], noise: Noise) -> Mask:
-    """Pixels that are farther before every wall than the noise of the frame explains, (H, W) bool.
-
-    At some metres the noise of a pixel is as deep as a thing that stands against the wall. So what
-    counts is the mean over the pixels around each, in a coarser picture; beside a thing that is off
-    the wall, and the pixel is not.
-
-    Args:
-        frame: of the depth camera.
-        walls: vertical planes that were found in it.
-        noise: of its pixels.
-    """
-    if not walls:
-        return np.ones(frame.shape, bool)
-    step = max(1, round(frame.shape[1] / COARSE_WIDTH))
-    few = (slice(None, None, step), slice(None, None, step))
-    depth = frame.depth[few]
-    known = (depth > 0).astype(np.float32)
-    share = np.maximum(
-        ndimage.uniform_filter(known, MEAN_SIDE, mode="constant"),
-        np.float32(1e-6),
-    )
-    deviation = (noise.at(depth) * depth**2).astype(np.float32)
-
-    before = known > 0
-    for wall in walls:
-        # Noise moves a point along its ray: it comes nearer to the wall by so much as the ray does.
-        distance = frame.along(wall.normal, wall.offset)[few]
-        camera = float(wall.normal @ frame.camera_to_world[:3, 3] + wall.offset)
-        slope = np.abs(distance - np.float32(camera)) / np.maximum(
-            depth,
-            np.float32(1e-6),
-        )
-        mean = (
-            ndimage.uniform_filter(distance * known, MEAN_SIDE, mode="constant") / share
-        )
-        noise_there = deviation * slope
-        error = np.float32(WALL_ERROR) * depth
-        before &= (mean > WALL_NOISE * noise_there + error) & (
-            distance > noise_there + error
-        )
-    return np.repeat(np.repeat(before, step, 0), step, 1)[
-        : frame.shape[0],
-        : frame.shape[1],
-    ]
 
 
 def _largest_upright_plane(
