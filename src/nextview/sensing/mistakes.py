@@ -35,9 +35,8 @@ NO_OVERLAP = 0.25
 # Share of the judgements that has to confirm without a mistake. The errors of a usual calibration
 # leave .88; of real frames whose poses are in any order, no mistake makes more than .2 confirm.
 WELL_EXPLAINED = 0.75
-HALF_AGREES = (
-    0.5  # of two frames: share that confirms if most of what they show stands still
-)
+# of two frames: share that confirms if most of what they show stands still
+HALF_AGREES = 0.5
 # Cameras stand in one place within this part of the depth: less of a move does not show.
 ONE_PLACE = ROUGH.depth_tolerance
 SAME_POSE = 1e-3  # metres, and parts of a rotation, up to which two poses are the same
@@ -215,9 +214,11 @@ def likeliest(
             )
         if _in_one_place(right):
             continue
+
         changed = relative_change(posed.poses, right.poses)
         before = as_read.among(changed)
         after = compare(right.views, right.poses).among(changed)
+
         confirmed = float(after.confirmed.sum())
         if confirmed > most_confirmed and _explains_all(before, after, posed, changed):
             best = mistake
@@ -426,13 +427,13 @@ def mistakes_in_poses(to_world: bool = True) -> list[Mistake]:
     Args:
         to_world: whether camera-to-world poses were expected.
     """
-    expected, other = "camera-to-world", "world-to-camera"
-    if not to_world:
-        expected, other = other, expected
+    expected = "camera-to-world" if to_world else "world-to-camera"
+    other = "world-to-camera" if to_world else "camera-to-world"
     wrong = f"{expected} ones are expected, and"
     opencv = "and OpenCV's are expected (x right, y down, z forward)"
     opengl = "the camera's axes are those of OpenGL (x right, y up, z backward)"
     ros = "the camera's axes are those of a ROS body (x forward, y left, z up)"
+
     return [
         Mistake(
             "inverse pose",
@@ -466,6 +467,7 @@ def mistakes_in_poses(to_world: bool = True) -> list[Mistake]:
 def _turned_pictures() -> list[Mistake]:
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     by_a_quarter = "the picture is turned to the {} by a quarter turn"
+
     return [
         Mistake(
             "turned left",

@@ -551,10 +551,12 @@ def _fill(
     aligned = rng.random() < ALIGNED
     quarters = base + np.arange(4) * np.pi / 2
     axes = np.c_[np.cos(quarters), np.sin(quarters), np.zeros(4)]
+
     beside: list[Solid] = []
     chosen = int(rng.integers(len(shapes)))
     size = world.scale
     free = rng.random() < 0.3
+
     for _ in range(count):
         if not alike:
             chosen = int(rng.integers(len(shapes)))
@@ -568,6 +570,7 @@ def _fill(
         yaw = rng.choice(quarters) if aligned else rng.uniform(0, 2 * np.pi)
         turn = Rotation.from_euler("z", yaw) * turn
         solid = turn.apply(shape.solid[0] * size), shape.solid[1]
+
         spread = min(ground.reach, world.scale * rng.uniform(0.3, 2.0) * np.sqrt(count))
         on_others = bool(rng.random() < piled)
         near = () if gap or rng.random() < 0.3 else beside
@@ -739,11 +742,13 @@ def photograph(
         sensor = _sensor(rng, shape)
         pose = _camera_pose(world, rng, sensor)
         rays = PinholeCamera.of(sensor.intrinsics, shape).rays.reshape(-1, 3)
+
         depth, owner = caster.cast(pose[:3, 3], rays @ pose[:3, :3].T)
         clean = np.where(np.isfinite(depth), depth, 0).reshape(shape).astype(np.float32)
         if (clean > 0).mean() < 0.2 or np.median(clean[clean > 0]) < 0.12:
             views -= 1  # the camera stands behind or in something
             continue
+
         labels = label_of[owner]
         clean *= _warp(rng, shape)
         measured, source = sensor.measure(clean, rng)

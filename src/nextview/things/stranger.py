@@ -98,19 +98,29 @@ class Stretched:
     factors: Float
 
     def render(self, comparison: Comparison, number: int) -> Rendered:
-        """What the view of this ``number`` would see of it."""
+        """Render it for a view.
+
+        Args:
+            comparison: with the views and the surfaces.
+            number: of the view.
+
+        Returns:
+            Depth and normals of the one hypothesis.
+        """
         view = comparison.views[number]
         aligned = self.alignment
         rotation = aligned.rotations[0]
         centre = aligned.centres[0] + aligned.cameras[0, number]
         origin = (view.origin - centre) @ rotation / self.factors
         rays = view.rays @ rotation / self.factors
+
         origin = origin + comparison.caster.centres[aligned.things[0]]
         depth, normals = comparison.caster.cast(
             aligned.things,
             origin[None].astype(np.float32),
             rays[None].astype(np.float32),
         )
+
         across = normals / self.factors
         lengths = np.linalg.norm(across, axis=2, keepdims=True)
         across = across / np.maximum(lengths, 1e-12) @ rotation.T
