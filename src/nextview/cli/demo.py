@@ -40,7 +40,7 @@ def demo(out: Path | None = None, overwrite: bool = False) -> None:
 
     Args:
         out: folder of the output; by default nextview_demo, in which files are replaced.
-        overwrite: replace files in the folder that --out names.
+        overwrite: replace files in a folder of your own.
     """
     folder = DEMO_FOLDER if out is None else out
     with new_folder(folder, overwrite or out is None) as part:
