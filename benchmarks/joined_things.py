@@ -52,10 +52,10 @@ def read_runs(runs: list[Path]) -> tuple[pd.DataFrame, pd.DataFrame]:
     for run in runs:
         if not (run / "tests.csv").is_file():
             raise UsageError(f"{run}: holds no results of nextview benchmark-things")
-        if reference_of(run) != reference_of(runs[0]):
+        if asked_reference_of(run) != asked_reference_of(runs[0]):
             raise UsageError(
-                f"{run}: is compared with {reference_of(run)}, and {runs[0]} with"
-                f" {reference_of(runs[0])}; run one again with --reference"
+                f"{run}: is compared with {asked_reference_of(run)}, and {runs[0]} with"
+                f" {asked_reference_of(runs[0])}; run one again with --reference"
             )
     measures = [pd.read_csv(run / "measures.csv").assign(set=run.name) for run in runs]
     tests = pd.concat(
@@ -67,6 +67,12 @@ def read_runs(runs: list[Path]) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 def reference_of(run: Path) -> str:
     """The policy that those of a run are compared with."""
+    record = json.loads((run / RECORD).read_text())
+    return str(record.get("compared_with") or record.get("reference", "random"))
+
+
+def asked_reference_of(run: Path) -> str:
+    """The same as it was asked for: the best blind rule of each set may be another."""
     return str(json.loads((run / RECORD).read_text()).get("reference", "random"))
 
 

@@ -123,7 +123,7 @@ class Cast:
             things: those of the memory.
             rng: draws the order.
         """
-        apart = distances_between(things)
+        apart = distances_between(things.verifier.caster.surfaces)
         pairs: list[tuple[str, str]] = []
         left = np.ones(len(apart), bool)
         while len(pairs) < PAIRS:

@@ -6,12 +6,14 @@ import runpy
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 from pipeline import benchmark, refused
 
+from nextview.benchmark import leaderboard
 from nextview.benchmark.leaderboard import promised_risks
 from nextview.benchmark.published import ACCURACY, published, read_table
 from nextview.benchmark.replay import make_specs, replay, truncate
@@ -379,3 +381,14 @@ def test_measured_error_rates_stand_beside_the_promised_ones(
     assert capsys.readouterr().out == ""  # the library prints nothing
     report(rates)
     assert "Promised error rates" in (rates / "report.html").read_text()
+
+
+def test_so_few_objects_that_nothing_can_be_significant_are_warned_of():
+    tests = pd.DataFrame({"policy": ["spread"] * 4, "measure": ["accuracy"] * 4})
+    few = SimpleNamespace(tests=tests.assign(threshold=0.9, low=-0.1, high=0.1))
+    # Of six objects no choice of signs is rarer than 2 of 64, and four tests are corrected.
+    said = leaderboard.too_few(few, 0.9, [f"t{k}" for k in range(6)])
+    assert "no p-value of 6 is below 0.031, and 4 tests" in said
+    assert "Too few objects" in leaderboard.too_few(
+        few, 0.9, [f"t{k}" for k in range(16)]
+    )

@@ -1,13 +1,13 @@
 """Which things look most alike, by their surfaces alone: no answer of a recogniser counts."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from nextview.geometry.viewsphere import rotation_z
-from nextview.things.taught import TaughtThings
+from nextview.things.surface import Surface
 from nextview.types import Float, Mask
 
 COMPARED_SURFACE_POINTS = 300  # by which two things are compared
@@ -17,7 +17,7 @@ RADII_APART = 1.25  # times as large as another, from which a thing is not like 
 
 @dataclass(frozen=True, eq=False)
 class Alikeness:
-    """How alike the things of a memory are.
+    """How alike things are.
 
     Attributes:
         names: of the things.
@@ -48,17 +48,16 @@ class Alikeness:
         return Alikeness(some, nearest, self.distance[rows])
 
 
-def distances_between(things: TaughtThings) -> Float:
+def distances_between(surfaces: Sequence[Surface]) -> Float:
     """Lay the surfaces of things over each other, as they stand in their files.
 
     Args:
-        things: T of known geometry.
+        surfaces: of T things.
 
     Returns:
         Mean distance of two surfaces at the best azimuth, as a share of their mean radius, (T, T)
         float64; infinity where they are of different sizes, and for a thing itself.
     """
-    surfaces = things.verifier.caster.surfaces
     rng = np.random.default_rng(0)
     points = [surface.sample(COMPARED_SURFACE_POINTS, rng) for surface in surfaces]
     points = [cloud - (cloud.max(0) + cloud.min(0)) / 2 for cloud in points]
@@ -79,17 +78,18 @@ def distances_between(things: TaughtThings) -> Float:
     return apart
 
 
-def how_alike(things: TaughtThings) -> Alikeness:
+def how_alike(surfaces: Sequence[Surface]) -> Alikeness:
     """Which other thing is most like each, see ``distances_between``.
 
     Args:
-        things: of known geometry.
+        surfaces: of the things.
 
     Returns:
         The nearest other thing of each.
     """
-    apart = distances_between(things)
+    apart = distances_between(surfaces)
     distance = apart.min(1)
     own = np.arange(len(apart))
     nearest = np.where(np.isfinite(distance), apart.argmin(1), own)
-    return Alikeness(things.names, tuple(things.names[k] for k in nearest), distance)
+    names = tuple(surface.name for surface in surfaces)
+    return Alikeness(names, tuple(names[k] for k in nearest), distance)

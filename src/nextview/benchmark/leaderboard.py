@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from nextview.benchmark.entries import is_oracle
-from nextview.benchmark.statistics import EXACT_FAMILIES
+from nextview.benchmark.statistics import EXACT_FAMILIES, target_families
 from nextview.benchmark.summary import Tables
 from nextview.checks import extras
 
@@ -117,17 +117,23 @@ def nothing_differs(tables: Tables, threshold: float, reference: str) -> str | N
     )
 
 
-def too_few(tables: Tables, threshold: float, objects: int) -> str | None:
+def too_few(tables: Tables, threshold: float, names: Sequence[str]) -> str | None:
     """Return a warning if there are too few objects to compare policies.
 
     Args:
         tables: of the benchmark.
         threshold: of the belief.
-        objects: number of objects.
+        names: of the objects.
 
     Returns:
         The warning; None if there are enough.
     """
+    families = int(target_families(names).max()) + 1
+    corrected = int((tables.tests["measure"] == "accuracy").sum())
+    if hopeless := too_few_families(families, corrected):
+        return hopeless
+
+    objects = len(names)
     tests = _robot_tests(tables, threshold)
     # NaN if nothing was compared
     half = float((tests["high"] - tests["low"]).median() / 2)

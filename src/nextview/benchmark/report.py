@@ -177,7 +177,7 @@ def page(results: Results, store: ViewStore | None, why_not: str) -> str:
         ],
         tests=tests,
         nothing=board.nothing_differs(t, at, reference),
-        warning=board.too_few(t, at, len(p)),
+        warning=board.too_few(t, at, p.names),
         levels=board.level_rows(t),
         level_differences=board.level_differences(t, reference),
         risks=board.promised_risks(t),

@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from nextview.benchmark.own_things import OwnAnswer, OwnThings
 from nextview.errors import ResultsError, UsageError
 from nextview.files import new_file
 from nextview.geometry.mesh import Mesh
@@ -32,11 +34,11 @@ from nextview.simulation.scene import boxes_around
 from nextview.simulation.sensed_camera import SensedCamera
 from nextview.simulation.sensor import sensor_named
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.things.depth_view import depth_view
 from nextview.things.expected_views import Outlook
-from nextview.things.registration import FINE, align, start
+from nextview.things.memory import TaughtRecogniser
+from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
-from nextview.things.verifier import FINE_SIDE, Verified
+from nextview.things.verifier import Verified
 from nextview.types import Float, Floats
 
 Occlusion = Literal["none", "half", "heavy"]
@@ -77,7 +79,7 @@ class ThingEpisode:
 
     def __init__(
         self,
-        things: TaughtThings,
+        things: TaughtThings | OwnThings,
         mesh: Callable[[], Mesh],
         thing: int,
         draw: int,
@@ -87,13 +89,14 @@ class ThingEpisode:
         """Place the thing, or go on with what was kept of it.
 
         Args:
-            things: that may be believed.
+            things: that may be believed: a memory of them, or a recogniser of your own.
             mesh: the mesh of the thing, of known unit, which is asked for when a view has to be
                 sensed.
             thing: its number among them.
             draw: number of the draw.
             setting: how it is shown.
-            folder: where all is kept; None for nowhere.
+            folder: where all is kept; None for nowhere. What a recogniser of your own says is not
+                kept: it may be another the next time.
         """
         self.things = things
         self.thing = thing
@@ -101,9 +104,11 @@ class ThingEpisode:
         self._seed = (setting.seed, thing, draw)
         self._setting = setting
         self._kept = KeptArrays(folder)
+        own = isinstance(things, OwnThings)
+        self._answers = KeptArrays(None) if own else self._kept
         self._stage: _Stage | None = None
         self._views: dict[int, Observation] = {}
-        self._verified: dict[frozenset[int], tuple[Verified, float]] = {}
+        self._verified: dict[frozenset[int], tuple[Verified | OwnAnswer, float]] = {}
         if "start" not in self._kept:
             self._kept["start"] = np.array(self._first_view())
         self.start = int(self._kept["start"])
@@ -150,35 +155,35 @@ class ThingEpisode:
         if camera.true_pose is not None:
             in_camera = np.linalg.inv(camera.true_pose) @ self.stage.in_truth
         self._kept[f"{view}.in_camera"] = in_camera
-        if "true_pose" not in self._kept:
-            self._kept["true_pose"] = self.stage.true_pose
 
     def log_evidence(self, view: int) -> Floats:
         """What the features say of a view that shows the thing."""
         name = f"{view}.evidence"
-        if name not in self._kept:
-            self._kept[name] = self.things.log_evidence([self.observation(view)])[0]
-        return self._kept[name]
+        if name not in self._answers:
+            self._answers[name] = self.things.log_evidence([self.observation(view)])[0]
+        return self._answers[name]
 
     def seen(self, views: Sequence[int]) -> list[int]:
         """Those of some views that show the thing."""
         return [view for view in views if self.observation(view).seen]
 
-    def verified(self, views: Sequence[int]) -> tuple[Verified, float]:
+    def verified(self, views: Sequence[int]) -> tuple[Verified | OwnAnswer, float]:
         """What is found in some views, and the seconds of CPU that it took."""
         used = frozenset(self.seen(views))
         if used not in self._verified:
             name = "-".join(map(str, sorted(used)))
-            needed = {f.name: f"{name}.{f.name}" for f in fields(Verified)}
+            own = isinstance(self.things, OwnThings)
+            answer: Any = OwnAnswer if own else Verified
+            needed = {f.name: f"{name}.{f.name}" for f in fields(answer)}
             # What an earlier version kept lacks parts, and was judged in another way.
             if not all(
-                one in self._kept for one in (*needed.values(), f"{name}.seconds")
+                one in self._answers for one in (*needed.values(), f"{name}.seconds")
             ):
                 self._verify(name, sorted(used))
-            parts = {part: self._kept[one] for part, one in needed.items()}
+            parts = {part: self._answers[one] for part, one in needed.items()}
             self._verified[used] = (
-                Verified(**parts),
-                float(self._kept[f"{name}.seconds"]),
+                answer(**parts),
+                float(self._answers[f"{name}.seconds"]),
             )
         return self._verified[used]
 
@@ -186,9 +191,13 @@ class ThingEpisode:
         observations = [self.observation(view) for view in views]
         begun = time.process_time()
         found = self.things(observations)
-        self._kept[f"{name}.seconds"] = np.array(time.process_time() - begun)
+        self._answers[f"{name}.seconds"] = np.array(time.process_time() - begun)
         for part, values in vars(found).items():
-            self._kept[f"{name}.{part}"] = values
+            self._answers[f"{name}.{part}"] = values
+
+    def named_right(self, views: Sequence[int]) -> bool:
+        """Whether the thing is named right after some views."""
+        return int(self.verified(views)[0].belief.argmax()) == self.thing
 
     def belief_in_truth(self, views: Sequence[int]) -> float:
         """Belief in the true thing after some views."""
@@ -197,7 +206,9 @@ class ThingEpisode:
     def p_value(self, views: Sequence[int]) -> float | None:
         """Share of known things that are explained as badly, see ``TaughtThings.p_value``."""
         observations = [self.observation(view) for view in sorted(self.seen(views))]
-        return self.things.p_value(observations, self.verified(views)[0])
+        things: Any = self.things  # which judged them
+        found: float | None = things.p_value(observations, self.verified(views)[0])
+        return found
 
     def pose_error(self, views: Sequence[int]) -> float | None:
         """How far the surface is from where it is found (ADD-S), millimetres, in the last view.
@@ -221,8 +232,7 @@ class ThingEpisode:
         pose = found.poses[rows[0]].copy()
         pose[:3, 3] += found.cameras[rows[0], sorted(seen).index(seen[-1])]
 
-        surface = self.things.verifier.caster.surfaces[self.thing]
-        points = surface.sample(POSE_ERROR_POINTS, np.random.default_rng(0))
+        points = self._surface.sample(POSE_ERROR_POINTS, np.random.default_rng(0))
         true = self._kept[f"{seen[-1]}.in_camera"]
         there, here = (
             points @ each[:3, :3].T + each[:3, 3]
@@ -230,21 +240,12 @@ class ThingEpisode:
         )
         return float(1000 * np.mean(cKDTree(there).query(here)[0]))
 
-    def aligned_truth(self, views: Sequence[int]) -> Float:
-        """The true pose, aligned with some views as the hypotheses are, (4, 4)."""
-        verifier = self.things.verifier
-        true_pose = self._kept["true_pose"]
-        found = [
-            depth_view(self.observation(view), FINE_SIDE) for view in self.seen(views)
-        ]
-        shown = [view for view in found if view is not None]
-        truth = start(np.array([self.thing]), true_pose[None, :3, :3], len(shown))
-        centre = verifier.caster.centres[self.thing].astype(np.float64)
-        place = true_pose[:3, :3] @ centre + true_pose[:3, 3]
-        truth = replace(truth, centres=place[None])
-        return align(verifier.caster, truth, shown, FINE, verifier.prior).poses(
-            verifier.caster
-        )[0]
+    @cached_property
+    def _surface(self) -> Surface:
+        """The surface of the thing, as it was taught; without a memory, that of its file."""
+        if isinstance(self.things, TaughtThings):
+            return self.things.verifier.caster.surfaces[self.thing]
+        return Surface.from_mesh(self._mesh(), self.things.names[self.thing])
 
     def state(self, views: Sequence[int], needs: Sequence[str]) -> EpisodeState:
         """Where the episode stands, as a policy sees it.
@@ -260,6 +261,7 @@ class ThingEpisode:
         visited[0, list(views)] = True
         joint = None
         if "joint" in needs:
+            assert isinstance(recogniser, TaughtRecogniser)  # see ``policies_of``
             total = np.sum([self.log_evidence(view) for view in seen], axis=0)
             here = EPISODE_SPHERE.azimuth[views[-1]]
             joint = recogniser.calibration.joint(total, len(seen), classes, here)[None]
@@ -278,7 +280,10 @@ class ThingEpisode:
     def outlook(self, views: Sequence[int]) -> Outlook:
         """What is known when the next view is to be chosen."""
         observations = [self.observation(view) for view in self.seen(views)]
-        return Outlook.of(self.things.verifier, self.verified(views)[0], observations)
+        found, _ = self.verified(views)
+        assert isinstance(self.things, TaughtThings)  # see ``policies_of``
+        assert isinstance(found, Verified)
+        return Outlook.of(self.things.verifier, found, observations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -344,15 +349,6 @@ class _Stage:
         camera = SensedCamera(self.standing, self.sensor, rng, around=self.around)
         rng.spawn(view)
         return camera
-
-    @property
-    def true_pose(self) -> Float:
-        """Of the file's frame in the object frame that the robot believes in, (4, 4), metres."""
-        frame = self.camera(0).object_frame
-        to_object = np.eye(4)
-        to_object[:3, :3] = frame.axes
-        to_object[:3, 3] = -frame.axes @ frame.centre
-        return np.asarray(to_object @ self.in_truth, np.float64)
 
 
 def hiding_boxes(

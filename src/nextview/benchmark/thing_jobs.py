@@ -11,8 +11,9 @@ from zlib import crc32
 
 import numpy as np
 
+from nextview.benchmark.own_things import OwnThings, own_things
 from nextview.benchmark.thing_episodes import Setting, ThingEpisode
-from nextview.benchmark.thing_policies import policies_of
+from nextview.benchmark.thing_policies import CEILINGS, policies_of
 from nextview.benchmark.thing_replay import EpisodeRuns, ThingRun, run
 from nextview.errors import DatasetError, ResultsError, UsageError
 from nextview.files import read_record, write_record
@@ -41,6 +42,7 @@ class ThingJob:
         repeats: runs of the policy random.
         policies: names.
         out: folder of the results.
+        recogniser: MODULE:NAME of your own in the place of the memory; None for the memory.
     """
 
     models: str
@@ -53,6 +55,12 @@ class ThingJob:
     repeats: int
     policies: tuple[str, ...]
     out: Path
+    recogniser: str | None = None
+
+    @property
+    def things(self) -> TaughtThings | OwnThings:
+        """What may be believed."""
+        return things_of(self.models, self.recogniser)
 
     @property
     def name(self) -> str:
@@ -86,9 +94,14 @@ def opened(models: str) -> TaughtThings:
     return things
 
 
+def things_of(models: str, recogniser: str | None) -> TaughtThings | OwnThings:
+    """The things of a recogniser of your own, or else of a memory."""
+    return opened(models) if recogniser is None else own_things(recogniser)
+
+
 def work(job: ThingJob) -> None:
     """Replay the policies of a job, and write down what they made of it."""
-    things = opened(job.models)
+    things = job.things
     chosen = policies_of(job.policies, things)
     folder = job.out / "episodes" / job.name
     episode = ThingEpisode(
@@ -102,8 +115,8 @@ def work(job: ThingJob) -> None:
     runs: dict[str, list[ThingRun]] = {}
     if job.runs_file.exists():
         runs |= read_record(job.runs_file, EpisodeRuns, "runs", ResultsError).runs
-    # Foresight verifies what others need, too.
-    for name in sorted(job.policies, key=lambda name: name != "foresight"):
+    # The ceiling verifies what others need, too.
+    for name in sorted(job.policies, key=lambda name: name not in CEILINGS):
         runs[name] = replayed(episode, name, chosen[name], job)
     episode.save()
     job.runs_file.parent.mkdir(parents=True, exist_ok=True)
@@ -111,8 +124,13 @@ def work(job: ThingJob) -> None:
     write_record(job.runs_file, done, overwrite=True)
 
 
-def scan_of(things: TaughtThings, thing: int, file: Path, unit: str) -> Mesh:
-    """The scan of a taught thing.
+def scan_of(
+    things: TaughtThings | OwnThings,
+    thing: int,
+    file: Path,
+    unit: str,
+) -> Mesh:
+    """The scan of a thing; of a taught one only if it is what was taught.
 
     Args:
         things: that are known.
@@ -125,6 +143,8 @@ def scan_of(things: TaughtThings, thing: int, file: Path, unit: str) -> Mesh:
             pose would be those of another thing.
     """
     mesh = load_mesh(file, unit=unit)
+    if isinstance(things, OwnThings):
+        return mesh
     surface = things.verifier.caster.surfaces[thing]
     if _apart(mesh, surface) <= SCAN_APART:
         return mesh

@@ -1,10 +1,11 @@
-"""Who takes part in the benchmark of things: policies, a fixed sequence, and two ceilings."""
+"""Who takes part in the benchmark of things: policies, blind rules, and a ceiling."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from nextview.benchmark.own_things import OwnThings
 from nextview.benchmark.thing_episodes import EPISODE_SPHERE, ThingEpisode
 from nextview.errors import UsageError
 from nextview.geometry.viewsphere import ViewSphere
@@ -13,7 +14,6 @@ from nextview.policies.baselines import Furthest, RandomAll, Spread
 from nextview.policies.discriminate import Discriminate
 from nextview.policies.discriminate_geometry import DiscriminateGeometry
 from nextview.policies.registry import make_policy
-from nextview.things.leading import Hypotheses
 from nextview.things.taught import TaughtThings
 from nextview.types import Index
 
@@ -22,17 +22,28 @@ THING_POLICIES = (
     "spread",
     "furthest",
     "fixed",
+    "ring",
     "picture",
     "geometry",
     "pose",
-    "foresight",
     "ceiling",
 )
-CEILINGS = ("foresight", "ceiling")  # they know what no robot does
+CEILINGS = ("ceiling",)  # it knows what no robot does
+BLIND_RULES = (
+    "random",
+    "spread",
+    "furthest",
+    "fixed",
+    "ring",
+)  # they ignore the images
+BEST_BLIND = "best-blind"  # the one of them that is best on other episodes
+# they go by the hypotheses of a memory of taught things
+OF_MEMORIES = ("picture", "geometry", "pose")
 # azimuth steps of the fixed sequence, of 8 a turn: it comes to all of them
 TURN_AHEAD = 3
-TRUTH_BELIEF = 0.01  # in the true pose, beside the hypotheses, for the ceiling
-SETTLED_BELIEF = 0.97  # in the truth, after which foresight looks for nothing better
+SETTLED_BELIEF = (
+    0.97  # in the truth, from which the ceiling is content with a view that keeps it
+)
 
 
 @dataclass(frozen=True)
@@ -41,10 +52,12 @@ class RingSteps:
 
     Attributes:
         sphere: of the views.
+        ahead: azimuth steps to the next view.
         needs: what it asks of the state of an episode, see ``Policy.needs``.
     """
 
     sphere: ViewSphere
+    ahead: int = TURN_AHEAD
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
@@ -56,7 +69,7 @@ class RingSteps:
         """
         azimuths = self.sphere.azimuths
         ring, azimuth = np.divmod(state.current, azimuths)
-        steps = TURN_AHEAD * np.arange(1, azimuths)
+        steps = self.ahead * np.arange(1, azimuths)
         ahead = ring[:, None] * azimuths + (azimuth[:, None] + steps) % azimuths
         free = np.take_along_axis(state.free, ahead, 1)
         on_ring = ahead[np.arange(len(ring)), free.argmax(1)]
@@ -64,60 +77,13 @@ class RingSteps:
 
 
 @dataclass(frozen=True, eq=False)
-class FairCeiling:
-    """Goes where a view is expected to tell most if the truth and its pose are known beforehand.
+class TruthCeiling:
+    """Goes where the truth comes out best, by the very views that are to come, noise included.
 
-    It does not know the noise of the views to come: no policy that foresees by geometry can be
-    expected to do better.
-
-    Attributes:
-        episode: whose truth it knows.
-        needs: what it asks of the state of an episode, see ``Policy.needs``.
-    """
-
-    episode: ThingEpisode
-    needs: tuple[str, ...] = ("outlook",)
-
-    def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """The free view that is expected to raise the log-belief in the truth most.
-
-        Args:
-            state: of the episodes.
-            rng: draws among equals.
-        """
-        assert state.outlook is not None
-        outlook = state.outlook[0]
-        assert outlook is not None
-        others = outlook.hypotheses
-        rivals = others.things != self.episode.thing
-        belief = np.append(
-            TRUTH_BELIEF + others.belief[~rivals].sum(),
-            others.belief[rivals],
-        )
-        views = np.flatnonzero(state.visited[0]).tolist()
-        hypotheses = Hypotheses(
-            np.append(self.episode.thing, others.things[rivals]),
-            np.concatenate(
-                [self.episode.aligned_truth(views)[None], others.poses[rivals]]
-            ),
-            belief / belief.sum(),
-        )
-        cameras = outlook.cameras(EPISODE_SPHERE.directions)
-        expected = replace(outlook, hypotheses=hypotheses).expect(cameras)
-        value = expected.found * expected.gain(0)
-
-        return best_view(
-            EPISODE_SPHERE,
-            state,
-            value[None] + 1e-9 * rng.random((1, len(EPISODE_SPHERE))),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Foresight:
-    """Goes where the truth really is believed most after the view, its noise included.
-
-    Every candidate is verified. Once the truth is believed, it spreads.
+    Every free view is judged: one after which the thing is named right comes before one after which
+    it is not, then the belief in the truth decides. No choice of one view names more things right,
+    so that nothing is above it after two views. It looks one view ahead: of several views there may
+    be a better sequence.
 
     Attributes:
         episode: whose views it knows.
@@ -128,24 +94,31 @@ class Foresight:
     needs: tuple[str, ...] = ()
 
     def next_views(self, state: EpisodeState, rng: np.random.Generator) -> Index:
-        """The free view after which the belief in the truth is largest.
+        """The free view after which the truth is named and believed most.
 
         Args:
             state: of the episodes.
             rng: draws among equals.
         """
         views = np.flatnonzero(state.visited[0]).tolist()
-        if state.step > 1 and self.episode.belief_in_truth(views) >= SETTLED_BELIEF:
-            return Spread(EPISODE_SPHERE).next_views(state, rng)
+        if state.step > 1 and self._worth(views) >= 1 + SETTLED_BELIEF:
+            far = Spread(EPISODE_SPHERE).next_views(state, rng)
+            if self._worth([*views, int(far[0])]) >= 1 + SETTLED_BELIEF:
+                return far
         values = np.full((1, len(EPISODE_SPHERE)), -np.inf)
         for view in np.flatnonzero(state.free[0]).tolist():
-            values[0, view] = self.episode.belief_in_truth([*views, view])
+            values[0, view] = self._worth([*views, view])
         return best_view(EPISODE_SPHERE, state, values)
+
+    def _worth(self, views: list[int]) -> float:
+        """Belief in the truth after some views; 1 more where it is the answer."""
+        right = self.episode.named_right(views)
+        return float(right) + self.episode.belief_in_truth(views)
 
 
 def policies_of(
     names: tuple[str, ...],
-    things: TaughtThings,
+    things: TaughtThings | OwnThings,
 ) -> dict[str, Callable[[ThingEpisode], Policy]]:
     """Policies by name, each made for an episode.
 
@@ -155,7 +128,8 @@ def policies_of(
         things: the things, for the one that goes by remembered pictures.
 
     Raises:
-        UsageError: there is no policy of one of these names.
+        UsageError: there is no policy of one of these names, or it goes by the hypotheses of a
+            memory where there is none.
         PolicyError: one cannot be made.
     """
     geometry = DiscriminateGeometry(EPISODE_SPHERE)
@@ -164,27 +138,45 @@ def policies_of(
         "spread": lambda _: Spread(EPISODE_SPHERE),
         "furthest": lambda _: Furthest(EPISODE_SPHERE),
         "fixed": lambda _: RingSteps(EPISODE_SPHERE),
+        "ring": lambda _: RingSteps(EPISODE_SPHERE, 1),
         "geometry": lambda _: geometry,
         "pose": lambda _: replace(geometry, goal="pose"),
-        "foresight": Foresight,
-        "ceiling": FairCeiling,
+        "ceiling": TruthCeiling,
     }
-    if "picture" in names:
+    if "picture" in names and isinstance(things, TaughtThings):
         picture = Discriminate.from_card(
             things.recogniser.card.card_path,
             EPISODE_SPHERE,
         )
         known["picture"] = lambda _: picture
     for name in names:
+        if name in OF_MEMORIES:
+            _refuse_needs(name, ("outlook",), things)
         if name in known:
             continue
         if ":" not in name:
             raise UsageError(
                 f"no policy is called {name}; there are {', '.join(THING_POLICIES)}"
             )
-        known[name] = _always(make_policy(name, EPISODE_SPHERE))
+        own = make_policy(name, EPISODE_SPHERE)
+        _refuse_needs(name, own.needs, things)
+        known[name] = _always(own)
 
     return {name: known[name] for name in names}
+
+
+def _refuse_needs(
+    name: str,
+    needs: tuple[str, ...],
+    things: TaughtThings | OwnThings,
+) -> None:
+    """Say that a policy goes by the hypotheses of a memory, where there are none; UsageError."""
+    lacking = sorted({"joint", "outlook"} & set(needs))
+    if lacking and isinstance(things, OwnThings):
+        raise UsageError(
+            f"the policy {name} goes by the hypotheses of a memory of taught things, which"
+            f" recogniser {things.recogniser.name} does not have; leave it out"
+        )
 
 
 def _always(policy: Policy) -> Callable[[ThingEpisode], Policy]:

@@ -75,7 +75,7 @@ def run(
 
     while True:
         found, seconds = episode.verified(views)
-        made["right"].append(int(found.belief.argmax()) == episode.thing)
+        made["right"].append(episode.named_right(views))
         made["confidence"].append(float(found.belief.max()))
         made["p_value"].append(episode.p_value(views))
         made["verification"].append(seconds)

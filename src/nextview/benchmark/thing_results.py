@@ -30,11 +30,11 @@ THING_POLICY_COLOURS = {
     "spread": "#d99000",
     "furthest": LIGHT_BLUE,
     "fixed": "#7a6fd0",
+    "ring": "#b3a000",
     "picture": "#5bb98c",
     "geometry": ACCENT,
     "pose": BLUE,
-    "foresight": "#111111",
-    "ceiling": "#777777",
+    "ceiling": "#111111",
 }
 RECORD = "benchmark.json"
 LOWEST_RIGHT = 0.9  # share named right that the axis reaches down to, at least
@@ -109,6 +109,7 @@ def markdown(tables: ThingTables) -> str:
             "",
         ]
 
+    parts += [f"{tables.chosen}\n"] if tables.chosen else []
     parts += [f"### Differences to {tables.reference}", "", *_tests(tables), ""]
     parts += [f"{sentence}\n" for sentence in too_few_things(tables)]
     return "\n".join(parts)

@@ -67,6 +67,7 @@ class ThingTables:
         alike: the things: "thing", "most_alike", "distance" (radii), "confusable".
         episodes: how many there are of all things.
         reference: the policy that the others are compared with.
+        chosen: how it was chosen, in a sentence; "" where it was named.
     """
 
     measures: "pd.DataFrame"
@@ -74,6 +75,7 @@ class ThingTables:
     alike: "pd.DataFrame"
     episodes: int
     reference: str
+    chosen: str = ""
 
 
 @dataclass(frozen=True, eq=False)

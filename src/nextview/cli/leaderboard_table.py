@@ -37,7 +37,7 @@ def print_leaderboard(results: Results) -> None:
             f"* differs from {reference} in accuracy: p after Holm's correction is below"
             f" {board.SIGNIFICANT}"
         )
-        few = board.too_few(tables, at, len(results.predictions))
+        few = board.too_few(tables, at, results.predictions.names)
         for sentence in (board.nothing_differs(tables, at, reference), few):
             if sentence:
                 console.print(sentence)

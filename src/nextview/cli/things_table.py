@@ -26,7 +26,7 @@ def print_things(found: ThingTables) -> None:
         f"* differs from {found.reference}: p after Holm's correction is below {SIGNIFICANT};"
         " choice is the median of its CPU"
     )
-    for sentence in too_few_things(found):
+    for sentence in (*filter(None, [found.chosen]), *too_few_things(found)):
         console.print(sentence)
 
 

@@ -1,0 +1,121 @@
+"""A recogniser of your own in the place of a memory, in the benchmark of things."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from nextview.geometry.observation import Observation
+from nextview.geometry.viewsphere import direction_of
+from nextview.recognition.belief import log_evidence_of
+from nextview.recognition.own_recogniser import own_recogniser
+from nextview.recognition.protocol import JointBelief, JudgesTogether
+from nextview.types import Float, Floats, Index
+
+
+@dataclass(frozen=True, eq=False)
+class OwnAnswer:
+    """What a recogniser of your own says of some views, in the parts that ``Verified`` has, too.
+
+    Attributes:
+        belief: in each thing, (T,) float64.
+        things: thing of each pose, the likeliest first, (M,) int64; none where it gives no poses.
+        poses: of the scan files' frames in the object frame, (M, 4, 4) float64, metres.
+        cameras: by how much each view sees them displaced, (M, V, 3) float64, metres.
+        p_value: share of known things that are explained as badly, () float64; NaN if it is not
+            known.
+    """
+
+    belief: Float
+    things: Index
+    poses: Float
+    cameras: Float
+    p_value: Float
+
+
+class OwnThings:
+    """The classes of a recogniser of your own as things that are shown.
+
+    Attributes:
+        recogniser: that was given.
+        names: its classes in alphabetical order, as a memory has them: things of the same names are
+            shown in the same episodes.
+    """
+
+    def __init__(self, given: str) -> None:
+        """Make the recogniser.
+
+        Args:
+            given: MODULE:NAME of a recogniser, or of a class that makes one.
+
+        Raises:
+            UsageError, ModelError: see ``own_recogniser``.
+        """
+        self.recogniser = own_recogniser(given)
+        self._order = np.argsort(self.recogniser.classes, kind="stable")
+        self.names = tuple(self.recogniser.classes[k] for k in self._order)
+
+    def log_evidence(self, observations: Sequence[Observation]) -> Floats:
+        """What it says of each view, (B, D): it can be summed over views.
+
+        Args:
+            observations: the views.
+
+        Raises:
+            ModelError: its answer is none.
+        """
+        evidence = self.recogniser(observations)
+        directions = np.stack([direction_of(each.pose) for each in observations])
+        azimuths = np.arctan2(directions[:, 1], directions[:, 0])
+        return log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuths)
+
+    def __call__(self, observations: Sequence[Observation]) -> OwnAnswer:
+        """What it says of views of one thing: together if it can, else by the sum of all.
+
+        Args:
+            observations: views that show the thing, in one object frame.
+
+        Raises:
+            ModelError: its answer is none.
+        """
+        total = self.log_evidence(observations).sum(0)
+        count = len(observations)
+        if isinstance(self.recogniser, JudgesTogether):
+            joint = self.recogniser.together(observations, total, count)
+        else:
+            classes = len(self.names)
+            calibration = self.recogniser.calibration
+            joint = JointBelief(calibration.belief(total, count, classes))
+
+        poses = [each for each in joint.poses if each.thing in self.names]
+        moved = np.zeros((len(poses), count, 3))
+        for row, each in enumerate(poses):
+            if len(each.displacements) == count:
+                moved[row] = each.displacements
+        return OwnAnswer(
+            belief=np.asarray(joint.belief, np.float64)[self._order],
+            things=np.array([self.names.index(each.thing) for each in poses], np.int64),
+            poses=np.array([each.pose for each in poses]).reshape(-1, 4, 4),
+            cameras=moved,
+            p_value=np.array(np.nan if joint.p_value is None else joint.p_value),
+        )
+
+    def p_value(
+        self,
+        observations: Sequence[Observation],
+        found: OwnAnswer,
+    ) -> float | None:
+        """Share of known things that are explained as badly; None where it does not tell.
+
+        Args:
+            observations: the views.
+            found: what it said of them.
+        """
+        return None if np.isnan(found.p_value) else float(found.p_value)
+
+
+@lru_cache(maxsize=1)
+def own_things(given: str) -> OwnThings:
+    """A recogniser of your own, made once in each process; see ``OwnThings``."""
+    return OwnThings(given)
