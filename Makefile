@@ -3,7 +3,7 @@ PYTHON ?= python3
 
 .PHONY: demo test test-ros lint docs reproduce reproduce-small clean
 
-demo: .venv/installed  ## look at a sample object, with the base installation (no torch)
+demo: .venv/installed  ## name everything on a bundled table, with the base installation (no torch)
 	.venv/bin/nextview demo
 
 test: .venv-test/installed  ## run the tests; NEXTVIEW_TESTS=all: also those that take minutes each
@@ -50,4 +50,4 @@ reproduce-small: .venv-test/installed  ## the same on three meshes a class, or o
 	touch $@
 
 clean:
-	rm -rf .venv .venv-test .venv-ros nextview_demo.png
+	rm -rf .venv .venv-test .venv-ros nextview_demo nextview_demo.png

@@ -126,8 +126,11 @@ def look_at_samples() -> None:
     assert "chair" in said
     assert Path("episode.png").stat().st_size > 50_000
     for _ in range(2):  # the second draws over the first
-        run("demo")
+        run("demo-episode")
     assert Path("nextview_demo.png").stat().st_size > 50_000
+    assert "cracker_box" in run("demo")
+    assert Path("nextview_demo/table.png").stat().st_size > 50_000
+    assert "cracker box" in Path("nextview_demo/table.html").read_text()
 
 
 def sessions_with_frames() -> None:

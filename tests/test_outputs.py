@@ -31,7 +31,8 @@ WRITES = {
         "look {capture} --models {knobs_memory} --frames 1 --figure",
         "t.png",
     ),
-    "demo": ("demo --figure", "demo.svg"),
+    "demo": ("demo --out", "folder"),
+    "demo-episode": ("demo-episode --figure", "demo.svg"),
     "capture": (f"capture {SAMPLE}", "folder", "--radius 0.4 --viewpoints 12"),
     "scenes": (
         "scenes {furniture}",
@@ -146,12 +147,12 @@ def test_the_demo_draws_over_its_own_picture_and_no_other(
 ):
     monkeypatch.chdir(tmp_path)
     for _ in range(2):
-        main(["demo"])
+        main(["demo-episode"])
     assert "wrote nextview_demo.png" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["nextview_demo.png"]
     mine = tmp_path / "mine.png"
     mine.write_bytes(b"mine")
-    assert "mine.png: exists" in refused(capsys, "demo", "--figure", mine)
+    assert "mine.png: exists" in refused(capsys, "demo-episode", "--figure", mine)
     assert mine.read_bytes() == b"mine"
 
 

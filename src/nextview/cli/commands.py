@@ -43,7 +43,11 @@ COMMANDS = {  # by name, in the order in which they are listed
     ),
     "demo": Command(
         f"{CLI}.demo:demo",
-        "recognise a sample object and draw the episode",
+        "name and locate everything on a bundled table",
+    ),
+    "demo-episode": Command(
+        f"{CLI}.demo:demo_episode",
+        "recognise sample furniture and draw the episode",
     ),
     "learn": Command(
         f"{TEACHING}.learn:learn_things",

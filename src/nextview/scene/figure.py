@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -16,6 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from nextview.geometry.axes import upright_axes
 from nextview.geometry.ray_caster import RayCaster
+from nextview.scene.name_places import Labelled, name_places
 from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.sensing.frame import Frame, within
 from nextview.sensing.tabletop import TableTop
@@ -49,10 +49,13 @@ OBJECT_COLOURS = (
 AXIS_COLOURS = ("#d1495b", "#3f9b4f", "#2f6fd0")  # x, y and z, as is usual
 AXIS_LENGTH = 0.7  # of the radius of a thing
 NEAREST_SHADE, FARTHEST_SHADE = 0.25, 0.95  # of grey, where there is no picture
-FIGURE_BORDER = 0.08  # metres around all that is drawn from above
-LINE_SHARE = 0.026  # of the picture's height, of a line of text
-NAME_LINES = 4.0  # lines that a name is wide, about
-CONTEXT = 0.15  # of the picture's height and width around what was found
+FIGURE_BORDER = 0.12  # metres around all that is drawn from above
+NAME_FONT = 10.0  # points
+SMALL_FONT = 8.5  # points, of notes
+POINTS = 72  # an inch
+CONTEXT = 0.1  # of the picture's height and width around what was found
+CLOSED_GAPS = 3  # pixels, of the outline of an object
+RELIEF_BLUR = 2.5  # pixels over which slopes are smoothed
 FIGURE_CELL = 0.002  # metres, of what is drawn from above
 SHORT_CAMERA = 0.06  # length of the arrow of a camera, of the picture's width
 
@@ -110,6 +113,10 @@ def draw_scene(
             (start, FIGURE_MARGIN / height, FIGURE_HEIGHT / width, high)
         )
         _draw_from_above(right, tops, objects, colours, target)
+        caption = "from above; numbered arrows: the cameras"
+        caption += "; red: where to look next" if target is not None else ""
+        above = 1 - 0.5 / height
+        figure.text(start, above, caption, fontsize=9.5, color=GREY, va="top")
         return figure
 
 
@@ -124,12 +131,18 @@ def _heading(
     """Say how many objects were found, and in how many frames."""
     named = sum(thing.name != UNKNOWN_NAME for thing in objects)
     said = f"{named} known thing{'s' * (named != 1)}"
+    doubtful = sum(
+        thing.name != UNKNOWN_NAME and not thing.confident for thing in objects
+    )
+    if doubtful:
+        said += f", {doubtful} of them not confident"
     if named < len(objects):
-        said += f", {len(objects) - named} unknown"
+        said += f"; {len(objects) - named} unknown"
     if not objects:
         said = "nothing on the plane"
     more = f"{title}: " if title else ""
-    more += f"{frames} frame{'s' * (frames > 1)}; names in italics are not confident"
+    more += f"{frames} frame{'s' * (frames > 1)}"
+    more += "; names in italics with ? are not confident" if doubtful else ""
     x = FIGURE_MARGIN / width
     figure.text(
         x,
@@ -178,7 +191,8 @@ def _draw_frame(
         if mask is None:
             continue
         colour = colours[thing.number]
-        shape = ndimage.gaussian_filter(ndimage.binary_closing(mask).astype(float), 1.0)
+        mask = _without_holes(mask)
+        shape = ndimage.gaussian_filter(mask.astype(float), 1.5)
         style = ":" if thing.name == UNKNOWN_NAME else "-"
         axes.contour(shape, [0.5], colors=[colour], linewidths=1.8, linestyles=style)
         tint = np.zeros((*mask.shape, 4))
@@ -187,22 +201,28 @@ def _draw_frame(
     for thing in objects:
         if thing.pose is not None and number in thing.pixels:
             _draw_axes(axes, frame, thing)
-    taken: list[tuple[float, float]] = []
-    line = LINE_SHARE * (part[0].stop - part[0].start)
+    shown = [thing for thing in objects if number in thing.pixels]
+    labels = []
+    for thing in shown:
+        rows, columns = np.nonzero(thing.pixels[number])
+        low = np.array([columns.min(), rows.min()], float)
+        high = np.array([columns.max(), rows.max()], float)
+        labels.append(Labelled(_name_of(thing), low, high))
+    low = np.array([part[1].start, part[0].start], float)
+    high = np.array([part[1].stop, part[0].stop], float)
+    font = NAME_FONT / POINTS / FIGURE_HEIGHT * float(high[1] - low[1])
 
-    for thing in objects:
-        mask = thing.pixels.get(number)
-        if mask is None:
-            continue
-        rows, columns = np.nonzero(mask)
-        x = float(columns.mean())
-        y = float(rows.min()) - 4
-        while any(
-            abs(y - b) < line and abs(x - a) < NAME_LINES * line for a, b in taken
-        ):
-            y -= line
-        taken.append((x, y))
-        _name(axes, thing, x, y, colours, "bottom")
+    places = name_places(labels, low, high, font)
+    for thing, (x, y) in zip(shown, places, strict=True):
+        _name(axes, thing, x, y, colours)
+
+
+def _without_holes(mask: Mask) -> Mask:
+    """A mask without the gaps that missing depth leaves in it, (H, W)."""
+    padded = np.pad(mask, CLOSED_GAPS)
+    closed = ndimage.binary_closing(padded, iterations=CLOSED_GAPS)
+    inner = (slice(CLOSED_GAPS, -CLOSED_GAPS),) * 2
+    return np.asarray(ndimage.binary_fill_holes(closed[inner]))
 
 
 def grey_picture(frame: Frame) -> Floats:
@@ -222,7 +242,7 @@ def grey_picture(frame: Frame) -> Floats:
     share = np.clip((inverse - low) / max(high - low, 1e-9), 0, 1)
     grey = FARTHEST_SHADE - 0.35 * share
     # slopes as a lamp at the upper left shows them
-    smooth = ndimage.gaussian_filter(depth, 1.5)
+    smooth = ndimage.gaussian_filter(depth, RELIEF_BLUR)
     down, right = np.gradient(smooth)
     pitch = smooth / frame.intrinsics[0, 0]
     lit = np.clip((down + 0.6 * right) / pitch, -3, 3) / 3
@@ -253,28 +273,34 @@ def _draw_axes(axes: Axes, frame: Frame, thing: SceneObject) -> None:
         line[0].set_path_effects([withStroke(linewidth=3.0, foreground="white")])
 
 
+def _name_of(thing: SceneObject) -> str:
+    """Name of an object, with a question mark where it is not confident."""
+    doubt = " ?" * (thing.name != UNKNOWN_NAME and not thing.confident)
+    return thing.name.replace("_", " ") + doubt
+
+
 def _name(
     axes: Axes,
     thing: SceneObject,
     x: float,
     y: float,
     colours: dict[int, str],
-    side: str,
 ) -> None:
     """Write the name of an object, in italics where it is not confident."""
-    options: dict[str, Any] = {"ha": "center", "va": side, "clip_on": True}
-    sure = thing.confident or thing.name == UNKNOWN_NAME
+    unknown = thing.name == UNKNOWN_NAME
     axes.text(
         x,
         y,
-        thing.name.replace("_", " "),
-        fontsize=8.5,
-        color=INK if thing.name == UNKNOWN_NAME else colours[thing.number],
-        style="normal" if sure else "italic",
-        weight="bold" if sure and thing.name != UNKNOWN_NAME else "normal",
-        path_effects=[withStroke(linewidth=2.6, foreground="white")],
+        _name_of(thing),
+        fontsize=NAME_FONT,
+        color=INK if unknown else colours[thing.number],
+        style="normal" if thing.confident or unknown else "italic",
+        weight="bold" if thing.confident and not unknown else "normal",
+        ha="center",
+        va="center",
+        clip_on=True,
+        path_effects=[withStroke(linewidth=2.8, foreground="white")],
         zorder=20,
-        **options,
     )
 
 
@@ -314,20 +340,21 @@ def _draw_from_above(
             colours[thing.number],
             thing.name != UNKNOWN_NAME,
         )
-    for thing, (corners, _) in zip(objects, outlines, strict=True):
-        middle = (corners.min(0) + corners.max(0)) / 2
-        _name(axes, thing, float(middle[0]), float(middle[1]), colours, "center")
-    for pose in cameras:
-        _draw_camera(axes, upright @ pose[:3, 3], upright @ pose[:3, 2], low, high, INK)
+    labels = [
+        Labelled(_name_of(thing), corners.min(0), corners.max(0))
+        for thing, (corners, _) in zip(objects, outlines, strict=True)
+    ]
+    font = NAME_FONT / POINTS / FIGURE_HEIGHT * side
+    places = name_places(labels, low, high, font, inside=True)
+    for thing, (x, y) in zip(objects, places, strict=True):
+        _name(axes, thing, x, y, colours)
+
+    arrows = [
+        _draw_camera(axes, upright, pose, low, high, INK, str(number))
+        for number, pose in enumerate(cameras, 1)
+    ]
     if target is not None:
-        _draw_camera(
-            axes,
-            upright @ target[:3, 3],
-            upright @ target[:3, 2],
-            low,
-            high,
-            ACCENT,
-        )
+        arrows.append(_draw_camera(axes, upright, target, low, high, ACCENT, "next"))
 
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
@@ -337,7 +364,7 @@ def _draw_from_above(
     for spine in axes.spines.values():
         spine.set_visible(True)
         spine.set_color(FAINT)
-    _scale_bar(axes, low, side)
+    _scale_bar(axes, low, side, np.array(arrows))
 
 
 def seen_from_above(thing: SceneObject, upright: Float) -> tuple[Float, Mask | None]:
@@ -406,18 +433,34 @@ def _draw_outline(
 
 def _draw_camera(
     axes: Axes,
-    place: Float,
-    ahead: Float,
+    upright: Float,
+    pose: Float,
     low: Float,
     high: Float,
     colour: str,
-) -> None:
-    """An arrow where a camera stood, at the border if it is outside."""
-    inset = 0.04 * (high - low)
+    label: str,
+) -> Float:
+    """Draw an arrow where a camera stood, at the border if it is outside.
+
+    Args:
+        axes: of the picture from above.
+        upright: rotation from the world to the axes of the picture, (3, 3).
+        pose: camera-to-world, (4, 4), metres.
+        low: least x and y of the picture, metres.
+        high: greatest x and y.
+        colour: of the arrow.
+        label: written behind it.
+
+    Returns:
+        Where it is drawn, (2,).
+    """
+    place = upright @ pose[:3, 3]
+    ahead = upright @ pose[:3, 2]
+    size = float((high - low).max())
+    inset = 0.07 * size
     at = np.clip(place[:2], low + inset, high - inset)
     level = np.linalg.norm(ahead[:2])
     way = ahead[:2] / level if level > 0.05 else np.array([0.0, -1.0])
-    size = float((high - low).max())
     end = at + SHORT_CAMERA * size * way
     arrow = FancyArrowPatch(
         (at[0], at[1]),
@@ -430,32 +473,38 @@ def _draw_camera(
     )
     axes.add_patch(arrow)
 
-    if colour == ACCENT:
-        away = at - 0.03 * size * way
-        axes.text(
-            away[0],
-            away[1],
-            "next",
-            fontsize=8,
-            color=ACCENT,
-            ha="center",
-            va="center",
-            zorder=25,
-            path_effects=[withStroke(linewidth=2.4, foreground="white")],
-        )
+    behind = at - 0.03 * size * way
+    axes.text(
+        behind[0],
+        behind[1],
+        label,
+        fontsize=SMALL_FONT,
+        color=colour,
+        ha="center",
+        va="center",
+        zorder=25,
+        path_effects=[withStroke(linewidth=2.4, foreground="white")],
+    )
+    return np.asarray(at)
 
 
-def _scale_bar(axes: Axes, low: Float, side: float) -> None:
-    """Ten centimetres, or one where little is shown, or a metre where much is."""
+def _scale_bar(axes: Axes, low: Float, side: float, arrows: Float) -> None:
+    """Ten centimetres, or one where little is shown, or a metre where much is.
+
+    The bar lies in the lower corner from which the arrows of the cameras are farther.
+    """
     length = next((step for step in (0.01, 0.1, 1.0) if step > 0.08 * side), 1.0)
     words = {0.01: "1 cm", 0.1: "10 cm", 1.0: "1 m"}[length]
-    start = low + 0.04 * side
+    starts = low + np.array([[0.04, 0.04], [0.96 - length / side, 0.04]]) * side
+    middles = starts + np.array([length / 2, 0.0])
+    away = np.linalg.norm(arrows[:, None] - middles, axis=2).min(0)
+    start = starts[away.argmax()]
     axes.plot([start[0], start[0] + length], [start[1], start[1]], color=INK, lw=1.6)
     axes.text(
         start[0] + length / 2,
         start[1] + 0.012 * side,
         words,
-        fontsize=8,
+        fontsize=SMALL_FONT,
         color=INK,
         ha="center",
     )

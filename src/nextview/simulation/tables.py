@@ -157,15 +157,18 @@ class TableCamera:
         table: SimulatedTable,
         sensor: Sensor,
         rng: np.random.Generator,
+        room: Sequence[Triangles] = (),
     ) -> None:
-        """Set a camera up over a table.
+        """Set up a camera over a table.
 
         Args:
             table: with the things.
-            sensor: its noise, and the errors of its setup.
+            sensor: noise model, and the errors of its setup.
             rng: draws the errors.
+            room: what stands around the table, in its frame, metres: walls, furniture.
         """
         self.sensor = sensor
+        self._room = tuple(room)
         self._rng = rng
         angles = [*rng.normal(0, sensor.tilt, 2), 0]
         self.lean = np.eye(4)
@@ -190,7 +193,7 @@ class TableCamera:
         for box, height in zip(size, (-TABLE_THICKNESS, -TABLE_HEIGHT), strict=True):
             mesh = upright_boxes(box[None], np.zeros(1), np.zeros((1, 2)), height)
             things.append((mesh.vertices, mesh.faces))
-        self._caster = RayCaster(things)
+        self._caster = RayCaster([*things, *self._room])
 
     @property
     def truth(self) -> dict[str, Float]:

@@ -6,7 +6,6 @@ The page is one file. It needs no server, and can be sent to somebody.
 from __future__ import annotations
 
 from contextlib import redirect_stdout
-from html import escape
 from io import StringIO
 from pathlib import Path
 
@@ -17,12 +16,12 @@ from scipy.spatial.transform import Rotation
 from nextview.checks import extras
 from nextview.errors import SessionError, UsageError
 from nextview.files import new_file
-from nextview.recognition.poses import place_in_words
 from nextview.scene.figure import grey_picture
 from nextview.scene.objects import UNKNOWN_NAME, SceneObject
 from nextview.scene.scene import Scene
-from nextview.session.style import ACCENT, FAINT, GROUND, INK, PAPER, rgb
+from nextview.session.style import ACCENT, GROUND, INK, PAPER, rgb
 from nextview.types import Float
+from nextview.viewers.scene_card import scene_card
 from nextview.viewers.scene_shapes import colour_of, named, placed_shape, points_of
 
 with extras():
@@ -30,8 +29,6 @@ with extras():
 
     from nextview.viewers.page import serve, titled
 
-PAGE_CANDIDATES = 4  # things of which the belief is shown for an object
-LEAST_BELIEF = 0.005  # of what is shown
 FRUSTUM_PIXELS = 200  # pixels of a frame's picture in its camera
 PAGE_FRUSTUM = 0.045  # metres, size of a camera that is drawn
 AROUND = 0.08  # metres of the table around all that stands on it
@@ -41,29 +38,6 @@ FAR = 2.0  # radii of the scene from which it does
 ASIDE = np.radians(50.0)  # from the last camera
 UNSURE = 0.6  # opacity of what is not confident
 HULL = 0.35  # and of the hull of an unknown object
-PANEL = f"""<style>
-.nv {{ position: fixed; z-index: 9; top: 0; right: 0; bottom: 0; width: 330px; overflow-y: auto;
-  box-sizing: border-box; padding: 14px 16px; background: {PAPER}; color: {INK};
-  border-left: 1px solid {FAINT}; font: 13px/1.35 "Helvetica Neue", Arial, sans-serif }}
-.nv h1 {{ font-size: 18px; margin: 0 0 2px }}
-.nv p {{ color: #5b6672; margin: 0 0 12px }}
-.nv section {{ border-top: 1px solid {FAINT}; padding: 8px 0 }}
-.nv h2 {{ font-size: 14px; margin: 0 0 2px }}
-.nv h2 i {{ display: inline-block; width: 11px; height: 11px; border-radius: 3px;
-  margin-right: 7px }}
-.nv h2 small {{ font-weight: normal; color: #5b6672 }}
-.nv small {{ color: #5b6672; overflow-wrap: anywhere }}
-.nv table {{ border-spacing: 0 2px; width: 100%; font-size: 12px }}
-.nv td:first-child {{ width: 130px; overflow-wrap: anywhere }}
-.nv td:last-child {{ width: 44px; text-align: right; font-variant-numeric: tabular-nums }}
-.nv .bar {{ height: 9px; background: #eef1f4 }}
-.nv .bar b {{ display: block; height: 9px }}
-#root {{ right: 330px !important; width: calc(100% - 330px) !important }}
-@media (max-width: 700px) {{
-  .nv {{ top: 55%; width: 100%; border: 0; border-top: 1px solid {FAINT} }}
-  #root {{ right: 0 !important; width: 100% !important; height: 55% !important }}
-}}
-</style>"""
 
 
 def write_scene_page(
@@ -106,63 +80,6 @@ def write_scene_page(
             f"{before}{scene_card(scene, title)}{end}{after}",
             encoding="utf-8",
         )
-
-
-def scene_card(scene: Scene, title: str) -> str:
-    """What is known of each object, as HTML.
-
-    Args:
-        scene: with one frame at least.
-        title: of what was looked at.
-    """
-    objects = scene.objects
-    count = len(scene.frames)
-    frames = f"{count} frame{'s' * (count > 1)}"
-    sure = sum(thing.confident for thing in objects)
-    unknown = sum(thing.name == UNKNOWN_NAME for thing in objects)
-    doubtful = len(objects) - sure - unknown
-    said = f"{frames}: {sure} confident, {doubtful} not confident, {unknown} unknown"
-    if not objects:
-        said = f"{frames}: nothing stands on the plane"
-    parts = "".join(_object_card(thing) for thing in objects)
-    # reached by Tab, so that it can be scrolled without a mouse
-    panel = '<div class="nv" role="region" aria-label="what was found" tabindex="0">'
-    return f"{PANEL}{panel}<h1>{escape(title)}</h1><p>{said}</p>{parts}</div>"
-
-
-def _object_card(thing: SceneObject) -> str:
-    """What is known of an object, as HTML."""
-    colour = colour_of(thing)
-    sure = "confident" if thing.confident else "not confident"
-    off = thing.pose_uncertainty
-    where = f"at {place_in_words(thing.place)}"
-    if thing.name == UNKNOWN_NAME:
-        sides = " x ".join(f"{100 * side:.0f}" for side in thing.size)
-        sure = f"{sides} cm"
-    elif off is not None:
-        where += f", ± {off.millimetres:.1f} mm, {off.degrees:.1f}°"
-    if thing.touches:
-        where += f", touches {', '.join(str(number) for number in thing.touches)}"
-
-    beliefs = sorted(thing.result.beliefs.items(), key=lambda pair: -pair[1])[
-        :PAGE_CANDIDATES
-    ]
-    rows = "".join(
-        f'<tr><td>{escape(name.replace("_", " "))}</td><td><div class="bar">'
-        f'<b style="width:{100 * belief:.1f}%;background:{colour}"></b></div></td>'
-        f"<td>{belief:.1%}</td></tr>"
-        for name, belief in beliefs
-        if belief >= LEAST_BELIEF
-    )
-    warnings = "".join(
-        f"<br>{escape(text)}" for text in sorted({w.message for w in thing.warnings})
-    )
-    name = escape(thing.name.replace("_", " "))
-    return (
-        f'<section><h2><i style="background:{colour}"></i>{thing.number} {name}'
-        f" <small>{sure}</small></h2><table>{rows}</table>"
-        f"<small>{where}{warnings}</small></section>"
-    )
 
 
 def draw_scene_in_3d(server: viser.ViserServer, scene: Scene) -> None:
