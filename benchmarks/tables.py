@@ -33,6 +33,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -63,6 +64,7 @@ COUNTED = (1, 2, 4)  # frames after which is counted
 COMPARED = (2, 4)  # frames after which ways are compared
 FEWEST_THINGS = 6
 MOST_THINGS = 10
+MOST_DRAWN = 20  # draws of one table, until all things fit on it
 DISTANCE = 0.6  # metres
 ELEVATIONS = (30.0, 60.0)  # degrees, of the first view
 CENTRE = np.array([0, 0, 0.03])
@@ -127,7 +129,24 @@ def draw_table(
     strangers: Sequence[Path],
     rng: np.random.Generator,
 ) -> SimulatedTable:
-    """A table with 6 to 10 things, the last of them a stranger."""
+    """A table with 6 to 10 things, the last of them a stranger.
+
+    What does not fit on the table is drawn again.
+
+    Raises:
+        UsageError: MOST_DRAWN draws do not fit.
+    """
+    for _ in range(MOST_DRAWN - 1):
+        with suppress(UsageError):
+            return _draw(scans, strangers, rng)
+    return _draw(scans, strangers, rng)
+
+
+def _draw(
+    scans: Sequence[Path],
+    strangers: Sequence[Path],
+    rng: np.random.Generator,
+) -> SimulatedTable:
     count = int(rng.integers(FEWEST_THINGS, MOST_THINGS + 1))
     paths = [scans[k] for k in rng.choice(len(scans), count - 1, replace=False)]
     meshes = [mesh_of(path) for path in paths]
