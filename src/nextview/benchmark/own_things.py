@@ -7,10 +7,12 @@ from functools import lru_cache
 import numpy as np
 
 from nextview.geometry.observation import Observation
-from nextview.geometry.viewsphere import direction_of
-from nextview.recognition.belief import log_evidence_of
 from nextview.recognition.own_recogniser import own_recogniser
-from nextview.recognition.protocol import JointBelief, JudgesTogether
+from nextview.recognition.protocol import (
+    JointBelief,
+    JudgesTogether,
+    log_evidence_of_views,
+)
 from nextview.types import Float, Floats, Index
 
 
@@ -65,10 +67,7 @@ class OwnThings:
         Raises:
             ModelError: its answer is none.
         """
-        evidence = self.recogniser(observations)
-        directions = np.stack([direction_of(each.pose) for each in observations])
-        azimuths = np.arctan2(directions[:, 1], directions[:, 0])
-        return log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuths)
+        return log_evidence_of_views(self.recogniser, observations)
 
     def verify(
         self,

@@ -6,12 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+
 from nextview.geometry.observation import Observation
-from nextview.recognition.belief import Calibration
+from nextview.geometry.viewsphere import azimuth_of, direction_of
+from nextview.recognition.belief import MUCH, Calibration, log_evidence_of
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.novelty import Quantiles
 from nextview.recognition.poses import PoseCandidate
 from nextview.types import Float, Floats
+
+# times that the size of a taught thing is off, half hidden say, which none has
+THING_SIZE = 1.3
 
 
 @runtime_checkable
@@ -126,3 +132,49 @@ class KnowsAnyOrientation(Protocol):
 def tells_unknown(recogniser: Recogniser) -> bool:
     """Whether a recogniser may say that an object is of none of its classes."""
     return recogniser.novelty is not None or isinstance(recogniser, JudgesTogether)
+
+
+def log_evidence_of_views(
+    recogniser: Recogniser,
+    observations: Sequence[Observation],
+) -> Floats:
+    """Return what a recogniser says of each view, in a form that can be summed over views.
+
+    Args:
+        recogniser: is asked once.
+        observations: V views.
+
+    Returns:
+        (V, D): see ``log_evidence_of``.
+
+    Raises:
+        ModelError: its answer is none.
+    """
+    evidence = recogniser(observations)
+    azimuths = azimuth_of(np.stack([direction_of(each.pose) for each in observations]))
+    return log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuths)
+
+
+def classes_of_other_size(
+    recogniser: Recogniser,
+    radius: float | None,
+) -> tuple[str, ...]:
+    """Names of the classes of which no object has a certain size.
+
+    A thing has one size, a class has many.
+
+    Args:
+        recogniser: knows the sizes, or not: one of your own does not.
+        radius: of the object, metres; None if it is not known.
+
+    Returns:
+        The names; none where a size is not known.
+    """
+    card = getattr(recogniser, "card", None)
+    if card is None or card.size is None or radius is None:
+        return ()
+    things = bool(recogniser.calibration.hypotheses)
+    wrong = card.size.impossible(radius, THING_SIZE if things else MUCH)
+    return tuple(
+        name for name, off in zip(recogniser.classes, wrong, strict=True) if off
+    )

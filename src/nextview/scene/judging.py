@@ -12,14 +12,17 @@ import numpy as np
 
 from nextview.geometry.observation import Observation
 from nextview.geometry.viewsphere import azimuth_of, direction_of
-from nextview.recognition.belief import MUCH, log_evidence_of
+from nextview.recognition.belief import log_evidence_of
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.novelty import ViewScore
-from nextview.recognition.protocol import JointBelief, JudgesTogether
+from nextview.recognition.protocol import (
+    JointBelief,
+    JudgesTogether,
+    classes_of_other_size,
+)
 from nextview.sensing.observed_object import ObservedObject
 from nextview.session.pose_frame import PoseFrame
 from nextview.session.result import SUSPICIOUS, Recognition
-from nextview.session.session import THING_SIZE
 from nextview.session.system import System
 from nextview.session.view import View, is_doubtful
 from nextview.types import Floats
@@ -93,7 +96,7 @@ class Judge:
             system.stopping,
             score=recogniser.novelty,
             unknown_rate=system.unknown,
-            impossible=self._impossible(thing),
+            impossible=classes_of_other_size(recogniser, thing.observations[-1].radius),
             poses_in=PoseFrame.of(thing),
         )
         return replace(result, confident=self._confident(result, joint))
@@ -151,19 +154,6 @@ class Judge:
         if card is None or card.size is None:
             return None
         return 2 * float(card.size.largest)
-
-    def _impossible(self, thing: ObservedObject) -> tuple[str, ...]:
-        """Classes whose objects have not the size of this one."""
-        recogniser = self.system.models.recogniser
-        card = getattr(recogniser, "card", None)  # a recogniser of your own has none
-        radius = thing.observations[-1].radius
-        if card is None or card.size is None or radius is None:
-            return ()
-        things = bool(recogniser.calibration.hypotheses)
-        wrong = card.size.impossible(radius, THING_SIZE if things else MUCH)
-        return tuple(
-            name for name, off in zip(self.system.classes, wrong, strict=True) if off
-        )
 
     def _confident(self, result: Recognition, joint: JointBelief | None) -> bool:
         """Whether the belief is high enough, and the object fits what it is taken for."""

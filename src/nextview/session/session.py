@@ -30,13 +30,17 @@ from nextview.geometry.viewsphere import (
 )
 from nextview.policies.base import EpisodeState, Policy, SeeksPose, ValuesViews
 from nextview.policies.off_grid import anywhere
-from nextview.recognition.belief import MUCH, Stopping, log_evidence_of
+from nextview.recognition.belief import Stopping, log_evidence_of
 from nextview.recognition.evidence import Evidence
 from nextview.recognition.inference import Models
 from nextview.recognition.map_names import maps_among
 from nextview.recognition.novelty import ViewScore, values_of
 from nextview.recognition.poses import share_of_likeliest
-from nextview.recognition.protocol import JudgesTogether, LooksAhead
+from nextview.recognition.protocol import (
+    JudgesTogether,
+    LooksAhead,
+    classes_of_other_size,
+)
 from nextview.sensing.frame import Frame
 from nextview.sensing.plausibility import (
     check_last_view,
@@ -65,8 +69,6 @@ if TYPE_CHECKING:
     from nextview.segmentation.instances import Segmenter
     from nextview.sensing.observed_object import ObservedObject
 
-# times that the size of a taught thing is off, half hidden say, which none has
-THING_SIZE = 1.3
 FARTHEST_TARGET = 60.0
 """Object radii: a camera looks at a thing of 0.01 m radius from 0.6 m; in millimetres it would
 be a thousand times.
@@ -1015,6 +1017,7 @@ class Session:
                 self.stopping.max_views,
                 len(self.sphere),
             )
+            radius = self.views[-1].observation.radius if self.views else None
             result = Recognition(
                 tuple(self.views),
                 self.models.classes,
@@ -1025,7 +1028,7 @@ class Session:
                 why_stranded=self._why_stranded() if stranded else "",
                 score=self.models.recogniser.novelty,
                 unknown_rate=self.unknown,
-                impossible=self._impossible(),
+                impossible=classes_of_other_size(self.models.recogniser, radius),
                 poses_in=PoseFrame.of(self.object),
             )
 
@@ -1040,21 +1043,6 @@ class Session:
             if k not in taken
         ]
         return in_words(left)
-
-    def _impossible(self) -> tuple[str, ...]:
-        """Classes whose objects have not the size of this one; none where it is not known."""
-        # a recogniser of your own has none
-        card = getattr(self.models.recogniser, "card", None)
-        sizes = card and card.size
-        radius = self.views[-1].observation.radius if self.views else None
-        if sizes is None or radius is None:
-            return ()
-        # a thing has one size, a class has many
-        things = bool(self.models.recogniser.calibration.hypotheses)
-        wrong = sizes.impossible(radius, THING_SIZE if things else MUCH)
-        return tuple(
-            name for name, off in zip(self.models.classes, wrong, strict=True) if off
-        )
 
 
 def _in_doubt(step: Step) -> bool:

@@ -8,9 +8,8 @@ import numpy as np
 
 from nextview.errors import ModelError, ObservationError
 from nextview.geometry.observation import Observation
-from nextview.geometry.viewsphere import direction_of
-from nextview.recognition.belief import log_evidence_of
 from nextview.recognition.model_card import Verification
+from nextview.recognition.protocol import log_evidence_of_views
 from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
 from nextview.things.unknown import KnownResiduals
@@ -141,12 +140,7 @@ class TaughtThings:
 
     def log_evidence(self, observations: Sequence[Observation]) -> Floats:
         """What features and size say of each view, (V, D): it can be summed over views."""
-        evidence = self.recogniser(observations)
-        directions = np.stack(
-            [direction_of(observation.pose) for observation in observations]
-        )
-        azimuths = np.arctan2(directions[:, 1], directions[:, 0])
-        return log_evidence_of(evidence.logits, evidence.azimuth_bins, azimuths)
+        return log_evidence_of_views(self.recogniser, observations)
 
     def verify(
         self,
