@@ -32,7 +32,7 @@ def demo(out: Path | None = None, overwrite: bool = False) -> None:
     Seven YCB objects and a toy that nextview was not taught lie on a simulated table. A wrist
     camera looks at them three times, with depth noise and pose errors. The command registers the 78
     bundled YCB scans to the frames and prints names and poses, followed by the ground truth. The
-    table was not selected by the result, so some names may be wrong. It takes about 20 s of CPU
+    table was not selected by the result, so some names may be wrong. It takes about 25 s of CPU
     time.
 
     It writes table.png, table.html for the browser, and the folder recording, which shows the
