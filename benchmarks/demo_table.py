@@ -104,22 +104,32 @@ def room() -> list[Triangles]:
     return boxes
 
 
-def one_of_a_kind(
-    scans: Sequence[Path], rng: np.random.Generator
-) -> dict[str, list[Path]]:
-    """Files of scans in a drawn order, by the kind of thing: ``a_cups`` and ``b_cups`` are one."""
-    kinds: dict[str, list[Path]] = {}
+def one_of_a_kind(scans: Sequence[Path], rng: np.random.Generator) -> list[Path]:
+    """One scan of each kind, in a drawn order: ``a_cups`` and ``b_cups`` are of one kind.
+
+    Args:
+        scans: files.
+        rng: draws.
+    """
+    kinds: dict[str, Path] = {}
     for row in rng.permutation(len(scans)):
-        kind = re.sub("^[a-z]_", "", scans[row].stem)
-        kinds.setdefault(kind, []).append(scans[row])
-    return kinds
+        kinds.setdefault(re.sub("^[a-z]_", "", scans[row].stem), scans[row])
+    return list(kinds.values())
 
 
 def draw_table(scans: Sequence[Path], rng: np.random.Generator) -> SimulatedTable:
-    """Some scans and a toy on a table."""
+    """Some scans and a toy on a table.
+
+    Args:
+        scans: files, in metres.
+        rng: draws them, and how they lie.
+
+    Raises:
+        UsageError: they do not fit on the table.
+    """
     meshes: list[Mesh] = []
-    for same in one_of_a_kind(scans, rng).values():
-        mesh = replace(load_mesh(same[0], unit="m"), name=same[0].stem)
+    for path in one_of_a_kind(scans, rng):
+        mesh = replace(load_mesh(path, unit="m"), name=path.stem)
         if 2 * mesh.radius >= SMALLEST and len(meshes) < TAUGHT_THINGS:
             meshes.append(mesh)
     name = str(rng.choice(sorted(SAMPLE_MESHES)))
@@ -164,9 +174,11 @@ def record(scans: Sequence[Path], first: int) -> Recording:
             table = draw_table(scans, rng)
         except UsageError:  # the things do not fit
             continue
+
         camera = TableCamera(table, SENSORS["wrist"], rng, room())
         azimuths = rng.uniform(0, 2 * np.pi) + STEP * np.arange(FRAMES)
         frames = []
+
         for pose in poses_around(azimuths, ELEVATION, DISTANCE, CENTRE):
             frames.append(camera.frame(pose))
             if not in_view(camera):
@@ -206,7 +218,12 @@ def main(
 
 
 def write(found: Recording, folder: Path) -> None:
-    """Write a recording into an empty folder."""
+    """Write a recording into an empty folder.
+
+    Args:
+        found: the recording.
+        folder: that it is written into.
+    """
     for name in ("depth", "poses"):
         (folder / name).mkdir()
     for number, frame in enumerate(found.frames):

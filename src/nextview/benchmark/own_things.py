@@ -59,7 +59,7 @@ class OwnThings:
         self.names = tuple(self.recogniser.classes[k] for k in self._order)
 
     def log_evidence(self, observations: Sequence[Observation]) -> Floats:
-        """What it says of each view, (B, D): it can be summed over views.
+        """What it says of each view, (V, D): it can be summed over views.
 
         Args:
             observations: the views.

@@ -104,14 +104,17 @@ class ThingSettings:
         for value, what in ((self.draws, "draws"), (self.repeats, "repeats")):
             whole(value, f"the number of {what}", 1)
         whole(self.samples, "the samples of the bootstrap", 100)
+
         if not self.views or list(self.views) != sorted(set(self.views)):
             raise UsageError("the numbers of views ascend, as in --views 1 2 3 5")
         whole(self.views[0], "a number of views", 1, len(EPISODE_SPHERE))
         whole(self.views[-1], "a number of views", 2, len(EPISODE_SPHERE))
+
         if number(self.threshold, "the threshold", 0) >= 1:
             raise UsageError(f"a threshold is below 1, not {self.threshold}")
         if self.unit not in UNITS:
             raise UsageError(f"the unit is {', '.join(UNITS)}, not {self.unit}")
+
         if self.reference == BEST_BLIND and self.choose_seed == self.seed:
             raise UsageError(
                 "the best blind rule is chosen in other episodes than it is compared in: give"
@@ -347,7 +350,8 @@ def _check_same(
 
     before = read_record(file, _Made, "a record of episodes", ResultsError)
     for name in _Made.__struct_fields__:
-        old, new = getattr(before, name), getattr(made, name)
+        old = getattr(before, name)
+        new = getattr(made, name)
         if old != new:
             what = name.removesuffix("_sha256")
             raise ResultsError(

@@ -95,7 +95,12 @@ def opened(models: str) -> TaughtThings:
 
 
 def things_of(models: str, recogniser: str | None) -> TaughtThings | OwnThings:
-    """The things of a recogniser of your own, or else of a memory."""
+    """The things of a recogniser of your own, or else of a memory.
+
+    Args:
+        models: folder or name of the memory.
+        recogniser: MODULE:NAME of your own; None for the memory.
+    """
     return opened(models) if recogniser is None else own_things(recogniser)
 
 

@@ -29,21 +29,15 @@ THING_POLICIES = (
     "ceiling",
 )
 CEILINGS = ("ceiling",)  # it knows what no robot does
-BLIND_RULES = (
-    "random",
-    "spread",
-    "furthest",
-    "fixed",
-    "ring",
-)  # they ignore the images
+# they ignore the images
+BLIND_RULES = ("random", "spread", "furthest", "fixed", "ring")
 BEST_BLIND = "best-blind"  # the one of them that is best on other episodes
 # they go by the hypotheses of a memory of taught things
 OF_MEMORIES = ("picture", "geometry", "pose")
 # azimuth steps of the fixed sequence, of 8 a turn: it comes to all of them
 TURN_AHEAD = 3
-SETTLED_BELIEF = (
-    0.97  # in the truth, from which the ceiling is content with a view that keeps it
-)
+# belief in the truth: where it is reached, a view that keeps it is good enough for the ceiling
+SETTLED_BELIEF = 0.97
 
 
 @dataclass(frozen=True)

@@ -186,6 +186,7 @@ def _tests(tables: ThingTables) -> list[str]:
         "p (Holm)",
     ]
     lines = [_row(head), "|---" * len(head) + "|"]
+
     row: Any  # a named tuple
     for row in tables.tests.itertuples():
         measure = f"{row.measure} after {row.views}" if row.views else row.measure

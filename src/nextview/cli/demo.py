@@ -5,9 +5,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
-from nextview.captured.bundled_table import BUNDLED_TABLE, TRUTH_FILE, table_truth
+from nextview.captured.bundled_table import (
+    BUNDLED_TABLE,
+    TRUTH_FILE,
+    NamedPlace,
+    compared_with_truth,
+)
 from nextview.captured.folders import read_capture
 from nextview.cli.common_options import check_file, say_written
 from nextview.cli.look import print_scene
@@ -15,15 +18,13 @@ from nextview.cli.progress import Terminal, track
 from nextview.cli.recognise import Output, show
 from nextview.data.samples import sample_mesh
 from nextview.files import new_folder
-from nextview.scene.objects import UNKNOWN_NAME, SceneObject
+from nextview.scene.objects import UNKNOWN_NAME
 from nextview.scene.scene import Scene
 from nextview.session.system import load, simulated
-from nextview.types import Float
 from nextview.viewers.scene_card import write_picture_page
 
 DEMO_FOLDER = Path("nextview_demo")
 DEMO_PICTURE = Path("nextview_demo.png")
-SAME_PLACE = 0.05  # metres, at most, between an object and the thing that it is
 
 
 def demo(out: Path | None = None, overwrite: bool = False) -> None:
@@ -48,7 +49,7 @@ def demo(out: Path | None = None, overwrite: bool = False) -> None:
         shutil.copytree(BUNDLED_TABLE, part / "recording", ignore=copied)
         scene = _bundled_scene()
         print_scene(scene, "the bundled recording")
-        for line in _compared_with_truth(scene):
+        for line in compared_with_truth(_named_places(scene), scene.system.classes):
             Terminal().print(line)
         scene.plot(part / "table.png", "bundled recording")
         write_picture_page(scene, part / "table.html", part / "table.png")
@@ -69,41 +70,16 @@ def _bundled_scene() -> Scene:
     return scene
 
 
-def _compared_with_truth(scene: Scene) -> list[str]:
-    """Sentences on how many things of the bundled table are named correctly."""
-    known = set(scene.system.classes)
-    places = table_truth().places
-    right = 0
-    wrong, missed = [], []
-    for true, place in places.items():
-        found = _nearest(scene, np.array(place))
-        name = None if found is None else found.name
-        if name == (true if true in known else UNKNOWN_NAME):
-            right += 1
-        elif found is None or name == UNKNOWN_NAME:
-            missed.append(true)
-        else:
-            doubt = "" if found.confident else ", not confident"
-            wrong.append(f"{true} (named {name}{doubt})")
-    strangers = " and the ".join(name for name in places if name not in known)
-
-    said = [
-        f"Ground truth: {right} of {len(places)} are correct. The {strangers} was not taught;"
-        " unknown is the correct answer."
+def _named_places(scene: Scene) -> list[NamedPlace]:
+    """Names and places of all objects."""
+    return [
+        NamedPlace(
+            None if one.name == UNKNOWN_NAME else one.name,
+            one.confident,
+            one.place,
+        )
+        for one in scene.objects
     ]
-    said += [f"Wrong: {', '.join(wrong)}."] if wrong else []
-    said += [f"Not named: {', '.join(missed)}."] if missed else []
-    return said
-
-
-def _nearest(scene: Scene, place: Float) -> SceneObject | None:
-    """The object nearest to a place, (3,), metres; None if there is none nearby."""
-    near = [
-        (float(np.linalg.norm(thing.place - place)), thing.number, thing)
-        for thing in scene.objects
-    ]
-    best = min(near, default=None)
-    return best[2] if best is not None and best[0] < SAME_PLACE else None
 
 
 def demo_episode(

@@ -16,7 +16,8 @@ from nextview.recognition.novelty import Quantiles
 from nextview.recognition.poses import PoseCandidate
 from nextview.types import Float, Floats
 
-# times that the size of a taught thing is off, half hidden say, which none has
+# factor by which an object is larger or smaller than a taught thing of which half may be hidden,
+# from which it is not that thing
 THING_SIZE = 1.3
 
 
@@ -159,9 +160,9 @@ def classes_of_other_size(
     recogniser: Recogniser,
     radius: float | None,
 ) -> tuple[str, ...]:
-    """Names of the classes of which no object has a certain size.
+    """Return the classes whose objects are far larger or far smaller than an object.
 
-    A thing has one size, a class has many.
+    The bounds of a taught thing are narrower than those of a class, whose objects differ in size.
 
     Args:
         recogniser: knows the sizes, or not: one of your own does not.

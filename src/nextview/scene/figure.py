@@ -288,6 +288,7 @@ def _name(
 ) -> None:
     """Write the name of an object, in italics where it is not confident."""
     unknown = thing.name == UNKNOWN_NAME
+
     axes.text(
         x,
         y,
@@ -323,14 +324,15 @@ def _draw_from_above(
     upright = np.stack([front[1], -front[0], front[2]])
 
     outlines = [seen_from_above(thing, upright) for thing in objects]
-    ends = [corners for corners, _ in outlines]
-    everything = np.concatenate([*ends, np.zeros((0, 2))])
+    everything = np.concatenate(
+        [*(corners for corners, _ in outlines), np.zeros((0, 2))]
+    )
     if not len(everything):
         everything = (cameras[:, :3, 3] + cameras[:, :3, 2]) @ upright[:2].T
-    low = everything.min(0) - FIGURE_BORDER
-    high = everything.max(0) + FIGURE_BORDER
-    side = float((high - low).max())
-    low, high = (low + high) / 2 - side / 2, (low + high) / 2 + side / 2
+    ends = np.stack([everything.min(0), everything.max(0)])
+    side = float(np.ptp(ends, axis=0).max()) + 2 * FIGURE_BORDER
+    low = ends.mean(0) - side / 2
+    high = ends.mean(0) + side / 2
 
     for thing, (corners, picture) in zip(objects, outlines, strict=True):
         _draw_outline(
@@ -495,10 +497,12 @@ def _scale_bar(axes: Axes, low: Float, side: float, arrows: Float) -> None:
     """
     length = next((step for step in (0.01, 0.1, 1.0) if step > 0.08 * side), 1.0)
     words = {0.01: "1 cm", 0.1: "10 cm", 1.0: "1 m"}[length]
+
     starts = low + np.array([[0.04, 0.04], [0.96 - length / side, 0.04]]) * side
     middles = starts + np.array([length / 2, 0.0])
     away = np.linalg.norm(arrows[:, None] - middles, axis=2).min(0)
     start = starts[away.argmax()]
+
     axes.plot([start[0], start[0] + length], [start[1], start[1]], color=INK, lw=1.6)
     axes.text(
         start[0] + length / 2,

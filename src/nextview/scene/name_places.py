@@ -55,10 +55,12 @@ def name_places(
     taken: list[tuple[Float, Float]] = []
     found: dict[int, tuple[float, float]] = {}
     order = sorted(range(len(objects)), key=lambda row: -len(objects[row].name))
+
     for row in order:
         thing = objects[row]
         half = np.array([LETTER_WIDTH * font * len(thing.name), line]) / 2
         best = None
+
         for rank, place in enumerate(_candidates(thing, half, line, inside)):
             box = place - half, place + half
             cost = AWAY * rank
@@ -71,6 +73,7 @@ def name_places(
             cost += OUTSIDE * (1 - _overlap(box, (low, high)))
             if best is None or cost < best[0] - 1e-9:
                 best = cost, place, box
+
         assert best is not None
         taken.append(best[2])
         found[row] = float(best[1][0]), float(best[1][1])

@@ -515,6 +515,7 @@ class Session:
         with self._lock:
             if self.done:
                 raise SessionError("this session has ended; begin another one")
+
             known = (
                 self.object is None
                 or self.object.sightings
@@ -525,6 +526,7 @@ class Session:
                 raise SessionError(
                     f"{what}: the first frame comes from wherever the camera stands"
                 )
+
             view = (
                 self.view
                 if view is None

@@ -426,6 +426,7 @@ class Verifier:
             for name in OF_HYPOTHESES
         }
         scores = self.weights.scores(both["mean"], both["camera_costs"], log_belief)
+
         order = np.argsort(-scores, kind="stable")
         shares = np.exp(scores - scores.max())
         whole = replace(
