@@ -34,10 +34,10 @@ import tyro
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
+from nextview.benchmark.class_tables import grid_mean, levels_of
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.replay import Grid, make_specs, run_grid
 from nextview.benchmark.statistics import holm, interval, resample, sign_flip_p
-from nextview.benchmark.summary import grid_mean, levels_of
 from nextview.cli.exit_status import orderly_end
 from nextview.cli.progress import track
 from nextview.data.metrics import calibration_error

@@ -1,25 +1,20 @@
 """The benchmark of next views of taught things: from scans to a folder of tables, resumable.
 
-A folder of results holds ``episodes``, all that was sensed and verified, a folder for each episode;
-``runs``, what each policy made of it, a small file for each; the record ``benchmark.json``, which
-says how it was run; and the tables and figures, which every run writes anew.
+Beside what ``jobs`` says of it, a folder of results holds ``episodes``: all that was sensed and
+verified, a folder for each episode.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
+from nextview.benchmark.compared_results import write_compared
 from nextview.benchmark.confusable import Alikeness, how_alike
+from nextview.benchmark.jobs import check_place, check_same, run_jobs
 from nextview.benchmark.own_things import OwnThings
-from nextview.benchmark.thing_episodes import (
-    EPISODE_SPHERE,
-    Occlusion,
-    Setting,
-)
-from nextview.benchmark.thing_jobs import ThingJob, things_of, work
 from nextview.benchmark.thing_policies import (
     BEST_BLIND,
     BLIND_RULES,
@@ -27,102 +22,28 @@ from nextview.benchmark.thing_policies import (
     THING_POLICIES,
     policies_of,
 )
-from nextview.benchmark.thing_replay import EpisodeRuns, policies_in
-from nextview.benchmark.thing_results import write_results
-from nextview.benchmark.thing_tables import Compared, ThingTables, summarise_things
-from nextview.checks import number, whole
+from nextview.benchmark.thing_runs import (
+    EpisodeRuns,
+    ThingJob,
+    ThingSettings,
+    things_of,
+    work,
+)
+from nextview.benchmark.thing_tables import ThingTables, summarise_things
 from nextview.data import pool
 from nextview.data.progress import TrackProgress, silently
-from nextview.errors import DatasetError, ResultsError, UsageError
-from nextview.files import check_new, command, only_one, read_record, write_record
-from nextview.geometry.mesh import UNITS, load_mesh
-from nextview.simulation.sensor import sensor_named
+from nextview.errors import DatasetError, ResultsError
+from nextview.files import command, only_one, read_record, write_record
+from nextview.geometry.mesh import load_mesh
 from nextview.teaching.learn import learn_things
 from nextview.teaching.thing_sources import find_things
 from nextview.teaching.thing_views import TeachingOptions
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 
-EPISODES_FILE = "episodes.json"  # how the episodes of a folder are shown
 ALIKE_FILE = "alike.json"  # how alike the things of the memory are
 CHOOSING = "choosing"  # folder of the episodes in which the best blind rule is chosen
 MEMORY = "memory"  # folder of what is taught, where no models are given
-
-
-@dataclass(frozen=True)
-class ThingSettings:
-    """Conditions, policies and statistics.
-
-    Attributes:
-        models: name or folder of the memory that knows the scans; by default they are taught first,
-            into OUT/memory.
-        sensor: simulated depth camera, NAME or NAME:STRENGTH, see nextview render --help.
-        occlusion: "none" shows things alone, "half" and "heavy" among boxes that leave half and a
-            third of them visible.
-        draws: episodes per thing, each with another rotation and first view.
-        views: numbers of views after which the policies are compared; episodes have the largest.
-        policies: names, or MODULE:CLASS for your own; by default all that the recogniser
-            allows. Only missing results are computed; your own policies always run again.
-        reference: policy that the others are compared with; it always takes part. "best-blind" is
-            the rule that ignores the images (random, spread, furthest, fixed or ring) and is best
-            after the first view in other episodes of the same things.
-        choose_seed: seed of these other episodes.
-        recogniser: MODULE:NAME of your own in the place of the memory; its classes are the things,
-            and nothing is taught. Policies that go by a memory's hypotheses do not take part.
-        threshold: belief from which an answer counts as confident, unless the thing is explained
-            worse than nine in ten known ones: then a session goes on, too.
-        repeats: runs of the policy random in each episode.
-        unit: unit of length of the scan files.
-        families: things whose names are equal up to the first _, such as variants of one scan,
-            count as one in intervals and p-values.
-        samples: number of bootstrap samples.
-        seed: seed of rotations, boxes, first views, noise and random policies.
-    """
-
-    models: str | None = None
-    sensor: str = "wrist"
-    occlusion: Occlusion = "none"
-    draws: int = 1
-    views: tuple[int, ...] = (1, 2, 3, 5)
-    policies: tuple[str, ...] = ()
-    reference: str = "random"
-    choose_seed: int = 1
-    recogniser: str | None = None
-    threshold: float = 0.97
-    repeats: int = 2
-    unit: str = "m"
-    families: bool = False
-    samples: int = 10_000
-    seed: int = 0
-
-    def check(self) -> None:
-        """See that it makes sense, before any work is done.
-
-        Raises:
-            UsageError: a number, a unit or a sensor that there is none of.
-        """
-        for value, what in ((self.draws, "draws"), (self.repeats, "repeats")):
-            whole(value, f"the number of {what}", 1)
-        whole(self.samples, "the samples of the bootstrap", 100)
-
-        if not self.views or list(self.views) != sorted(set(self.views)):
-            raise UsageError("the numbers of views ascend, as in --views 1 2 3 5")
-        whole(self.views[0], "a number of views", 1, len(EPISODE_SPHERE))
-        whole(self.views[-1], "a number of views", 2, len(EPISODE_SPHERE))
-
-        if number(self.threshold, "the threshold", 0) >= 1:
-            raise UsageError(f"a threshold is below 1, not {self.threshold}")
-        if self.unit not in UNITS:
-            raise UsageError(f"the unit is {', '.join(UNITS)}, not {self.unit}")
-
-        if self.reference == BEST_BLIND and self.choose_seed == self.seed:
-            raise UsageError(
-                "the best blind rule is chosen in other episodes than it is compared in: give"
-                f" --choose-seed another value than --seed, {self.seed}"
-            )
-        if self.recogniser is not None and self.models is not None:
-            raise UsageError("a recogniser of your own takes no --models")
-        sensor_named(self.sensor)
 
 
 class _Made(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -170,7 +91,7 @@ def benchmark_things(
     asked = settings
     scans = Path(scans)
     out = Path(out)
-    _check_place(out)
+    check_place(out, MEMORY)
     pool.count(workers)
     found = {thing.name: thing.path for thing in find_things(scans, out).things}
     with only_one(out):
@@ -199,17 +120,9 @@ def benchmark_things(
 
         jobs = _jobs(models, found, out, settings, things)
         runs = _replayed(jobs, settings, things, workers, track)
-        names = {job.scan_name for job in jobs}
+        names = {job.scan.stem for job in jobs}
         alike = _alike(out, _surfaces(things, found, settings)).of(names)
-        how = Compared(
-            policies_in(runs),
-            settings.views,
-            settings.threshold,
-            settings.families,
-            settings.samples,
-            settings.reference,
-        )
-        tables = replace(summarise_things(runs, alike, how), chosen=chosen)
+        tables = summarise_things(runs, alike, settings, chosen)
         made = asdict(asked) | {
             "policies": settings.policies,
             "compared_with": settings.reference,
@@ -217,7 +130,7 @@ def benchmark_things(
             "command": command(),
             "scans": str(scans),
         }
-        write_results(out, tables, made)
+        write_compared(out, tables, made, "accuracy", "named right")
     return tables
 
 
@@ -240,15 +153,20 @@ def _replayed(
     track: TrackProgress,
 ) -> list[EpisodeRuns]:
     """The runs of all episodes, of which those that are not there are replayed."""
-    jobs[0].out.mkdir(parents=True, exist_ok=True)
-    _check_same(jobs[0].out, settings, things)
-    left = [job for job in map(_left, jobs) if job is not None]
-    steps = pool.counted(work, left, len(jobs), lambda job: job.name, workers)
-    next(steps)
-    track((done for done, _ in steps), len(jobs), "episodes")
-    return [
-        read_record(job.runs_file, EpisodeRuns, "runs", ResultsError) for job in jobs
-    ]
+    made = _Made(
+        memory_sha256=things.recogniser.card.sha256
+        if isinstance(things, TaughtThings)
+        else "",
+        recogniser=settings.recogniser or "",
+        sensor=settings.sensor,
+        occlusion=settings.occlusion,
+        views=settings.views[-1],
+        repeats=settings.repeats,
+        seed=settings.seed,
+    )
+    check_same(jobs[0].out, made)
+    anew = settings.recogniser is not None
+    return run_jobs(work, jobs, EpisodeRuns, workers, track, anew)
 
 
 def best_blind(
@@ -295,18 +213,6 @@ def _surfaces(
     ]
 
 
-def _check_place(out: Path) -> None:
-    """See that a folder is new, or holds results of this benchmark."""
-    check_new(out, overwrite=True, folder=True)
-    if not out.is_dir() or (out / EPISODES_FILE).is_file() or (out / MEMORY).is_dir():
-        return
-    strange = [path.name for path in out.iterdir() if not path.name.startswith(".")]
-    if strange:
-        raise ResultsError(
-            f"{out}: holds {strange[0]}, and no results of this benchmark"
-        )
-
-
 def _taught(
     scans: Path,
     out: Path,
@@ -324,39 +230,6 @@ def _taught(
         how = TeachingOptions(unit=settings.unit, sensor=settings.sensor)  # type: ignore[arg-type]
         learn_things(scans, memory, how, workers=workers, track=track)
     return str(memory)
-
-
-def _check_same(
-    out: Path,
-    settings: ThingSettings,
-    things: TaughtThings | OwnThings,
-) -> None:
-    """See that episodes which are there are of the same memory, sensor and seed."""
-    made = _Made(
-        memory_sha256=things.recogniser.card.sha256
-        if isinstance(things, TaughtThings)
-        else "",
-        recogniser=settings.recogniser or "",
-        sensor=settings.sensor,
-        occlusion=settings.occlusion,
-        views=settings.views[-1],
-        repeats=settings.repeats,
-        seed=settings.seed,
-    )
-    file = out / EPISODES_FILE
-    if not file.exists():
-        write_record(file, made)
-        return
-
-    before = read_record(file, _Made, "a record of episodes", ResultsError)
-    for name in _Made.__struct_fields__:
-        old = getattr(before, name)
-        new = getattr(made, name)
-        if old != new:
-            what = name.removesuffix("_sha256")
-            raise ResultsError(
-                f"{out}: its episodes are of another {what} ({old}, not {new}); give another folder"
-            )
 
 
 class _Alike(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -398,32 +271,18 @@ def _jobs(
     things: TaughtThings | OwnThings,
 ) -> list[ThingJob]:
     """All episodes of a run."""
-    setting = Setting(settings.sensor, settings.occlusion, settings.seed)
-
     return [
         ThingJob(
-            models=models,
-            scan=scans[name],
-            unit=settings.unit,
-            thing=thing,
-            draw=draw,
-            setting=setting,
-            views=settings.views[-1],
-            repeats=settings.repeats,
-            policies=settings.policies,
-            out=out,
-            recogniser=settings.recogniser,
+            settings,
+            out,
+            f"{thing:04d}_{draw:02d}",
+            settings.policies,
+            models,
+            scans[name],
+            thing,
+            draw,
         )
         for draw in range(settings.draws)
         for thing, name in enumerate(things.names)
         if name in scans
     ]
-
-
-def _left(job: ThingJob) -> ThingJob | None:
-    """The job with the policies that are not done; None if all are. Your own are done anew."""
-    if not job.runs_file.exists() or job.recogniser is not None:
-        return job
-    done = read_record(job.runs_file, EpisodeRuns, "runs", ResultsError).runs
-    left = tuple(name for name in job.policies if name not in done or ":" in name)
-    return replace(job, policies=left) if left else None
