@@ -63,7 +63,7 @@ def test_tables_of_another_seed_or_of_few_scans_are_refused(looked, household, s
     other = TableSettings(tables=1, views=(1,), seed=SIX + 1)
     with pytest.raises(ResultsError, match="of another seed"):
         benchmark_tables(household, scans, out, other, workers=0)
-    with pytest.raises(UsageError, match="holds 3 scans; a table takes up to 10"):
+    with pytest.raises(UsageError, match="holds 3 scans; a table takes up to 9"):
         benchmark_tables(scans, scans, out.parent / "few", SETTINGS, workers=0)
     with pytest.raises(UsageError, match="ascend"):
         TableSettings(views=(2, 1)).check()

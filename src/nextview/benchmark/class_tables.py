@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,18 +16,21 @@ from nextview.benchmark.comparison import (
     Tables,
     corrected,
     measures_of,
+    tests_of,
 )
 from nextview.benchmark.entries import knows_truth
 from nextview.benchmark.published import comparable_classes, published
 from nextview.benchmark.replay import Grid
 from nextview.checks import extras
 from nextview.data import metrics
+from nextview.data.predictions import Predictions
 from nextview.session.episode import Outcome
 from nextview.simulation.scene_layout import CLUTTER_LEVELS, clutter_level
 from nextview.types import Float, Index
 
 with extras():
     import pandas as pd
+    import pyarrow.parquet as pq
 
 Cell = tuple[str, float | None, Outcome]
 Both = tuple["pd.DataFrame", "pd.DataFrame"]  # measures and tests
@@ -60,6 +65,38 @@ class ClassTables(Tables):
 
     sweep: pd.DataFrame
     reliability: pd.DataFrame
+
+
+@dataclass(frozen=True)
+class ClassResults:
+    """A folder of results: how it was run, from which predictions, and the tables.
+
+    Attributes:
+        folder: that holds them.
+        settings: with which they were made.
+        predictions: that were replayed.
+        tables: the results.
+    """
+
+    folder: Path
+    settings: dict[str, Any]
+    predictions: Predictions
+    tables: ClassTables
+
+    def episodes(self, policy: str, threshold: float | None) -> pd.DataFrame:
+        """Read the episodes of a policy at a threshold.
+
+        Args:
+            policy: name of the policy.
+            threshold: of the belief; None for fixed views.
+
+        Returns:
+            One episode per row: run by run, with the objects in the order of the predictions.
+        """
+        cell = [("policy", "==", policy)] + (
+            [] if threshold is None else [("threshold", "==", threshold)]
+        )
+        return pq.read_table(self.folder / "episodes.parquet", filters=cell).to_pandas()
 
 
 def class_set(label: str) -> str:
@@ -265,8 +302,7 @@ def by_level(
     choosing = [name for name, paths in grid.paths.items() if not paths.fixed]
     known = [level for level in CLUTTER_LEVELS if level in level_of]
     measures = [measures_of("", [])]
-    nothing = Counted((), np.empty((0, 0)), np.empty((0, 0)), np.empty(0, np.int64))
-    tests = [nothing.tests("", np.empty((0, 0)), reference, lambda key: False)]
+    tests = [tests_of("", reference, [])]
 
     for level in [*known, *sorted({*level_of} - {*known, ""})]:
         mine = np.flatnonzero(level_of == level)

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from nextview.benchmark.class_tables import ClassTables, summarise
+from nextview.benchmark.class_tables import ClassResults, ClassTables, summarise
 from nextview.benchmark.entries import default_entries
 from nextview.benchmark.leaderboard import after_views_rows
 from nextview.benchmark.replay import THESIS_THRESHOLDS, Grid, make_specs, run_grid
@@ -65,38 +65,6 @@ class ClassSettings:
     reference: str = "random"
     samples: int = 2000
     seed: int = 0
-
-
-@dataclass(frozen=True)
-class ClassResults:
-    """A folder of results: how it was run, from which predictions, and the tables.
-
-    Attributes:
-        folder: that holds them.
-        settings: with which they were made.
-        predictions: that were replayed.
-        tables: the results.
-    """
-
-    folder: Path
-    settings: dict[str, Any]
-    predictions: Predictions
-    tables: ClassTables
-
-    def episodes(self, policy: str, threshold: float | None) -> pd.DataFrame:
-        """Read the episodes of a policy at a threshold.
-
-        Args:
-            policy: name of the policy.
-            threshold: of the belief; None for fixed views.
-
-        Returns:
-            One episode per row: run by run, with the objects in the order of the predictions.
-        """
-        cell = [("policy", "==", policy)] + (
-            [] if threshold is None else [("threshold", "==", threshold)]
-        )
-        return pq.read_table(self.folder / "episodes.parquet", filters=cell).to_pandas()
 
 
 def benchmark_classes(

@@ -55,6 +55,10 @@ class Tables:
     tests: "pd.DataFrame"
     reference: str
 
+    def policies(self) -> list[str]:
+        """The policies, in their order."""
+        return list(self.measures["policy"].unique())
+
     def frames(self) -> dict[str, "pd.DataFrame"]:
         """All tables by their names."""
         there = vars(self).items()

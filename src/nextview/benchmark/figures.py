@@ -7,14 +7,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from nextview.benchmark.class_tables import ONE_STEP
-from nextview.benchmark.classes import ClassResults
+from nextview.benchmark.class_tables import ONE_STEP, ClassResults
 from nextview.benchmark.comparison import ALL, SIGNIFICANT, Tables, values_of
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.evaluation import Evaluation
 from nextview.benchmark.leaderboard import headline_threshold
 from nextview.benchmark.page import words
-from nextview.benchmark.results import policies_of_tables
 from nextview.checks import extras
 from nextview.recognition.map_names import LCM, LEM
 from nextview.session.style import (
@@ -113,7 +111,7 @@ def look_of(policy: str, tables: Tables) -> dict[str, Any]:
     Returns:
         Keyword arguments of ``plot``; no two of eight policies without a colour have the same.
     """
-    own = [name for name in policies_of_tables(tables) if name not in POLICY_COLOURS]
+    own = [name for name in tables.policies() if name not in POLICY_COLOURS]
     colour = POLICY_COLOURS.get(policy) or OWN[own.index(policy) % len(OWN)]
     line = ":" if policy in FORESEES else "--" if is_oracle(policy) else "-"
     return {"color": colour, "linestyle": line}
@@ -130,7 +128,7 @@ def views_curve(tables: Tables, measure: str, what: str) -> Figure:
     figure, axes = new_figure(4.6, 3.5)
     values = values_of(tables, ALL)
     views = sorted({k for _, name, k in values if name == measure})
-    policies = policies_of_tables(tables)
+    policies = tables.policies()
     for row, policy in enumerate(policies):
         shares = np.array([values[policy, measure, k] for k in views])
         # side by side, so that the bars can be told apart

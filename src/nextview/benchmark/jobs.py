@@ -126,12 +126,12 @@ def check_place(out: Path, own: str = EPISODES_FILE) -> None:
         )
 
 
-def check_same(out: Path, made: msgspec.Struct) -> None:
+def check_same(out: Path, made: dict[str, Any]) -> None:
     """See that the episodes of a folder are shown as those of this run; note it in a new folder.
 
     Args:
         out: folder of the results.
-        made: how they are shown.
+        made: how they are shown, by what is set.
 
     Raises:
         ResultsError: they are shown in another way.
@@ -142,10 +142,9 @@ def check_same(out: Path, made: msgspec.Struct) -> None:
         write_record(file, made)
         return
 
-    before = read_record(file, type(made), "a record of episodes", ResultsError)
-    for name in made.__struct_fields__:
-        old = getattr(before, name)
-        new = getattr(made, name)
+    before = read_record(file, dict[str, Any], "a record of episodes", ResultsError)
+    for name, new in made.items():
+        old = before.get(name)
         if old != new:
             what = name.removesuffix("_sha256")
             raise ResultsError(

@@ -14,8 +14,8 @@ from PIL import Image
 
 from nextview.benchmark import figures as draw
 from nextview.benchmark import leaderboard as board
-from nextview.benchmark.class_tables import class_set, levels_of
-from nextview.benchmark.classes import ClassResults, load
+from nextview.benchmark.class_tables import ClassResults, class_set, levels_of
+from nextview.benchmark.classes import load
 from nextview.benchmark.comparison import ALL, SIGNIFICANT, values_of
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.page import numbers, origin, picture, render, write_figures

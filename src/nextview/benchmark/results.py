@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 from nextview.benchmark.comparison import Tables, too_few, values_of
+from nextview.benchmark.figures import differences, views_curve
 from nextview.checks import extras
 from nextview.files import new_folder
+from nextview.session.style import to_png
 
 with extras():
     import pandas as pd
@@ -76,11 +78,6 @@ class ComparedTables(Tables):
         return [*filter(None, [self.chosen]), *few]
 
 
-def policies_of_tables(tables: Tables) -> list[str]:
-    """The policies, in their order."""
-    return list(tables.measures["policy"].unique())
-
-
 def write_results(
     out: Path,
     tables: Tables,
@@ -131,7 +128,7 @@ def board_rows(
         star = "*" * ((policy, measure, column.views) in stars)
         return "-" if np.isnan(value) else f"{value:.{column.digits}f}{star}"
 
-    for policy in policies_of_tables(tables):
+    for policy in tables.policies():
         yield [
             policy,
             *(", ".join(shown(policy, m, c) for m in c.measures) for c in columns),
@@ -178,6 +175,36 @@ def _tests(tables: Tables) -> str:
             [row.set, row.policy, measure, f"{row.difference:+.3f}", between, p]
         )
     return markdown([*head, "95 % interval", "p (Holm)"], rows)
+
+
+def write_compared(
+    out: Path,
+    tables: ComparedTables,
+    made: Mapping[str, Any],
+    measure: str,
+    what: str,
+) -> None:
+    """Write tables and figures into a folder, in the place of earlier ones.
+
+    Args:
+        out: the folder.
+        tables: what was found.
+        made: how, as JSON can hold it.
+        measure: the share that is drawn, after numbers of views.
+        what: the same in words.
+    """
+
+    def more(part: Path) -> None:
+        (part / "tables.md").write_text(compared_markdown(tables), encoding="utf-8")
+        (part / "table.tex").write_text(latex(tables), encoding="utf-8")
+        to_png(views_curve(tables, measure, what), part / "accuracy.png")
+        tests = tables.tests[tables.tests["measure"] == measure]
+        if len(tests):
+            k = tests["views"].min()
+            drawn = differences(tables, tests[tests["views"] == k], f"{what} after {k}")
+            to_png(drawn, part / "differences.png")
+
+    write_results(out, tables, made, more)
 
 
 def latex(tables: ComparedTables) -> str:

@@ -127,23 +127,18 @@ class TableJob(Job):
 
 
 @lru_cache(maxsize=1)
-def knowing(models: str) -> System:
-    """The system that knows the things.
+def opened_models(
+    models: str,
+    network: Path | None,
+) -> tuple[System, Segmenter | None]:
+    """The system that knows the things, and what tells them apart; None for the bundled network.
 
     Args:
         models: name or folder of the memory.
+        network: card of another segmentation network.
     """
-    return load(models, threads=1)
-
-
-@lru_cache(maxsize=1)
-def told_by(network: Path | None) -> Segmenter | None:
-    """What tells the things apart; None for the bundled network.
-
-    Args:
-        network: card of another one.
-    """
-    return None if network is None else LearnedSegmenter(network)
+    segmenter = None if network is None else LearnedSegmenter(network)
+    return load(models, threads=1), segmenter
 
 
 @lru_cache(maxsize=2)
@@ -230,14 +225,29 @@ def _draw(
 
 
 class Looking:
-    """A table under way: the frames so far, and what each of their pixels truly shows."""
+    """A table under way: the frames so far, and what each of their pixels truly shows.
+
+    Attributes:
+        scene: what is known of it.
+        camera: over it.
+        owners: thing of each pixel, -1 for none, (H, W) int64, by frame.
+        cameras: believed and true pose of the camera, (4, 4) each, metres, by frame.
+        seconds: of CPU for the last frame.
+    """
 
     def __init__(
         self,
-        system: System,
         camera: TableCamera,
+        system: System,
         segmentation: Segmenter | None = None,
     ) -> None:
+        """Begin with no frame.
+
+        Args:
+            camera: over the table.
+            system: that knows the things.
+            segmentation: that tells them apart; None for the bundled network.
+        """
         self.scene = Scene(system, segmentation=segmentation)
         self.camera = camera
         self.owners: list[Index] = []
@@ -335,7 +345,7 @@ def look_at_table(job: TableJob, table: SimulatedTable, policy: str) -> TableRun
     how: TableSettings = job.settings
     rng = np.random.default_rng([how.seed, job.table, 1])
     camera = TableCamera(table, SENSORS["wrist"], rng)
-    looking = Looking(knowing(how.models), camera, told_by(how.network))
+    looking = Looking(camera, *opened_models(how.models, how.network))
     choose = np.random.default_rng([how.seed, job.table, 2])
     azimuth = choose.uniform(0, 2 * np.pi)
     elevation = np.radians(choose.uniform(*VIEW_ELEVATIONS))

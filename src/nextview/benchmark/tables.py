@@ -4,13 +4,16 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
-from nextview.benchmark.compared_results import write_compared
 from nextview.benchmark.comparison import ALL, Counted, Key, corrected
 from nextview.benchmark.jobs import check_place, check_same, run_jobs
-from nextview.benchmark.results import Board, Column, ComparedTables
+from nextview.benchmark.results import (
+    Board,
+    Column,
+    ComparedTables,
+    write_compared,
+)
 from nextview.benchmark.statistics import resample
 from nextview.benchmark.table_runs import (
     MOST_THINGS,
@@ -27,26 +30,16 @@ from nextview.errors import UsageError
 from nextview.files import command, only_one
 from nextview.things.memory import open_memory
 
-SHARES = {  # by measure: what is counted, of what, and the heading
-    "recall": ("right", "things"),
-    "precision": ("right", "named"),
-    "recall, confident": ("sure_right", "things"),
-    "precision, confident": ("sure_right", "sure"),
-    "ADD-S < 0.1 d, world": ("close", "right"),
-    "ADD-S < 0.1 d, camera": ("close_in_camera", "right"),
-    "strangers unknown": ("unknown", "strangers"),
+# by measure: what is counted, of what, and the heading in narrow tables
+SHARES = {
+    "recall": ("right", "things", "recall"),
+    "precision": ("right", "named", "precision"),
+    "recall, confident": ("sure_right", "things", "confident recall"),
+    "precision, confident": ("sure_right", "sure", "confident precision"),
+    "ADD-S < 0.1 d, world": ("close", "right", ""),
+    "ADD-S < 0.1 d, camera": ("close_in_camera", "right", ""),
+    "strangers unknown": ("unknown", "strangers", "strangers unknown"),
 }
-
-
-class _Shown(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How the tables of a folder are shown: those of another run fit only if all is the same."""
-
-    memory_sha256: str
-    network: str
-    scans: int
-    strangers: int
-    views: list[int]
-    seed: int
 
 
 def benchmark_tables(
@@ -81,19 +74,20 @@ def benchmark_tables(
     scans, strangers, out = Path(scans), Path(strangers), Path(out)
     check_place(out)
     pool.count(workers)
-    if len(meshes_in(scans)) < MOST_THINGS:
+    least = MOST_THINGS - 1  # one is a stranger
+    if len(meshes_in(scans)) < least:
         raise UsageError(
-            f"{scans}: holds {len(meshes_in(scans))} scans; a table takes up to {MOST_THINGS}"
+            f"{scans}: holds {len(meshes_in(scans))} scans; a table takes up to {least}"
         )
     policies = tuple(dict.fromkeys([settings.reference, *settings.policies]))
-    shown = _Shown(
-        memory_sha256=open_memory(settings.models)[0].sha256,
-        network=str(settings.network or ""),
-        scans=len(meshes_in(scans)),
-        strangers=len(meshes_in(strangers)),
-        views=list(settings.views),
-        seed=settings.seed,
-    )
+    shown = {
+        "memory_sha256": open_memory(settings.models)[0].sha256,
+        "network": str(settings.network or ""),
+        "scans": len(meshes_in(scans)),
+        "strangers": len(meshes_in(strangers)),
+        "views": list(settings.views),
+        "seed": settings.seed,
+    }
     jobs = [
         TableJob(settings, out, f"{table:04d}", policies, scans, strangers, table)
         for table in range(settings.tables)
@@ -104,7 +98,7 @@ def benchmark_tables(
         there = [name for name in TABLE_POLICIES if all(name in e.runs for e in runs)]
         tables = summarise_tables(runs, there, settings)
         made = asdict(settings) | {
-            "network": shown.network,
+            "network": shown["network"],
             "policies": there,
             "command": command(),
             "scans": str(scans),
@@ -138,7 +132,7 @@ def summarise_tables(
 
             sums |= {
                 Key(policy, None, k, measure): (of(found), of(there))
-                for measure, (found, there) in SHARES.items()
+                for measure, (found, there, _) in SHARES.items()
             }
             sums[Key(policy, None, k, "CPU, s")] = of("seconds"), one
         done = np.array([run.done for run in mine], np.float64)
@@ -173,6 +167,8 @@ def _is_compared(key: Key) -> bool:
 def _columns(k: int) -> tuple[Column, ...]:
     """What is shown of the policies after a number of frames."""
     until = "frames until done"
-    shares = [Column(name, (name,), k, short=name) for name in SHARES]
+    shares = [
+        Column(name, (name,), k, short=short) for name, (_, _, short) in SHARES.items()
+    ]
     spent = Column("CPU for the last frame, s", ("CPU, s",), k, 2)
-    return (*shares, Column(until, (until,), 0, 2, until), spent)
+    return (*shares, Column(until, (until,), 0, 2, "until done"), spent)

@@ -218,7 +218,7 @@ def summarise_things(
         poses = _poses(name, together, family, weights, how)
         measures += [counted.measures(name, weights), poses[0], _times(name, together)]
         tests += [counted.tests(name, weights, how.reference, _is_tested), poses[1]]
-        about = f"{len(things)} things"
+        about = f"{len(things)} thing{'s' * (len(things) > 1)}"
         title = f"{TITLES[name]}: share named right after views"
         boards.append(Board(title, name, _columns(how.views), about))
 
@@ -260,7 +260,7 @@ def _columns(views: tuple[int, ...]) -> tuple[Column, ...]:
         Column(f"travel to view {last}, rad", ("travel, rad",), last, 2, "travel"),
         Column(way, (way,), 0, 2),
         *poses,
-        Column("choice, ms of CPU: median, 95 %", spent, 0, 0, "choice, ms"),
+        Column("choice, ms of CPU: median, 95 %", spent, 0, 0, "choice, ms of CPU"),
     )
 
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from nextview.benchmark.compared_results import write_compared
 from nextview.benchmark.confusable import Alikeness, how_alike
 from nextview.benchmark.jobs import check_place, check_same, run_jobs
 from nextview.benchmark.own_things import OwnThings
+from nextview.benchmark.results import write_compared
 from nextview.benchmark.thing_policies import (
     BEST_BLIND,
     BLIND_RULES,
@@ -44,18 +44,6 @@ from nextview.things.taught import TaughtThings
 ALIKE_FILE = "alike.json"  # how alike the things of the memory are
 CHOOSING = "choosing"  # folder of the episodes in which the best blind rule is chosen
 MEMORY = "memory"  # folder of what is taught, where no models are given
-
-
-class _Made(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How the episodes of a folder are shown: those of another run fit only if all is the same."""
-
-    memory_sha256: str
-    recogniser: str
-    sensor: str
-    occlusion: str
-    views: int
-    repeats: int
-    seed: int
 
 
 def benchmark_things(
@@ -153,17 +141,17 @@ def _replayed(
     track: TrackProgress,
 ) -> list[EpisodeRuns]:
     """The runs of all episodes, of which those that are not there are replayed."""
-    made = _Made(
-        memory_sha256=things.recogniser.card.sha256
-        if isinstance(things, TaughtThings)
-        else "",
-        recogniser=settings.recogniser or "",
-        sensor=settings.sensor,
-        occlusion=settings.occlusion,
-        views=settings.views[-1],
-        repeats=settings.repeats,
-        seed=settings.seed,
-    )
+    made = {
+        "memory_sha256": ""
+        if isinstance(things, OwnThings)
+        else things.recogniser.card.sha256,
+        "recogniser": settings.recogniser or "",
+        "sensor": settings.sensor,
+        "occlusion": settings.occlusion,
+        "views": settings.views[-1],
+        "repeats": settings.repeats,
+        "seed": settings.seed,
+    }
     check_same(jobs[0].out, made)
     anew = settings.recogniser is not None
     return run_jobs(work, jobs, EpisodeRuns, workers, track, anew)

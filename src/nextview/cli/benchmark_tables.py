@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from nextview.benchmark import leaderboard as board
-from nextview.benchmark.classes import ClassResults
+from nextview.benchmark.class_tables import ClassResults
 from nextview.benchmark.comparison import SIGNIFICANT, significant
 from nextview.benchmark.entries import is_oracle
 from nextview.benchmark.evaluation import Evaluation
@@ -122,15 +122,14 @@ def print_compared(found: ComparedTables) -> None:
     for each in found.boards:
         console.print(_compared(found, each))
     console.print(
-        f"* differs from {found.reference}: p after Holm's correction is below {SIGNIFICANT};"
-        " choice is the median of its CPU"
+        f"* differs from {found.reference}: p after Holm's correction is below {SIGNIFICANT}"
     )
     for sentence in found.sentences():
         console.print(sentence)
 
 
 def _compared(found: ComparedTables, shown: Board) -> Table:
-    table = Table(title=shown.title, box=box.SIMPLE_HEAD)
+    table = Table(title=shown.title, caption=shown.about, box=box.SIMPLE_HEAD)
     table.add_column("policy", no_wrap=True)
     columns = [
         replace(column, measures=column.measures[:1]) for column in shown.narrow()
