@@ -216,8 +216,10 @@ def summarise_things(
             sums |= _sums(own, policy, how.views)
         counted = Counted.of(sums, family)
         poses = _poses(name, together, family, weights, how)
-        measures += [counted.measures(name, weights), poses[0], _times(name, together)]
-        tests += [counted.tests(name, weights, how.reference, _is_tested), poses[1]]
+        found = [counted.measures(name, weights), poses[0], _times(name, together)]
+        apart = [counted.tests(name, weights, how.reference, _is_tested), poses[1]]
+        measures.append(_by_policy(found, list(together)))
+        tests.append(_by_policy(apart, list(together)))
         about = f"{len(things)} thing{'s' * (len(things) > 1)}"
         title = f"{TITLES[name]}: share named right after views"
         boards.append(Board(title, name, _columns(how.views), about))
@@ -232,6 +234,13 @@ def summarise_things(
         _as_table(alike),
         len(runs),
     )
+
+
+def _by_policy(parts: list["pd.DataFrame"], policies: list[str]) -> "pd.DataFrame":
+    """Rows of one set, policy by policy."""
+    table = pd.concat(parts, ignore_index=True)
+    place = table["policy"].map(policies.index)
+    return table.iloc[np.argsort(place.to_numpy(), kind="stable")]
 
 
 def _columns(views: tuple[int, ...]) -> tuple[Column, ...]:
