@@ -322,11 +322,7 @@ def test_a_policy_without_known_geometry_says_so():
 
 def test_what_is_known_of_a_scene_comes_from_the_views_and_the_verifier():
     meshes = [box_mesh(BODY), box_mesh(BODY, HANDLE)]
-    verifier = Verifier(
-        [Surface.from_mesh(m, str(k)) for k, m in enumerate(meshes)],
-        [0, 1],
-        [np.eye(3)] * 2,
-    )
+    verifier = Verifier([Surface.from_mesh(m, str(k)) for k, m in enumerate(meshes)])
     sensor = replace(SENSORS["none"], radius=meshes[1].metres, distance=AWAY)
     block = trimesh.creation.box((0.2, 1.0, 1.5))
     block.apply_translation((1.8, 0.0, 0.0))  # object radii
@@ -338,7 +334,7 @@ def test_what_is_known_of_a_scene_comes_from_the_views_and_the_verifier():
     )
     camera = SensedCamera(meshes[1], sensor, np.random.default_rng(0), around=obstacle)
     observations = [camera.observe(SPHERE.poses[view]) for view in (12, 18)]
-    found = verifier(observations, np.full((2, 16), 1 / 32))
+    found = verifier(observations)
     outlook = Outlook.of(verifier, found, observations)
     assert outlook.taken == 2
     assert outlook.distance == pytest.approx(AWAY, rel=1e-3)

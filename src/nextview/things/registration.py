@@ -24,7 +24,6 @@ PLACE = slice(3, 6)
 POSE = 6
 """Unknowns of a step: turn and place of a hypothesis; the errors of the cameras follow."""
 
-FIXED_WEIGHT = 1e9  # weight of an unknown that does not change
 FREE_WEIGHT = 1e-3  # weight of one that nothing is known of
 SHIFT_LIMIT = 0.25  # radii that a step moves a hypothesis at most
 TURN_LIMIT = 0.3  # radians that a step turns it at most
@@ -81,13 +80,11 @@ class Level:
         steps: how many.
         off: by which part of its radius a surface is off.
         displaced: by which part of what it may be a view is still displaced.
-        turned: whether the tilt is aligned too, and not only azimuth and place.
     """
 
     steps: int
     off: float
     displaced: float
-    turned: bool
 
     def reach(self, radii: Float32, displaced: float) -> Float32:
         """Deviation to be expected of each hypothesis, (H,) float32, metres, without noise.
@@ -99,9 +96,9 @@ class Level:
         return np.hypot(self.off * radii, np.float32(self.displaced * displaced))
 
 
-FIRST = (Level(2, 0.25, 2.0, False),)
-COARSE_LEVELS = (Level(2, 0.1, 1.0, False), Level(1, 0.05, 0.5, True))
-FINE = (Level(2, 0.035, 0.25, True), Level(1, 0.02, 0.1, True))
+FIRST = (Level(2, 0.25, 2.0),)
+COARSE_LEVELS = (Level(2, 0.1, 1.0), Level(1, 0.05, 0.5))
+FINE = (Level(2, 0.035, 0.25), Level(1, 0.02, 0.1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +107,6 @@ class Alignment:
 
     Attributes:
         things: number of the surface of each hypothesis, (H,) int64.
-        ups: direction in the scan file's axes that points up where the thing rests, (H, 3) float64.
         rotations: from the axes of the scan file to those of the object frame, (H, 3, 3) float64.
         centres: where the centre of the surface lies, (H, 3) float64.
         cameras: by how much each view sees the thing displaced, because of an error of the camera's
@@ -118,7 +114,6 @@ class Alignment:
     """
 
     things: Index
-    ups: Float
     rotations: Float
     centres: Float
     cameras: Float
@@ -144,17 +139,10 @@ class Alignment:
         """Some of the hypotheses, by index or mask."""
         return Alignment(
             things=self.things[rows],
-            ups=self.ups[rows],
             rotations=self.rotations[rows],
             centres=self.centres[rows],
             cameras=self.cameras[rows],
         )
-
-    @property
-    def tilts(self) -> Float:
-        """Turn about x and y out of the resting pose, (H, 2) float64, radians."""
-        ups = np.einsum("hij,hj->hi", self.rotations, self.ups)
-        return np.stack([-ups[:, 1], ups[:, 0]], 1)
 
     def poses(self, caster: SurfaceCaster) -> Float:
         """Poses of the scan files' frames in the object frame, (H, 4, 4) float64, metres."""
@@ -195,7 +183,6 @@ def start(things: NDArray[np.integer], rotations: Float, views: int) -> Alignmen
     rotations = np.asarray(rotations, np.float64)
     return Alignment(
         things=np.asarray(things, np.int64),
-        ups=rotations[:, 2],
         rotations=rotations,
         centres=np.zeros((count, 3)),
         cameras=np.zeros((count, views, 3)),
@@ -763,10 +750,7 @@ def priors_of(
     weights = np.zeros((len(alignment), POSE + cameras))
     so_far = np.zeros((len(alignment), POSE + cameras))
 
-    weights[:, :2] = 1 / prior.tilt**2 if level.turned else FIXED_WEIGHT
-    weights[:, 2] = FREE_WEIGHT
-    if level.turned:
-        so_far[:, :2] = alignment.tilts
+    weights[:, TURN] = FREE_WEIGHT
 
     reach = prior.place * caster.radii[alignment.things].astype(np.float64)
     weights[:, PLACE] = 1 / reach[:, None] ** 2

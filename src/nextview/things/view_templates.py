@@ -9,7 +9,7 @@ union, depths by the mean squared difference where both show, and sizes by the r
 outlines. All of it is a few matrix products.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,7 @@ TEMPLATE_REACH = 2.2  # from its centre to its borders, root mean squares of the
 RENDERING_PIXELS = 28  # rows and columns of pixels of a rendering
 TEMPLATE_DISTANCE = 5.0  # of the camera from the centre, radii
 MOST_ORIENTATIONS = 16  # of one thing that are proposed
+THINGS_PROPOSED = 40  # things that are proposed, the likeliest by their outlines
 FEWEST_OUTLINE_PIXELS = 12  # of an outline that can be compared
 SPECK = 0.05  # of the largest part of an outline, below which a part is noise
 
@@ -58,16 +59,18 @@ class Pictures:
 
 @dataclass(frozen=True, eq=False)
 class OrientedProposals:
-    """Hypotheses of things in any orientation, the likeliest first.
+    """Hypotheses of things in any orientation.
 
     Attributes:
         things: thing of each, (M,) int64.
+        ranks: how many orientations of its thing suit its view better, (M,) int64.
         rotations: from the axes of the scan files to the object frame, (M, 3, 3) float64.
         log_belief: in each thing by outline, size and the shape of the depth, up to a constant,
             (T,) float64.
     """
 
     things: Index
+    ranks: Index
     rotations: Float
     log_belief: Float
 
@@ -105,48 +108,62 @@ class ViewTemplates:
             np.array([one[2] for one in found]),
         )
 
-    def propose(
-        self,
-        image: MetricImage,
-        count: int,
-        of_one: int = MOST_ORIENTATIONS,
-    ) -> OrientedProposals:
-        """The likeliest things and orientations, given what one view shows.
+    def propose(self, images: Sequence[MetricImage]) -> OrientedProposals:
+        """Orientations of the likeliest things, given what some views show.
+
+        Each view proposes orientations, of things that suit all of the views.
 
         Args:
-            image: the view.
-            count: number of proposals.
-            of_one: of one thing, at most.
+            images: the views, of one thing.
 
         Returns:
-            The proposals; none where too little is seen.
+            Up to MOST_ORIENTATIONS of each of THINGS_PROPOSED things; none where too little is
+            seen.
         """
         known = int(self.things.max()) + 1
-        turned, look = seen(image)
-        if turned is None:
+        views = [one for one in map(seen, images) if one is not None]
+        if not views:
+            nothing = np.zeros(0, np.int64)
             return OrientedProposals(
-                np.zeros(0, np.int64),
-                np.zeros((0, 3, 3)),
-                np.zeros(known),
+                nothing, nothing, np.zeros((0, 3, 3)), np.zeros(known)
             )
 
-        costs = mismatch(turned, self.pictures)
-        turn = costs.argmin(0)
-        best = costs[turn, np.arange(len(turn))]
-        of_things = np.full(known, np.inf)
-        np.minimum.at(of_things, self.things, best)
+        fits = [self._fit(pictures) for pictures, _ in views]
+        of_things = np.full((len(views), known), np.inf)
+        for row, (best, _) in enumerate(fits):
+            np.minimum.at(of_things[row], self.things, best)
+        together = of_things.sum(0)
+        likely = np.zeros(known, bool)
+        likely[np.argsort(together, kind="stable")[:THINGS_PROPOSED]] = True
 
-        order = np.argsort(best, kind="stable")
-        rank = _rank_within(self.things[order])
-        order = order[rank < of_one][:count]
-        rotations = (
-            look @ rotation_z(2 * np.pi * turn[order] / TURNS) @ self.rotations[order]
+        of_one = max(1, MOST_ORIENTATIONS // len(views))
+        proposed = []
+        for (best, turn), (_, look) in zip(fits, views, strict=True):
+            order = np.argsort(best, kind="stable")
+            order = order[likely[self.things[order]]]
+            rank = rank_within(self.things[order])
+            order = order[rank < of_one]
+            turns = rotation_z(2 * np.pi * turn[order] / TURNS)
+            rotations = look @ turns @ self.rotations[order]
+            proposed.append((self.things[order], rank[rank < of_one], rotations))
+        things, ranks, rotations = (
+            np.concatenate(parts) for parts in zip(*proposed, strict=True)
         )
-        return OrientedProposals(self.things[order], rotations, -of_things)
+        return OrientedProposals(things, ranks, rotations, -together / len(views))
+
+    def _fit(self, pictures: Pictures) -> tuple[Float32, Index]:
+        """Least cost of each template, and the turn in the image plane that has it, (N,) each."""
+        costs = mismatch(pictures, self.pictures)
+        turn = costs.argmin(0)
+        return costs[turn, np.arange(len(turn))], turn
 
 
-def _rank_within(things: Index) -> Index:
-    """How many earlier elements are the same, for each element, (N,)."""
+def rank_within(things: Index) -> Index:
+    """How many earlier elements are the same, for each element, (N,).
+
+    Args:
+        things: numbers, (N,).
+    """
     order = np.argsort(things, kind="stable")
     first = np.searchsorted(things[order], things[order])
     rank = np.empty(len(things), np.int64)
@@ -205,18 +222,18 @@ def _rendered(
             yield look, (picture[0][0], picture[1][0], picture[2])
 
 
-def seen(image: MetricImage) -> tuple[Pictures | None, Float]:
-    """What a view shows of the thing, turned in the image plane by so many angles.
+def seen(image: MetricImage) -> tuple[Pictures, Float] | None:
+    """What a view shows of the thing, turned in the image plane by TURNS angles.
 
     Returns:
-        The pictures, None where too little is seen; and the axes of a camera in the same place that
-        looks at the middle of the outline, columns, (3, 3), object frame.
+        The pictures; and the axes of a camera in the same place that looks at the middle of the
+        outline, columns, (3, 3), object frame. None where too little is seen.
     """
     shown = without_specks(image.kind == THING)
     focal = float(image.intrinsics[[0, 1], [0, 1]].mean())
     found = _picture(image.depth, shown, focal, 2 * np.pi * np.arange(TURNS) / TURNS)
     if found is None:
-        return None, np.eye(3)
+        return None
     outline, depth, size = found
 
     rows, columns = np.nonzero(shown)
