@@ -15,7 +15,14 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nextview.things.depth_view import ELSEWHERE, NOT_MEASURED, THING, DepthView
+from nextview.things.depth_view import (
+    ELSEWHERE,
+    HIDING,
+    HIDING_NOISE,
+    NOT_MEASURED,
+    THING,
+    DepthView,
+)
 from nextview.things.surface import SurfaceCaster
 from nextview.types import Float, Float32, Floats, Index, Mask
 
@@ -168,24 +175,28 @@ def joined(first: Alignment, second: Alignment) -> Alignment:
     return Alignment(**parts)
 
 
-def start(things: NDArray[np.integer], rotations: Float, views: int) -> Alignment:
-    """Hypotheses before anything is aligned: each with its centre in that of the object frame.
+def start(
+    things: NDArray[np.integer],
+    rotations: Float,
+    centres: Float,
+    views: int,
+) -> Alignment:
+    """Hypotheses before anything is aligned.
 
     Args:
         things: number of the surface of each, (H,) int.
         rotations: from the axes of the scan file to those of the object frame, (H, 3, 3).
+        centres: of the surfaces in the object frame, (H, 3), metres.
         views: how many views there are.
 
     Returns:
         The hypotheses, with no error of any camera.
     """
-    count = len(things)
-    rotations = np.asarray(rotations, np.float64)
     return Alignment(
         things=np.asarray(things, np.int64),
-        rotations=rotations,
-        centres=np.zeros((count, 3)),
-        cameras=np.zeros((count, views, 3)),
+        rotations=np.asarray(rotations, np.float64),
+        centres=np.asarray(centres, np.float64),
+        cameras=np.zeros((len(things), views, 3)),
     )
 
 
@@ -193,9 +204,6 @@ SCAN_ERROR = 0.0007  # deviation of a surface from the thing itself, metres
 # and a part of its radius: large things are scanned less exactly
 RELATIVE_SCAN_ERROR = 0.005
 SUNK = 0.005  # metres that a hypothesis may be below the ground, beside the errors of the scan
-# metres by which something stands before a surface that it hides, at least
-HIDING = 0.005
-HIDING_NOISE = 4.0  # deviations of the noise by which it does
 # deviations of the noise at which a pixel counts half, however fine the level
 NOISE_REACH = 2.0
 

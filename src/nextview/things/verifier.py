@@ -181,12 +181,14 @@ class _Proposed:
     Attributes:
         things: number of the surface of each, (M,) int64.
         rotations: from the axes of the scan files to the object frame, (M, 3, 3) float64.
+        centres: of the surfaces in the object frame, (M, 3) float64, metres.
         log_belief: before the geometry is looked at, (M,) float64.
         by_outline: belief in each thing before that, (T,) float64, sums to 1.
     """
 
     things: Index
     rotations: Float
+    centres: Float
     log_belief: Float
     by_outline: Float
 
@@ -196,6 +198,7 @@ class _Proposed:
             self,
             things=self.things[rows],
             rotations=self.rotations[rows],
+            centres=self.centres[rows],
             log_belief=self.log_belief[rows],
         )
 
@@ -205,6 +208,7 @@ class _Proposed:
             self,
             things=np.concatenate([self.things, others.things]),
             rotations=np.concatenate([self.rotations, others.rotations]),
+            centres=np.concatenate([self.centres, others.centres]),
             log_belief=np.concatenate([self.log_belief, others.log_belief]),
         )
 
@@ -276,6 +280,7 @@ class Verifier:
         proposed = _Proposed(
             things=found.things,
             rotations=found.rotations,
+            centres=found.centres,
             log_belief=by_outline[found.things],
             by_outline=belief / belief.sum(),
         )
@@ -360,15 +365,13 @@ class Verifier:
         stage = STAGES[0]
         views = [image.view(stage.side) for image in images]
         first = proposed.select(ranks == 0)
-        tried = start(first.things, first.rotations, len(views))
-        tried = centred(self.caster, tried, views)
+        tried = start(first.things, first.rotations, first.centres, len(views))
         tried = align(self.caster, tried, views, stage.levels, self.prior)
         order = np.argsort(-self._scores(first, tried, views)[0], kind="stable")
 
         best = list(dict.fromkeys(first.things[order].tolist()))[:THINGS_TRIED]
         others = proposed.select((ranks > 0) & np.isin(proposed.things, best))
-        alignment = start(others.things, others.rotations, len(views))
-        alignment = centred(self.caster, alignment, views)
+        alignment = start(others.things, others.rotations, others.centres, len(views))
         return first.followed_by(others), joined(tried, alignment)
 >>>>>>> 92221686 (One search in all orientations, proposed by outlines, again)
 
