@@ -20,16 +20,17 @@ from nextview.geometry.mesh import Mesh
 from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.simulated import SimulatedCamera
-from nextview.things.depth_view import MetricImage
+from nextview.things.depth_view import ELSEWHERE, THING, MetricImage
 from nextview.things.standing import is_stable
 from nextview.things.view_templates import (
     MOST_ORIENTATIONS,
     TEMPLATE_SIDE,
     TURNS,
+    Outline,
     Pictures,
+    SeenPictures,
     looking_from,
     mismatch,
-    seen,
     spread_directions,
 )
 
@@ -91,10 +92,53 @@ def test_one_of_the_first_proposals_is_near_the_truth(templates, seed):
     assert proposals.log_belief.argmax() == 0
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_thing_of_which_a_part_is_hidden_is_proposed_near_the_truth(
+    templates,
+    seed,
+    side,
+):
+    turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    observations, true = turned_views(THINGS[0], turn)
+    image = MetricImage.of(observations[0])
+    columns = np.nonzero(image.kind == THING)[1]
+    beyond = side * (np.arange(image.kind.shape[1]) - np.quantile(columns, 0.5))
+    before = np.broadcast_to(beyond > 0.1 * np.ptp(columns), image.kind.shape)
+    nearest = image.depth[image.kind == THING].min()
+    board = replace(
+        image,
+        depth=np.where(before, 0.8 * nearest, image.depth),
+        kind=np.where(before, ELSEWHERE, image.kind),
+    )
+    proposals = templates.propose([replace(board, hiding=board.find_hiding())])
+    own = np.flatnonzero(proposals.things == 0)
+    off = Rotation.from_matrix(proposals.rotations[own] @ turn.T).magnitude()
+    centre = turn @ THINGS[0].centre + true[:3, 3]
+    apart = np.linalg.norm(proposals.centres[own] - centre, axis=1)
+    near = (np.degrees(off) < 25) & (apart < 0.2 * templates.sizes.max())
+    assert near.any()
+
+
+def test_what_lies_before_a_thing_hides_it_and_the_ground_does_not():
+    observation, _ = standing_in(THINGS[1], np.eye(3))
+    image = MetricImage.of(observation)
+    assert image.ground is not None
+    assert not image.hiding.any()
+    held = image.depth.copy()
+    rows = np.nonzero(image.kind == THING)[0]
+    held[rows.max() - 5 : rows.max() + 20] = (
+        0.5 * image.depth[image.kind == THING].min()
+    )
+    kind = np.where(held != image.depth, ELSEWHERE, image.kind)
+    hiding = replace(image, depth=held, kind=kind).find_hiding()
+    assert hiding[rows.max()].any()
+    assert not hiding[: rows.max() - 5].any()
+
+
 def test_what_a_camera_that_is_rolled_sees_is_turned_back(templates):
     observations, _ = turned_views(THINGS[0], np.eye(3))
     image = MetricImage.of(observations[0])
-    upright, look = seen(image)
     roll = np.eye(4)
     roll[:3, :3] = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
     # The camera turns clockwise by a quarter: rows become columns.
@@ -102,13 +146,16 @@ def test_what_a_camera_that_is_rolled_sees_is_turned_back(templates):
         image,
         depth=np.rot90(image.depth),
         kind=np.rot90(image.kind),
+        hiding=np.rot90(image.hiding),
         pose=image.pose @ roll,
     )
-    other, other_look = seen(rolled)
-    quarter = TURNS // 4
-    assert np.mean(other.outline[0] == upright.outline[quarter]) > 0.98
-    np.testing.assert_allclose(other.size, upright.size, rtol=1e-3)
-    np.testing.assert_allclose(other_look @ roll[:3, :3].T, look, atol=1e-2)
+    one, other = Outline.of(image), Outline.of(rolled)
+    assert other.size == pytest.approx(one.size, rel=1e-3)
+    np.testing.assert_allclose(roll[:3, :3] @ other.ahead, one.ahead, atol=1e-2)
+    middle = np.zeros(2)
+    upright = one.pictures(one.size, middle, np.array([np.pi / 2]))
+    turned = other.pictures(one.size, middle, np.zeros(1))
+    assert np.mean(turned.outline == upright.outline) > 0.98
 
 
 def test_the_mismatch_is_what_is_defined():
@@ -117,20 +164,19 @@ def test_the_mismatch_is_what_is_defined():
     for count in (3, 5):
         outline = (rng.random((count, TEMPLATE_SIDE**2)) < 0.5).astype(np.float32)
         depth = outline * rng.normal(size=outline.shape).astype(np.float32)
-        made.append(Pictures(outline, depth, rng.uniform(0.05, 0.1, count)))
-    costs = mismatch(*made)
+        made.append(Pictures(outline, depth))
+    seen, other = made
+    free = (rng.random(seen.outline.shape) < 0.8).astype(np.float32)
+    known = np.maximum(free, seen.outline)
+    area = float(seen.outline[1].sum())
+    costs, behind = mismatch(SeenPictures(seen.outline, known, seen.depth, area), other)
 
-    one, other = made
-    both = (one.outline[1] > 0) & (other.outline[2] > 0)
-    either = (one.outline[1] > 0) | (other.outline[2] > 0)
-    apart = (one.depth[1] - other.depth[2])[both].std()
-    ratio = np.log(one.size[1] / other.size[2])
-    expected = (
-        8 * (1 - both.sum() / either.sum())
-        + 4 * apart
-        + 3 * min((ratio / 0.1) ** 2 / 2, 3)
-    )
+    both = (seen.outline[1] > 0) & (other.outline[2] > 0)
+    either = (seen.outline[1] > 0) | ((other.outline[2] > 0) & (known[1] > 0))
+    apart = (seen.depth[1] - other.depth[2])[both]
+    expected = 8 * (1 - both.sum() / either.sum()) + 4 * apart.std()
     assert costs[1, 2] == pytest.approx(expected, rel=1e-4)
+    assert behind[1, 2] == pytest.approx(apart.mean(), abs=1e-5)
 
 
 def test_directions_are_spread_evenly_and_cameras_look_along_them():

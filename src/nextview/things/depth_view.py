@@ -205,7 +205,9 @@ class MetricImage:
             rays = np.stack([x, y, np.ones(len(x))], -1) @ self.pose[:3, :3].T
             points = self.pose[:3, 3] + rays * depth[at][:, None].astype(np.float64)
             heights = self.ground.heights(points)
-            allowed = np.hypot(HIDING, HIDING_NOISE * self.ground.noise * depth[at] ** 2)
+            allowed = np.hypot(
+                HIDING, HIDING_NOISE * self.ground.noise * depth[at] ** 2
+            )
             hiding[at] = heights > allowed
         every = np.zeros(self.kind.shape, bool)
         every[rows, columns] = hiding

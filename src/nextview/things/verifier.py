@@ -21,7 +21,6 @@ from nextview.things.registration import (
     RegistrationPrior,
     align,
     camera_cost,
-    centred,
     different_poses,
     joined,
     render,

@@ -14,7 +14,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from nextview.geometry.pinhole import PinholeCamera
@@ -39,10 +38,18 @@ OUTLINE_WEIGHT = 8.0
 DEPTH_WEIGHT = 4.0
 """How much a unit of the mismatch of outlines and depths costs."""
 SIZE_STEP = 0.06  # of the logarithm of the sizes at which what is seen is compared
-SIZES = (-0.36, 0.36)  # of outlines that are compared with a seen one, logarithms of ratios
+SIZES = (
+    -0.36,
+    0.36,
+)  # of outlines that are compared with a seen one, logarithms of ratios
 SIZES_HIDDEN = (-0.24, 1.2)  # the same where something hides a part of what is seen
-SHIFTS = (0.5, 1.5)  # step and reach, in sizes, by which the middle of what is hidden is moved
-HIDDEN_SHARE = 0.05  # of the pixels around an outline that hide something, from which it is moved
+SHIFTS = (
+    0.5,
+    1.5,
+)  # step and reach, in sizes, by which the middle of what is hidden is moved
+HIDDEN_SHARE = (
+    0.05  # of the pixels around an outline that hide something, from which it is moved
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,9 +203,7 @@ class ViewTemplates:
                 continue
             size = view.size * np.exp(step * SIZE_STEP)
             pixels = size * view.focal / view.middle
-            templates = Pictures(
-                self.pictures.outline[rows], self.pictures.depth[rows]
-            )
+            templates = Pictures(self.pictures.outline[rows], self.pictures.depth[rows])
             for shift in view.shifts:
                 seen = view.pictures(size, shift * pixels, turns)
                 costs, behind = mismatch(seen, templates)
@@ -209,9 +214,7 @@ class ViewTemplates:
                 fit.cost[some] = cost[better]
                 fit.turn[some] = turns[turn[better]]
                 fit.shift[some] = shift * pixels
-                fit.behind[some] = (
-                    size * behind[turn[better], np.flatnonzero(better)]
-                )
+                fit.behind[some] = size * behind[turn[better], np.flatnonzero(better)]
         return fit
 
     def _poses(
@@ -381,7 +384,9 @@ class Outline:
         """That of some pixels, which are enough."""
         rows, columns = np.nonzero(shown)
         centre = np.array([columns.mean(), rows.mean()])
-        spread = float(np.sqrt(columns.var() + rows.var() + 1 / 6))  # a pixel is a square
+        spread = float(
+            np.sqrt(columns.var() + rows.var() + 1 / 6)
+        )  # a pixel is a square
         middle = float(np.median(depth[rows, columns]))
         size = spread * middle / np.sqrt(camera.fx * camera.fy)
         shifts = np.zeros((1, 2))
@@ -400,7 +405,7 @@ class Outline:
 
     @property
     def axes(self) -> Float:
-        """Axes of a camera that looks at the middle of the outline, columns, camera axes, (3, 3)."""
+        """Axes of a camera that looks at the middle of the outline, columns, (3, 3)."""
         return _from_z_to(self.ahead / np.linalg.norm(self.ahead))
 
     def pictures(self, size: float, shift: Float, turns: Float) -> SeenPictures:
