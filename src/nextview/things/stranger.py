@@ -36,7 +36,7 @@ from nextview.things.registration import (
     rotations_of,
     scan_errors,
 )
-from nextview.things.standing import ground_height
+from nextview.things.stability import ground_height
 from nextview.things.surface import SurfaceCaster
 from nextview.things.verification import PixelModel, likelihood
 from nextview.things.weighing import EvidenceWeights

@@ -27,7 +27,7 @@ from nextview.things.registration import (
     rotations_of,
     start,
 )
-from nextview.things.standing import Standing, standing
+from nextview.things.stability import Stability, standing
 from nextview.things.stranger import Comparison, log_odds_of_stranger
 from nextview.things.surface import Surface, SurfaceCaster
 from nextview.things.verification import PixelModel, ViewLikelihood, likelihood
@@ -37,7 +37,7 @@ from nextview.types import Float, Index, Mask
 
 # share of things that do not stand on what is seen below them: they lean on something, or hang
 UNUSUAL = 0.1
-THINGS_TRIED = 8  # likeliest things of which all proposed orientations are aligned
+THINGS_ALIGNED = 8  # likeliest things of which all proposed orientations are aligned
 RIVAL_STEPS = 24  # in which a thing of which any turn is nearly a symmetry is turned
 RIVAL_THINGS = 2  # likeliest things that are turned
 
@@ -368,7 +368,7 @@ class Verifier:
         tried = align(self.caster, tried, views, stage.levels, self.prior)
         order = np.argsort(-self._scores(first, tried, views)[0], kind="stable")
 
-        best = list(dict.fromkeys(first.things[order].tolist()))[:THINGS_TRIED]
+        best = list(dict.fromkeys(first.things[order].tolist()))[:THINGS_ALIGNED]
         others = proposed.select((ranks > 0) & np.isin(proposed.things, best))
         alignment = start(others.things, others.rotations, others.centres, len(views))
         return first.followed_by(others), joined(tried, alignment)
@@ -449,7 +449,7 @@ class Verifier:
         self,
         alignment: Alignment,
         views: Sequence[DepthView],
-        ground: Standing,
+        ground: Stability,
     ) -> list[ViewLikelihood]:
         return [
             likelihood(
@@ -461,7 +461,7 @@ class Verifier:
             for number, view in enumerate(views)
         ]
 
-    def _standing(self, alignment: Alignment, views: Sequence[DepthView]) -> Standing:
+    def _standing(self, alignment: Alignment, views: Sequence[DepthView]) -> Stability:
         return standing(self.caster, alignment, views, self.prior.tilt)
 
     def _verified(

@@ -148,7 +148,7 @@ class ViewTemplates:
             seen.
         """
         known = int(self.things.max()) + 1
-        views = [one for one in map(Outline.of, images) if one is not None]
+        views = [one for one in map(SeenOutline.of, images) if one is not None]
         if not views:
             nothing = np.zeros(0, np.int64)
             nowhere = np.zeros((0, 3))
@@ -185,7 +185,7 @@ class ViewTemplates:
             things, ranks, rotations, centres, -together / len(views)
         )
 
-    def _fit(self, view: "Outline") -> "TemplateFit":
+    def _fit(self, view: "SeenOutline") -> "TemplateFit":
         """How well each template fits a view, where it fits best."""
         count = len(self.things)
         fit = TemplateFit(
@@ -218,7 +218,7 @@ class ViewTemplates:
         return fit
 
     def _poses(
-        self, fit: "TemplateFit", view: "Outline", rows: Index
+        self, fit: "TemplateFit", view: "SeenOutline", rows: Index
     ) -> tuple[Float, Float]:
         """Rotations, (M, 3, 3), and centres, (M, 3), of some templates where they fit best."""
         x, y = view.camera.slopes(*(view.centre + fit.shift[rows])[:, ::-1].T)
@@ -314,7 +314,7 @@ def _rendered(
         shown = np.isfinite(image)
         if np.count_nonzero(shown) < FEWEST_OUTLINE_PIXELS:
             continue
-        outline = Outline.of_depth(image, shown, shown | True, camera, np.eye(4))
+        outline = SeenOutline.of_depth(image, shown, shown | True, camera, np.eye(4))
         seen = outline.pictures(outline.size, np.zeros(2), np.zeros(1))
         axes = outline.axes.T
         middle = outline.middle * outline.ahead
@@ -323,7 +323,7 @@ def _rendered(
 
 
 @dataclass(frozen=True, eq=False)
-class Outline:
+class SeenOutline:
     """What a view shows of a thing.
 
     Attributes:
@@ -350,7 +350,7 @@ class Outline:
     shifts: Float
 
     @classmethod
-    def of(cls, image: MetricImage) -> "Outline | None":
+    def of(cls, image: MetricImage) -> "SeenOutline | None":
         """That of an image; None where too little is seen."""
         shown = without_specks(image.kind == THING)
         if np.count_nonzero(shown) < FEWEST_OUTLINE_PIXELS:
@@ -380,7 +380,7 @@ class Outline:
         known: Mask,
         camera: PinholeCamera,
         pose: Float,
-    ) -> "Outline":
+    ) -> "SeenOutline":
         """That of some pixels, which are enough."""
         rows, columns = np.nonzero(shown)
         centre = np.array([columns.mean(), rows.mean()])
@@ -409,7 +409,7 @@ class Outline:
         return _from_z_to(self.ahead / np.linalg.norm(self.ahead))
 
     def pictures(self, size: float, shift: Float, turns: Float) -> SeenPictures:
-        """Outline and depth on the grid of templates of a size.
+        """SeenOutline and depth on the grid of templates of a size.
 
         Args:
             size: root mean square of their outlines, metres.

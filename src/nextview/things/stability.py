@@ -16,7 +16,7 @@ LARGEST_OVERHANG = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class Standing:
+class Stability:
     """How H hypotheses stand on the ground, up to noise, tilt and errors of the scans.
 
     Attributes:
@@ -37,7 +37,7 @@ def standing(
     alignment: Alignment,
     views: Sequence[DepthView],
     tilt: float,
-) -> Standing:
+) -> Stability:
     """Measure what of hypotheses lies below the ground, visible or not, and which of them stand.
 
     Where views disagree on the ground, the lowest counts: the others show the top of something that
@@ -57,7 +57,7 @@ def standing(
     depth = np.zeros(len(alignment))
     grounds = [view for view in views if view.ground is not None]
     if not grounds:
-        return Standing(below, depth, stands)
+        return Stability(below, depth, stands)
 
     lowest = min(grounds, key=ground_height)
     assert lowest.ground is not None
@@ -74,7 +74,7 @@ def standing(
             depth[row] = -heights.min()
         turned = alignment.rotations[row] @ (surface.hull - surface.centroid).T
         stands[row] = heights.min() < allowed and is_stable(turned, float(allowed))
-    return Standing(below, depth, stands)
+    return Stability(below, depth, stands)
 
 
 def is_stable(corners: Float, slack: float) -> bool:
