@@ -31,6 +31,7 @@ from nextview.things.view_templates import (
     looking_from,
     mismatch,
     spread_directions,
+    turned_grid,
 )
 
 MUG = mesh_of(((0.08, 0.08, 0.1), (0, 0, 0)), ((0.05, 0.015, 0.06), (0.06, 0, 0.015)))
@@ -151,8 +152,8 @@ def test_what_a_camera_that_is_rolled_sees_is_turned_back(templates):
     assert other.size == pytest.approx(one.size, rel=1e-3)
     np.testing.assert_allclose(roll[:3, :3] @ other.ahead, one.ahead, atol=1e-2)
     middle = np.zeros(2)
-    upright = one.pictures(one.size, middle, np.array([np.pi / 2]))
-    turned = other.pictures(one.size, middle, np.zeros(1))
+    upright = one.pictures(one.size, middle, turned_grid(np.array([np.pi / 2])))
+    turned = other.pictures(one.size, middle, turned_grid(np.zeros(1)))
     assert np.mean(turned.outline == upright.outline) > 0.98
 
 

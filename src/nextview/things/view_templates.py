@@ -197,6 +197,7 @@ class ViewTemplates:
         bins = np.rint(np.log(self.sizes / view.size) / SIZE_STEP).astype(int)
         first, last = SIZES_HIDDEN if len(view.shifts) > 1 else SIZES
         turns = 2 * np.pi * np.arange(TURNS) / TURNS
+        grid = turned_grid(turns)
         for step in range(round(first / SIZE_STEP), round(last / SIZE_STEP) + 1):
             rows = np.flatnonzero(bins == step)
             if not len(rows):
@@ -205,7 +206,7 @@ class ViewTemplates:
             pixels = size * view.focal / view.middle
             templates = Pictures(self.pictures.outline[rows], self.pictures.depth[rows])
             for shift in view.shifts:
-                seen = view.pictures(size, shift * pixels, turns)
+                seen = view.pictures(size, shift * pixels, grid)
                 costs, behind = mismatch(seen, templates)
                 turn = costs.argmin(0)
                 cost = costs[turn, np.arange(len(rows))]
@@ -306,6 +307,7 @@ def _rendered(
         origins.astype(np.float32),
         (rays @ looks).astype(np.float32),
     )
+    grid = turned_grid(np.zeros(1))
     for look, image in zip(
         looks,
         depth.reshape(-1, RENDERING_PIXELS, RENDERING_PIXELS),
@@ -315,7 +317,7 @@ def _rendered(
         if np.count_nonzero(shown) < FEWEST_OUTLINE_PIXELS:
             continue
         outline = SeenOutline.of_depth(image, shown, shown | True, camera, np.eye(4))
-        seen = outline.pictures(outline.size, np.zeros(2), np.zeros(1))
+        seen = outline.pictures(outline.size, np.zeros(2), grid)
         axes = outline.axes.T
         middle = outline.middle * outline.ahead
         offset = np.array([0, 0, TEMPLATE_DISTANCE * radius]) - middle
@@ -408,21 +410,17 @@ class SeenOutline:
         """Axes of a camera that looks at the middle of the outline, columns, (3, 3)."""
         return _from_z_to(self.ahead / np.linalg.norm(self.ahead))
 
-    def pictures(self, size: float, shift: Float, turns: Float) -> SeenPictures:
-        """SeenOutline and depth on the grid of templates of a size.
+    def pictures(self, size: float, shift: Float, grid: Float32) -> SeenPictures:
+        """Outline and depth on the grid of templates of a size.
 
         Args:
             size: root mean square of their outlines, metres.
             shift: of the grid's middle from that of the outline, pixels, (2,).
-            turns: of the grid in the image plane, radians, (A,).
+            grid: cells of the grid, turned in the image plane, see ``turned_grid``, (A, C, 2).
         """
         pixels = size * self.focal / self.middle
-        lines = (np.arange(TEMPLATE_SIDE) + 0.5) / TEMPLATE_SIDE * 2 - 1
-        cells = np.stack(np.meshgrid(lines, lines), -1).reshape(-1, 2)
-        cells *= TEMPLATE_REACH * pixels
-        turned = np.einsum("aij,cj->aci", rotation_z(turns)[:, :2, :2], cells)
-        turned += self.centre + shift
-        column, row = np.rint(turned).astype(np.int64).transpose(2, 0, 1)
+        turned = grid * np.float32(pixels) + (self.centre + shift).astype(np.float32)
+        column, row = np.rint(turned).astype(np.int32).transpose(2, 0, 1)
         height, width = self.shown.shape
         inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
         row = np.where(inside, row, 0)
@@ -438,6 +436,21 @@ class SeenOutline:
             np.clip(behind, -3, 3).astype(np.float32),
             np.count_nonzero(self.shown) / cell**2,
         )
+
+
+def turned_grid(turns: Float) -> Float32:
+    """Cells of a template's grid, turned in the image plane by some angles.
+
+    Args:
+        turns: radians, (A,).
+
+    Returns:
+        x and y of each cell, sizes, (A, C, 2) float32.
+    """
+    lines = (np.arange(TEMPLATE_SIDE) + 0.5) / TEMPLATE_SIDE * 2 - 1
+    cells = TEMPLATE_REACH * np.stack(np.meshgrid(lines, lines), -1).reshape(-1, 2)
+    turned = cells @ rotation_z(turns)[:, :2, :2].swapaxes(1, 2)
+    return turned.astype(np.float32)
 
 
 def without_specks(shown: Mask) -> Mask:
