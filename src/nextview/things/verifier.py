@@ -38,6 +38,7 @@ from nextview.types import Float, Index, Mask
 # share of things that do not stand on what is seen below them: they lean on something, or hang
 UNUSUAL = 0.1
 THINGS_ALIGNED = 8  # likeliest things of which all proposed orientations are aligned
+LIKELY_THINGS = 4  # the same of the likeliest by outline: of what is hidden the first may fail
 RIVAL_STEPS = 24  # in which a thing of which any turn is nearly a symmetry is turned
 RIVAL_THINGS = 2  # likeliest things that are turned
 
@@ -326,7 +327,7 @@ class Verifier:
         ranks: Index,
         images: Sequence[MetricImage],
     ) -> tuple[_Proposed, Alignment]:
-        """The first orientation of each thing, and all of the things that explain the views best.
+        """The first orientation of each thing, and all of the likeliest things by either.
 
         Args:
             proposed: orientations of things.
@@ -369,6 +370,7 @@ class Verifier:
         order = np.argsort(-self._scores(first, tried, views)[0], kind="stable")
 
         best = list(dict.fromkeys(first.things[order].tolist()))[:THINGS_ALIGNED]
+        best += np.argsort(-proposed.by_outline)[:LIKELY_THINGS].tolist()
         others = proposed.select((ranks > 0) & np.isin(proposed.things, best))
         alignment = start(others.things, others.rotations, others.centres, len(views))
         return first.followed_by(others), joined(tried, alignment)
