@@ -38,7 +38,9 @@ from nextview.types import Float, Index, Mask
 # share of things that do not stand on what is seen below them: they lean on something, or hang
 UNUSUAL = 0.1
 THINGS_ALIGNED = 8  # likeliest things of which all proposed orientations are aligned
-LIKELY_THINGS = 4  # the same of the likeliest by outline: of what is hidden the first may fail
+LIKELY_THINGS = (
+    4  # the same of the likeliest by outline: of what is hidden the first may fail
+)
 RIVAL_STEPS = 24  # in which a thing of which any turn is nearly a symmetry is turned
 RIVAL_THINGS = 2  # likeliest things that are turned
 

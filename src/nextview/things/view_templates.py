@@ -195,10 +195,13 @@ class ViewTemplates:
             np.zeros(count),
         )
         bins = np.rint(np.log(self.sizes / view.size) / SIZE_STEP).astype(int)
-        first, last = SIZES_HIDDEN if len(view.shifts) > 1 else SIZES
+        sizes = SIZES_HIDDEN if len(view.shifts) > 1 else SIZES
+        first, last = (round(one / SIZE_STEP) for one in sizes)
+        if not ((bins >= first) & (bins <= last)).any():
+            bins = bins.clip(first, last)  # those of the next size are the likeliest
         turns = 2 * np.pi * np.arange(TURNS) / TURNS
         grid = turned_grid(turns)
-        for step in range(round(first / SIZE_STEP), round(last / SIZE_STEP) + 1):
+        for step in range(first, last + 1):
             rows = np.flatnonzero(bins == step)
             if not len(rows):
                 continue
