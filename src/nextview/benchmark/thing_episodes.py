@@ -255,7 +255,8 @@ class ThingEpisode:
         joint = None
         if "joint" in needs:
             assert isinstance(recogniser, TaughtRecogniser)  # see ``policies_of``
-            total = np.sum([self.log_evidence(view) for view in seen], axis=0)
+            views_seen = [self.observation(view) for view in seen]
+            total = self.things.log_evidence(views_seen).sum(0)
             here = EPISODE_SPHERE.azimuth[views[-1]]
             joint = recogniser.calibration.joint(total, len(seen), classes, here)[None]
 

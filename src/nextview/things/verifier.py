@@ -336,31 +336,6 @@ class Verifier:
             ranks: how many orientations of the same thing come before each, (M,).
             images: the views.
 
-<<<<<<< HEAD
-    def _joined(self, resting: Verified, unusual: Verified) -> Verified:
-        """Hypotheses of resting things and of others, the likeliest first."""
-        logs = [resting.log_belief, unusual.log_belief + np.log(UNUSUAL)]
-        log_belief = np.concatenate(logs)
-        both = {
-            name: np.concatenate([getattr(resting, name), getattr(unusual, name)])
-            for name in OF_HYPOTHESES
-        }
-        scores = self.weights.scores(both["mean"], both["camera_costs"], log_belief)
-
-        order = np.argsort(-scores, kind="stable")
-        shares = np.exp(scores - scores.max())
-        whole = replace(
-            resting,
-            belief=self.weights.belief(scores, both["things"], resting.by_features),
-            probabilities=(shares / shares.sum())[order],
-            log_belief=log_belief[order],
-            **{name: values[order] for name, values in both.items()},
-        )
-        alike = different_poses(
-            self.caster, whole.alignment(np.arange(len(order)), self)
-        )
-        return whole.select(alike)
-=======
         Returns:
             What is worth aligning, and where it starts.
         """
@@ -376,7 +351,6 @@ class Verifier:
         others = proposed.select((ranks > 0) & np.isin(proposed.things, best))
         alignment = start(others.things, others.rotations, others.centres, len(views))
         return first.followed_by(others), joined(tried, alignment)
->>>>>>> 92221686 (One search in all orientations, proposed by outlines, again)
 
     def _settled(
         self,
