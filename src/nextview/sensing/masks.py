@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import ndimage
+from scipy.ndimage import uniform_filter
 
 from nextview.sensing.facets import Noise
 from nextview.sensing.frame import WHOLE, Frame, Part, within
-from nextview.sensing.mask_edges import trimmed
+from nextview.sensing.mask_edges import SQUARE_WIDTH, trimmed
 from nextview.sensing.object_frame import Box
 from nextview.sensing.planes import Plane
 from nextview.types import Float, Mask
@@ -120,9 +121,37 @@ def inside_mask(
     mask = trimmed(frame.depth, given, noise, high)
     part = within(mask)
     above = mask.copy()
-    above[part] &= above_plane(frame, plane, noise, part)
+    above[part] &= _above_in_the_mean(frame, mask, plane, noise, part)
     # a plane may lie above what is hidden or flat
     return above if 2 * np.count_nonzero(above) > np.count_nonzero(mask) else mask
+
+
+def _above_in_the_mean(
+    frame: Frame,
+    mask: Mask,
+    plane: Plane,
+    noise: Noise,
+    part: Part,
+) -> Mask:
+    """Which pixels of a mask are higher above a plane than the noise of their neighbourhood.
+
+    The mean of the neighbours in the mask is less noisy than a pixel: with the noise of a pixel the
+    lower part of a small thing would be taken for the plane.
+    """
+    z = frame.depth[part]
+    own = mask[part] & (z > 0)
+    height = frame.along(plane.normal, plane.offset, part)
+    share = uniform_filter(own.astype(np.float32), SQUARE_WIDTH, mode="constant")
+    total = uniform_filter(height * own, SQUARE_WIDTH, mode="constant")
+    mean = total / np.maximum(share, np.float32(1e-6))
+    count = np.maximum(share * SQUARE_WIDTH**2, 1)
+
+    a, b, c = (frame.camera_to_world[:3, :3].T @ plane.normal).astype(np.float32)
+    rise = np.abs(
+        a * frame.rays[0][part[1]] + (b * frame.rays[1][part[0]] + c)[:, None]
+    )
+    least = 0.003 + 4 * noise.at(z) * z * rise / np.sqrt(count)
+    return own & (mean > z * least)
 
 
 def touching(

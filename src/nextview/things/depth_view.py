@@ -26,7 +26,8 @@ NOISE_ROWS = 40  # rows of an image in which its noise is measured
 NOISIEST = 0.005  # of the depth: its deviation, where no ground shows it
 GROUND_MARGIN = 1.0  # of the size of the outline, around which the ground is looked for
 GROUND_SIDE = 48  # rows and columns of pixels that it is looked for in
-LEVEL_NOISE = 3.0  # deviations of the noise within which a pixel lies on the ground
+LEVEL_NOISE = 4.0  # deviations of the noise within which a pixel lies on the ground
+LEVEL_SHARE = 0.003  # of its distance within which it does, beside the noise
 # metres by which something stands before a surface that it hides, at least
 HIDING = 0.005
 HIDING_NOISE = 4.0  # deviations of the noise by which it does
@@ -52,7 +53,8 @@ class DepthView:
         towards: direction in the image, x and y, to the nearest pixel of the thing, (P, 2) float32,
             unit vectors; zero within it.
         ground: plane that the thing stands on, if it is seen.
-        level: pixels of the thing that lie on the ground, (P,) bool: they may not be of the thing.
+        level: pixels as low as the noise of the ground is high, (P,) bool: whether they show the
+            thing is not known, however they were segmented.
         shape: rows and columns of the grid; P is their product.
         step: distance between the grid's rows, and between its columns, (2,) float64, pixels of the
             image.
@@ -251,7 +253,9 @@ class MetricImage:
             heights = self.ground.heights(
                 origin + rays * finite[:, None].astype(np.float64)
             )
-            level = (kind == THING) & (np.abs(heights) < LEVEL_NOISE * noise)
+            rise = np.abs(rays @ self.ground.normal)
+            low = LEVEL_NOISE * noise * rise + LEVEL_SHARE * finite
+            level = (finite > 0) & (np.abs(heights) < low)
 
         return DepthView(
             origin=origin,

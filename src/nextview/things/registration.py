@@ -331,7 +331,8 @@ def pulls_of(
     # Where the thing was measured: along the normal.
     measured = shows & (view.kind == THING)
     # Where the hypothesis shows, and the outline says that it does not: towards the outline.
-    beyond = shows & (view.kind == ELSEWHERE) & ~rendered.hidden(view)
+    elsewhere = shows & (view.kind == ELSEWHERE) & ~rendered.hidden(view)
+    beyond = elsewhere & ~(view.level & ~rendered.seen_behind(view))
     # Where the thing was measured and the hypothesis does not show: the nearest of its pixels is
     # drawn there.
     shows_somewhere = shows.any(1, keepdims=True)
