@@ -196,7 +196,7 @@ def test_what_is_expected_is_what_the_verifier_says(shown, side):
     view = depth_view(replace(found, scene=scene), 40)
 
     caster = surfaces_of(*meshes)
-    placed = start(np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), 1)
+    placed = start(np.array([0, 1]), np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), 1)
     centre = mesh.centre
     placed = replace(placed, centres=caster.centres.astype(float) - centre)
     said = likelihood(view, render(caster, placed, view, 0)).mean
@@ -240,7 +240,7 @@ def outlook_of(belief, taken=1) -> Outlook:
         weights=EvidenceWeights(),
         pixels=PixelModel(),
         prior=RegistrationPrior(),
-        likeliest=start(np.array([0]), np.eye(3)[None], 0),
+        likeliest=start(np.array([0]), np.eye(3)[None], np.zeros((1, 3)), 0),
         views=(),
     )
 

@@ -13,7 +13,7 @@ from nextview.recognition.protocol import (
     JudgesTogether,
     log_evidence_of_views,
 )
-from nextview.types import Float, Floats, Index
+from nextview.types import Float, Index
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,7 +39,7 @@ from nextview.things.memory import TaughtRecogniser
 from nextview.things.surface import Surface
 from nextview.things.taught import TaughtThings
 from nextview.things.verifier import Verified
-from nextview.types import Float, Floats
+from nextview.types import Float
 
 Occlusion = Literal["none", "half", "heavy"]
 
