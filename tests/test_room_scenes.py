@@ -18,7 +18,7 @@ from nextview.errors import DatasetError, UsageError
 from nextview.geometry.viewsphere import level_pose
 from nextview.sensing import ObservedObject
 from nextview.simulation.room import UNEVEN_HEIGHT, Room, RoomCamera, build_room
-from nextview.simulation.room_layout import RoomLayout, Slab, Stability
+from nextview.simulation.room_layout import RoomLayout, Slab, Standing
 from nextview.simulation.scene import footprint, mesh_hash, separation
 from nextview.simulation.sensor import SENSORS
 
@@ -61,7 +61,7 @@ def room_with(folder: Path, mesh: trimesh.Trimesh, pose: np.ndarray, **changed) 
         "kind": "floor",
         "seed": 0,
         "label": "thing",
-        "target": Stability(path.name, mesh_hash(path), float(radius)),
+        "target": Standing(path.name, mesh_hash(path), float(radius)),
         "width": 6.0,
         "depth": 4.0,
         "height": 2.5,

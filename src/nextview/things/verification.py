@@ -16,6 +16,8 @@ class PixelModel:
     Attributes:
         outlier: log-likelihood of a pixel that the hypothesis does not explain, against one that it
             explains exactly.
+        mislabelled: that of a pixel where the depth is explained, and that was not segmented as the
+            thing's. Of one as low as the noise of the ground nothing is known.
         hole: that of a pixel where the surface was not measured, seen face on. A grazing one costs
             less.
         steep: how many pixels a steep surface may be off sideways.
@@ -25,6 +27,7 @@ class PixelModel:
     """
 
     outlier: float = -4.0
+    mislabelled: float = -1.5
     hole: float = -0.5
     steep: float = 1.0
     edge: float = 3.0
@@ -121,9 +124,10 @@ def likelihood(
     judged = np.zeros(shows.shape)
     judged = np.where(shows & thing, match, judged)
     judged = np.where(~shows & thing, model.outlier * deep, judged)
-    judged = np.where(
-        through, np.where(view.level & ~sunk, match, model.outlier) * inner, judged
-    )
+    # Where the depth is that of the surface, and another thing was segmented.
+    mislabelled = np.where(view.level, 0, model.mislabelled)
+    agrees = np.logaddexp(match + mislabelled, model.outlier)
+    judged = np.where(through, np.where(sunk, model.outlier, agrees) * inner, judged)
     judged = np.where(hole, model.hole * cosine, judged)
 
     counted = thing | through | hole
