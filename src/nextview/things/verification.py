@@ -16,6 +16,8 @@ class PixelModel:
     Attributes:
         outlier: log-likelihood of a pixel that the hypothesis does not explain, against one that it
             explains exactly.
+        mislabelled: that of a pixel where the depth is explained, and that was not segmented as the
+            thing's. Of one as low as the noise of the ground nothing is known.
         hole: that of a pixel where the surface was not measured, seen face on. A grazing one costs
             less.
         steep: how many pixels a steep surface may be off sideways.
@@ -25,6 +27,7 @@ class PixelModel:
     """
 
     outlier: float = -4.0
+    mislabelled: float = -1.5
     hole: float = -0.5
     steep: float = 1.0
     edge: float = 3.0
@@ -114,24 +117,25 @@ def likelihood(
     inner = np.clip(np.abs(view.edge) / model.edge, 0.1, 1)
     deep = np.where(view.level, 0.1, inner)  # of the ground, more likely
     thing = view.kind == THING
-    through = (
-        shows
-        & (view.kind == ELSEWHERE)
-        & (~rendered.hidden(view) | rendered.sunk(view))
-    )
+    sunk = rendered.sunk(view)
+    through = shows & (view.kind == ELSEWHERE) & (~rendered.hidden(view) | sunk)
     hole = shows & (view.kind == NOT_MEASURED)
 
     judged = np.zeros(shows.shape)
     judged = np.where(shows & thing, match, judged)
     judged = np.where(~shows & thing, model.outlier * deep, judged)
-    judged = np.where(through, model.outlier * deep, judged)
+    # Where the depth is that of the surface, and another thing was segmented.
+    mislabelled = np.where(view.level, 0, model.mislabelled)
+    agrees = np.logaddexp(match + mislabelled, model.outlier)
+    judged = np.where(through, np.where(sunk, model.outlier, agrees) * inner, judged)
     judged = np.where(hole, model.hole * cosine, judged)
 
     counted = thing | through | hole
     explained = (shows & thing & (squared < 9)).sum(1) / max(1, int(thing.sum()))
     # Depths tell best whether a thing was taught. Outlines depend on how well it was segmented.
     missing = np.where(~shows & thing, deep, 0).sum(1) / max(1, int(thing.sum()))
-    seen_through = np.where(through, deep, 0).sum(1) / np.maximum(shows.sum(1), 1)
+    seen_through = np.where(through, judged / model.outlier, 0).sum(1)
+    seen_through /= np.maximum(shows.sum(1), 1)
     impossible = np.minimum(seen_through + below, 1)
     # Real sensors round off edges.
     both = np.where(shows & thing, inner, 0)
