@@ -255,6 +255,7 @@ class ThingEpisode:
         joint = None
         if "joint" in needs:
             assert isinstance(recogniser, TaughtRecogniser)  # see ``policies_of``
+            assert isinstance(self.things, TaughtThings)
             views_seen = [self.observation(view) for view in seen]
             total = self.things.log_evidence(views_seen).sum(0)
             here = EPISODE_SPHERE.azimuth[views[-1]]
