@@ -16,8 +16,6 @@ class PixelModel:
     Attributes:
         outlier: log-likelihood of a pixel that the hypothesis does not explain, against one that it
             explains exactly.
-        mislabelled: that of a pixel where the depth is explained, and that was not segmented as the
-            thing's. Of one as low as the noise of the ground nothing is known.
         hole: that of a pixel where the surface was not measured, seen face on. A grazing one costs
             less.
         steep: how many pixels a steep surface may be off sideways.
@@ -27,7 +25,6 @@ class PixelModel:
     """
 
     outlier: float = -4.0
-    mislabelled: float = -1.5
     hole: float = -0.5
     steep: float = 1.0
     edge: float = 3.0
@@ -83,7 +80,8 @@ def likelihood(
 
     The depth on the thing is compared with the surface under the noise of the sensor, which grows
     where the surface is steep. Pixels of the thing without a surface are outliers; so are pixels
-    where the surface should be visible and what is behind it was measured. What stands in front of
+    where the surface should be visible and what is behind it was measured. Pixels as low as the noise
+    of the ground are judged by their depth, however they were segmented. What stands in front of
     the surface is neutral, as are pixels where neither shows. What lies below the ground counts
     like as large a share of the pixels that is seen through, whether it is visible or not.
 
@@ -124,10 +122,9 @@ def likelihood(
     judged = np.zeros(shows.shape)
     judged = np.where(shows & thing, match, judged)
     judged = np.where(~shows & thing, model.outlier * deep, judged)
-    # Where the depth is that of the surface, and another thing was segmented.
-    mislabelled = np.where(view.level, 0, model.mislabelled)
-    agrees = np.logaddexp(match + mislabelled, model.outlier)
-    judged = np.where(through, np.where(sunk, model.outlier, agrees) * inner, judged)
+    # Whether low pixels show the thing is not known: what they measure decides.
+    low = view.level & ~sunk
+    judged = np.where(through, np.where(low, match, model.outlier) * inner, judged)
     judged = np.where(hole, model.hole * cosine, judged)
 
     counted = thing | through | hole
