@@ -80,9 +80,9 @@ def likelihood(
 
     The depth on the thing is compared with the surface under the noise of the sensor, which grows
     where the surface is steep. Pixels of the thing without a surface are outliers; so are pixels
-    where the surface should be visible and what is behind it was measured. Pixels as low as the noise
-    of the ground are judged by their depth, however they were segmented. What stands in front of
-    the surface is neutral, as are pixels where neither shows. What lies below the ground counts
+    where the surface should be visible and what is behind it was measured. Pixels as low as the
+    noise of the ground are judged by their depth, however they were segmented. What stands in front
+    of the surface is neutral, as are pixels where neither shows. What lies below the ground counts
     like as large a share of the pixels that is seen through, whether it is visible or not.
 
     Args:
