@@ -7,7 +7,6 @@ import pytest
 import trimesh
 from test_verification import (
     cup,
-    even_belief,
     l_block,
     off_by,
     on_a_wall,
@@ -80,7 +79,7 @@ def test_a_scan_with_faults_is_recognised(thing, fault):
     verifier = verifier_of(*taught, cup(False))
 
     shown = intact[thing]
-    found = verifier(views_of(shown, YAW)[:2], even_belief(3))
+    found = verifier(views_of(shown, YAW)[:2])
     assert found.belief.argmax() == thing
     degrees, millimetres = off_by(found.poses[0], true_pose(shown, YAW), shown.centre)
     assert degrees < 2
@@ -107,7 +106,7 @@ def test_what_the_border_of_the_picture_cuts_is_right_or_not_sure(thing, share):
     things = (l_block(), cup(True), cup(False))
     verifier = verifier_of(*things)
     views = [cut(view, share) for view in views_of(things[thing], YAW)[:2]]
-    found = verifier(views, even_belief(3))
+    found = verifier(views)
     wrong_and_sure = found.belief.argmax() != thing and found.belief.max() > 0.97
     assert not wrong_and_sure
     if share < 0.2:
