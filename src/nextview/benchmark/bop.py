@@ -22,6 +22,7 @@ from nextview.captured.bop_dataset import (
     MODELS_FOLDER,
     BopDataset,
     BopImage,
+    TrueObject,
     model_number,
     read_bop_dataset,
 )
@@ -183,6 +184,8 @@ def look_for_models(
     read = read_bop_dataset(dataset, how.split, how.targets)
     images = _evenly(read.images, how.frames)
     given = _numbers_given(how.ids, read)
+    # a mistake in them is told before any work is done
+    truths = {image: read.true_objects(image) for image in images}
     memory = _memory(read, out, how, track) if how.models is None else how.models
     numbers = _numbers_of_things(memory, given, read)
     system = load(memory, unknown=how.unknown)
@@ -200,7 +203,7 @@ def look_for_models(
             raise DatasetError(
                 f"{dataset}: no image can be looked at: {next(iter(left_out.values()))}"
             )
-        hits = _recall(read, images, found)
+        hits = _recall(read, truths, found)
         with new_file(out, overwrite) as new:
             _write(new, found)
 
@@ -408,7 +411,7 @@ def _write(path: Path, found: dict[BopImage, FoundInImage]) -> None:
 
 def _recall(
     dataset: BopDataset,
-    images: Sequence[BopImage],
+    truths: dict[BopImage, tuple[TrueObject, ...] | None],
     found: dict[BopImage, FoundInImage],
 ) -> dict[int, Hits] | None:
     """Hits of each model that is in the images; None where none of them has a truth.
@@ -416,7 +419,6 @@ def _recall(
     Images that could not be looked at count: what is in them is missed.
     """
     nothing = FoundInImage((), 0.0, 1)
-    truths = {image: dataset.true_objects(image) for image in images}
     known = {image: true for image, true in truths.items() if true is not None}
     if not known:
         return None

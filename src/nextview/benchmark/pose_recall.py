@@ -16,7 +16,7 @@ from nextview.captured.bop_dataset import BopModelInfo
 from nextview.types import Float, Floats
 
 PART_STEPS = np.arange(1, 11)
-MSSD_PARTS = 0.05 * PART_STEPS  # of the diameter
+MSSD_PARTS = PART_STEPS / 20  # of the diameter
 MSPD_PIXELS = 5.0 * PART_STEPS  # of an image of MSPD_WIDTH
 MSPD_WIDTH = 640
 # largest way of a point between two turns of a symmetry by any angle, parts of its distance from
