@@ -179,7 +179,8 @@ def surface_error(dataset: Path, line: dict) -> float:
 def recall_of(dataset: Path, lines: list[dict], number: int) -> list[str]:
     """What is to be printed of a model that is once in each image."""
     info = json.loads((dataset / "models/models_info.json").read_text())[str(number)]
-    width = Image.open(dataset / f"test/000001/depth/{VIEWS[0][0]:06d}.png").width
+    with Image.open(dataset / f"test/000001/depth/{VIEWS[0][0]:06d}.png") as image:
+        width = image.width
     errors = [errors_of(dataset, line) for line in lines if line["obj_id"] == number]
     parts = [k / 20 * info["diameter"] for k in range(1, 11)]
     pixels = [5 * k * width / 640 for k in range(1, 11)]
@@ -272,6 +273,18 @@ def test_without_the_truth_nothing_is_compared(own, tmp_path, capsys):
     assert len(read_results(out)) == 2
 
 
+def test_models_that_the_memory_does_not_know_are_named(own, tmp_path, capsys):
+    out = tmp_path / "out.csv"
+    one = ["--models", "ycb", "--ids", "mug=14", "--frames", "1"]
+    main(["bop", str(own), str(out), *one])
+    said = capsys.readouterr()
+    assert "does not know the models 2, so they are never found" in said.err
+    assert "cracker_box: is no model of the dataset, found 1 time" in said.err
+    assert {line["obj_id"] for line in read_results(out)} == {14}
+    (row,) = [row for row in said.out.splitlines() if row.split()[:1] == ["2"]]
+    assert row.split() == ["2", "1", "0.000", "0.000", "0.000"]
+
+
 def test_what_is_hidden_counts_neither_way(own, tmp_path):
     shares = [{"visib_fract": 0.05}, {"visib_fract": 0.9}]
     info = {image: shares for image, _ in VIEWS}
@@ -293,13 +306,15 @@ def test_models_are_taught_once_where_no_memory_is_named(tmp_path, monkeypatch):
     (tmp_path / "bop/test_targets_bop24.json").write_text(json.dumps(targets))
 
     out = tmp_path / "out.csv"
-    look_for_models(tmp_path / "bop", out)
+    run = look_for_models(tmp_path / "bop", out)
+    assert (run.learned.things, run.not_known) == (2, ())
     (line,) = read_results(out)
     assert line["obj_id"] == 14
     assert surface_error(tmp_path / "bop", line) < 10
     card = tmp_path / "out-memory/memory.json"
     before = card.read_bytes(), card.stat().st_mtime_ns
-    look_for_models(tmp_path / "bop", out, overwrite=True)
+    again = look_for_models(tmp_path / "bop", out, overwrite=True)
+    assert again.learned is None
     assert (card.read_bytes(), card.stat().st_mtime_ns) == before
 
 

@@ -41,7 +41,7 @@ from nextview.files import (
 from nextview.geometry.mesh import load_mesh
 from nextview.scene.scene import Scene
 from nextview.session.system import System, load
-from nextview.teaching.learn import CARD, learn_things
+from nextview.teaching.learn import CARD, Learned, learn_things
 from nextview.teaching.thing_views import TeachingOptions
 from nextview.things.memory import open_memory
 from nextview.types import Float
@@ -133,6 +133,8 @@ class BopRun:
         seconds: a looked-at image, mean.
         others: how often things were found that are no models of the dataset, by name.
         hits: of each model that is in the images, by its number; None where the truth is not known.
+        not_known: models that the memory does not know, by their numbers.
+        learned: what was taught; None where a memory was there.
     """
 
     out: Path
@@ -142,6 +144,8 @@ class BopRun:
     seconds: float
     others: dict[str, int]
     hits: dict[int, Hits] | None
+    not_known: tuple[int, ...] = ()
+    learned: Learned | None = None
 
 
 def look_for_models(
@@ -186,7 +190,10 @@ def look_for_models(
     given = _numbers_given(how.ids, read)
     # a mistake in them is told before any work is done
     truths = {image: read.true_objects(image) for image in images}
-    memory = _memory(read, out, how, track) if how.models is None else how.models
+    learned = None
+    memory = how.models
+    if memory is None:
+        memory, learned = _memory(read, out, how, track)
     numbers = _numbers_of_things(memory, given, read)
     system = load(memory, unknown=how.unknown)
 
@@ -216,6 +223,8 @@ def look_for_models(
         float(np.mean([one.seconds for one in found.values()])),
         {name: names.count(name) for name in sorted(set(names))},
         hits,
+        tuple(sorted(set(read.models) - set(numbers.values()))),
+        learned,
     )
 
 
@@ -251,13 +260,13 @@ def _memory(
     out: Path,
     how: BopOptions,
     track: TrackProgress,
-) -> str:
-    """Teach the models, unless an earlier run did; returns the folder of the memory."""
+) -> tuple[str, Learned | None]:
+    """The folder of the memory of the models, and what was taught, unless an earlier run did."""
     folder = out.with_name(f"{out.stem}-memory")
     if not (folder / CARD).exists():
         options = TeachingOptions(unit="mm", sensor=how.sensor, seed=how.seed)
-        learn_things(dataset.folder / MODELS_FOLDER, folder, options, track=track)
-        return str(folder)
+        models = dataset.folder / MODELS_FOLDER
+        return str(folder), learn_things(models, folder, options, track=track)
 
     known = _things_of(str(folder))
     names = {path.stem for path in dataset.models.values()}
@@ -266,7 +275,7 @@ def _memory(
             f"{folder}: holds the memory of another dataset ({strange[0]}); remove it, or name the"
             " right one with --models"
         )
-    return str(folder)
+    return str(folder), None
 
 
 def _things_of(memory: str) -> list[str]:

@@ -20,6 +20,15 @@ def print_bop(run: BopRun) -> None:
     Args:
         run: what was found.
     """
+    if run.learned is not None:
+        console.print(f"{run.learned.out}: {run.learned}", soft_wrap=True)
+    if run.not_known:
+        numbers = ", ".join(map(str, run.not_known))
+        console.print(
+            f"the memory does not know the models {numbers}, so they are never found",
+            style="yellow",
+            soft_wrap=True,
+        )
     for name, reason in run.left_out.items():
         console.print(f"left out: {name}: {reason}", style="yellow", soft_wrap=True)
     for name, count in run.others.items():
