@@ -60,6 +60,7 @@ LIMIT = 900  # seconds for one command
 
 NOT_RUN = {  # commands by how they begin, or what is in them; the reason
     r"^nextview look ": "needs frames of a table: tests/test_scene.py makes some and runs it",
+    r"lmo": "needs a dataset of BOP: tests/test_bop.py writes one and runs it",
     r"examples/arm_over_table": (
         "needs the YCB scans; research/tests/test_arm_over_table.py has files of a few"
     ),

@@ -16,6 +16,7 @@ from msgspec import Meta, Struct
 from scipy.spatial.transform import Rotation
 
 from nextview.captured.bag import At, is_bag, read_bag
+from nextview.captured.bop_scene import ThreeNumbers, read_bop_scene
 from nextview.captured.camera_file import CameraFile, check_size, read_camera_file
 from nextview.captured.depth_folder import (
     is_depth_folder,
@@ -51,8 +52,6 @@ MOST_LOST = 0.1  # share of the lines of a trajectory that may hold no pose
 KINECT = (585.0, 585.0, 320.0, 240.0)
 # metres that a step of a depth image may stand for; a float image has 1
 LARGEST_SCALE = 0.05
-ThreeNumbers = Annotated[list[float], Meta(min_length=3, max_length=3)]
-Nine = Annotated[list[float], Meta(min_length=9, max_length=9)]
 # as given by hand, see ``read_capture``
 Intrinsics = tuple[float, float, float, float] | str | Path | None
 
@@ -290,124 +289,6 @@ def read_box(path: Path) -> Box:
         raise UsageError(f"{path}: {error}") from None
 
 
-class _Camera(Struct):
-    cam_K: Nine
-    depth_scale: Annotated[float, Meta(gt=0)]
-    cam_R_w2c: Nine | None = None
-    cam_t_w2c: ThreeNumbers | None = None
-
-
-class _Object(Struct):
-    obj_id: int
-    cam_R_m2c: Nine | None = None
-    cam_t_m2c: ThreeNumbers | None = None
-
-
-LACKS_POSE = (
-    "lacks the camera's pose (cam_R_w2c, cam_t_w2c); an object's pose in scene_gt.json will do,"
-    " named with --object-id if there are several"
-)
-
-
-def _bop_mask(folder: Path, name: str, here: list[int]) -> Path | None:
-    """Read the mask of an object by its number in an image."""
-    which = f"{here[0]:06d}" if here else "*"
-    masks = list(folder.glob(f"mask_visib/{name}_{which}.png"))
-    return masks[0] if len(masks) == 1 else None
-
-
-def _read_bop(folder: Path, camera: CameraFile | None, how: Reading) -> LayoutViews:
-    """Views of scene_camera.json.
-
-    Without camera poses, the world is the object's model, by scene_gt.json.
-    """
-    object_id = how.object_id
-    intrinsics = _matrix(camera)
-    path = folder / "scene_camera.json"
-    truth = folder / "scene_gt.json"
-    cameras = read_record(
-        path,
-        dict[int, _Camera],
-        "the cameras of a BOP scene",
-        DatasetError,
-    )
-    all_objects: dict[int, list[_Object]] = {}
-    if truth.exists():
-        all_objects = read_record(
-            truth,
-            dict[int, list[_Object]],
-            "the objects of a BOP scene",
-            DatasetError,
-        )
-    numbers = sorted({one.obj_id for many in all_objects.values() for one in many})
-    named = ", ".join(map(str, numbers))
-    if object_id is not None and object_id not in numbers:
-        known = f"there are {named}" if numbers else "there is no scene_gt.json"
-        raise DatasetError(f"{folder}: no object has the number {object_id}; {known}")
-    single = numbers[0] if object_id is None and len(numbers) == 1 else object_id
-
-    notes = ["intrinsics of scene_camera.json"] if intrinsics is None else []
-    if single is None and numbers:
-        notes.append(
-            f"objects {named}: name one with --object-id, and its masks are used"
-        )
-
-    views = LayoutViews([], notes)
-    from_model = False
-    for index, taken in sorted(cameras.items()):
-        objects = all_objects.get(index, [])
-        name = f"{index:06d}"
-        here = [i for i, one in enumerate(objects) if one.obj_id == single]
-        if single is not None and numbers and not here:
-            continue  # it does not show the object
-        rotation = taken.cam_R_w2c
-        translation = taken.cam_t_w2c
-        where = f"image {index} of {path}"
-        if rotation is None and here:
-            thing = objects[here[0]]
-            from_model = True
-            where = f"image {index} of {truth}"
-            rotation = thing.cam_R_m2c
-            translation = thing.cam_t_m2c
-        if rotation is None or translation is None:
-            raise DatasetError(f"{where}: {LACKS_POSE}")
-        try:
-            pose = _from_world_to_camera(rotation, translation, where)
-        except DatasetError as error:
-            views.unreadable[name] = str(error)
-            continue
-        k = np.reshape(taken.cam_K, (3, 3)) if intrinsics is None else intrinsics
-        mask = _bop_mask(folder, name, here) if len(here) == 1 or not numbers else None
-        files = (f"rgb/{name}.png", f"rgb/{name}.jpg", f"gray/{name}.png")
-        image = next(
-            (folder / file for file in files if (folder / file).exists()),
-            None,
-        )
-        depth = DepthFile(folder / f"depth/{name}.png")
-        step = taken.depth_scale * MILLIMETRES
-        views.frames.append(CapturedFrame(name, depth, step, k, pose, mask, image))
-    if from_model:
-        notes.append(
-            "there are no camera poses: the world is the object's model in scene_gt.json"
-        )
-        views.object_is_world = True
-    if any(frame.mask for frame in views.frames):
-        notes.append("masks of mask_visib")
-    return views
-
-
-def _from_world_to_camera(
-    rotation: list[float],
-    translation: list[float],
-    where: str,
-) -> Float:
-    """Convert BOP's world-to-camera transform to a camera-to-world pose."""
-    pose = np.eye(4)
-    pose[:3, :3] = np.reshape(rotation, (3, 3)).T
-    pose[:3, 3] = -pose[:3, :3] @ (np.array(translation) * MILLIMETRES)
-    return rigid(pose, where)
-
-
 def _read_tum(folder: Path, camera: CameraFile | None, _: Reading) -> LayoutViews:
     """Read views by depth.txt and groundtruth.txt, with images and masks if there are any."""
     intrinsics = _matrix(camera)
@@ -557,7 +438,9 @@ FOLDER_LAYOUTS: dict[
     str,
     Callable[[Path, CameraFile | None, Reading], LayoutViews],
 ] = {
-    "BOP": _read_bop,
+    "BOP": lambda path, camera, how: read_bop_scene(
+        path, _matrix(camera), how.object_id
+    ),
     "TUM RGB-D": _read_tum,
     "7-Scenes": _read_seven_scenes,
     DEPTH_FOLDER: lambda path, camera, how: read_depth_folder(

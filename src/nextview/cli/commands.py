@@ -179,6 +179,12 @@ COMMANDS = {  # by name, in the order in which they are listed
         MORE_POLICIES,
         f"{CLI}.benchmark_tables:print_compared",
     ),
+    "bop": Command(
+        "nextview.benchmark.bop:look_for_models",
+        "locate the models of a BOP dataset in its images",
+        "wrote {out}; next: evaluate it with bop_toolkit",
+        f"{CLI}.bop:print_bop",
+    ),
     "report": Command(
         "nextview.benchmark.report:report",
         "write one HTML page of a benchmark of classes",
@@ -195,6 +201,7 @@ RESUMES = (
     "train segmentation",
     "learn",
     "scenes",
+    "bop",
     "benchmark things",
     "benchmark tables",
 )
