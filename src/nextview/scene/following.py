@@ -47,8 +47,9 @@ class Outline:
 
     @classmethod
     def of(cls, track: Track, up: Float) -> Outline | None:
-        """Compute the outline of an object from its scan if it was recognised, else from its
-        points.
+        """Compute the outline of an object.
+
+        It is that of the scan if the object was recognised, and otherwise of its visible points.
 
         Args:
             track: the object, already judged.

@@ -74,9 +74,7 @@ class SceneState:
 
     @property
     def remarks(self) -> tuple[ViewWarning, ...]:
-        """Open issues of all frames, or a remark that nothing was found; empty before the first
-        frame.
-        """
+        """Open issues, or a remark that nothing was found; empty before the first frame."""
         remarks = []
         if self.left_unknown:
             small = number_of(self.left_unknown, "small object")
