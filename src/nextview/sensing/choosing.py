@@ -17,18 +17,20 @@ from nextview.sensing.sighting import FEWEST_OBJECT_PIXELS
 from nextview.types import Float, Index, Mask
 
 Parting = Literal["instance", "touching", "piece"]
-"""What of the segmentation is one object: an instance; an instance with all that touches it; or a
-piece of one."""
+"""Part of the segmentation that is one object: an instance, an instance with everything that
+touches it, or a piece of an instance."""
 
-# of a thing that stands alone: what touches it belongs to it
+# for an object that stands alone, so that everything that touches it belongs to it
 ALONE: Parting = "touching"
 NO_INSTANCE = (
     "the segmentation finds nothing {where} in this frame: check its pose, aim the camera at the"
     " object, or give a mask"
 )
-NEAREST_POINT = 0.01  # metres between the camera and a point on an object, at least
-POINTS_COMPARED = 1000  # of an instance with the point that chooses one
-# picture widths from the optical axis at which an instance counts for 1 / e of its pixels
+NEAREST_POINT = (
+    0.01  # metres, least distance between the camera and a point on an object
+)
+POINTS_COMPARED = 1000  # sampled points of an instance
+# image widths from the optical axis at which pixels have the weight 1 / e
 AIM_SPREAD = 0.08
 
 
@@ -165,7 +167,7 @@ def _aimed_at(supports: Supports) -> Mask:
 
 
 def _weight(mask: Mask, frame: Frame) -> float:
-    """Return the number of pixels of an instance, weighted by the distance from the optical axis."""
+    """Return the number of pixels of an instance, weighted by distance from the optical axis."""
     rows, columns = np.nonzero(mask)
     column, row = frame.intrinsics[:2, 2]
     away = float(np.hypot(rows - row, columns - column).min()) / frame.shape[1]

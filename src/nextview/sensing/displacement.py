@@ -250,8 +250,9 @@ class _Surface:
         )
 
     def _looks_past(self, rays: Float, z: Float) -> Mask:
-        """Return where the frame measures something behind points with these rays, (N, 2), and
-        depths.
+        """Return where the frame measures something behind points.
+
+        The points are given by their rays, (N, 2), and depths.
         """
         frame = self.sighting.frame
         at = frame.camera.project(np.column_stack([rays, np.ones(len(rays))]))

@@ -1,4 +1,4 @@
-"""Occupancy grid around an object from depth frames, and its expected visibility from other views."""
+"""Occupancy grid around an object from depth frames, and its expected visibility."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -55,7 +55,7 @@ class VoxelGrid:
         return np.stack(np.meshgrid(*self.axes, indexing="ij")).reshape(3, -1)
 
     def within(self, radius: float) -> Mask:
-        """Return the voxels whose centre is within a radius of the cube's centre, (n, n, n) bool."""
+        """Return the voxels within a radius of the grid's centre, (n, n, n) bool."""
         x, y, z = (
             (axis - middle) ** 2
             for axis, middle in zip(self.axes, self.centre, strict=True)
@@ -63,7 +63,7 @@ class VoxelGrid:
         return x[:, None, None] + y[:, None] + z <= radius**2
 
     def cell_of(self, points: Floats) -> tuple[Index, Mask]:
-        """Return the voxel index of each point, (P, 3), and whether the point is inside the grid."""
+        """Return the voxel index of each point, (P, 3), and whether it is inside the grid."""
         at = np.floor((points - np.array(self.centre) + self.half) / self.pitch).astype(
             np.int64
         )
@@ -362,7 +362,7 @@ class SightLines:
 
     @cached_property
     def passed(self) -> "csr_array":
-        """Length of the line from each part to each camera in each voxel, (P * V, n^3)."""
+        """Unit steps of the line from each part to each camera in each voxel, (P * V, n^3)."""
         from scipy.sparse import (
             csr_array,
         )  # slow to import, and rarely needed

@@ -135,7 +135,7 @@ class Frame:
         return self.depth.shape[0], self.depth.shape[1]
 
     def shifted(self, shift: Float) -> "Frame":
-        """Return the frame with its pose shifted in the world, (3,), metres; it must have a pose."""
+        """Return the frame with its pose, which must exist, shifted in the world, (3,), metres."""
         pose = self.camera_to_world.copy()
         pose[:3, 3] += shift
         moved = copy(self)  # skips validation

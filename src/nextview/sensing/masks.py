@@ -1,4 +1,4 @@
-"""Pixels of a frame in a box, in a sphere, above a plane, or in a mask without its edge."""
+"""Select pixels of a frame: in a box, in a sphere, above a plane, or in a trimmed mask."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ from nextview.sensing.object_frame import Box
 from nextview.sensing.planes import Plane
 from nextview.types import Float, Mask
 
-# height over a plane, as a part of the distance, above which a pixel at a mask's edge is not the
-# plane's
+# height above a plane, relative to the distance, from which a pixel at a mask's edge is not on it
 STANDS = 0.02
-TOUCHING_GAP = 0.006  # metres between two things that touch, at most
-TOUCHING_STEP = 0.015  # metres between their depths where they are nearest, at most
-BESIDE_POINTS = 200  # pixels at a border that are compared
-SPHERE_MARGIN = 1.02  # times the radius of a known object within which its pixels lie
+TOUCHING_GAP = 0.006  # metres, largest gap between objects that touch
+TOUCHING_STEP = 0.015  # metres, largest depth difference at their closest pixels
+BESIDE_POINTS = 200  # compared pixels at a border
+SPHERE_MARGIN = 1.02  # radius of the sphere of a known object, in object radii
 
 
 def inside_box(frame: Frame, box: Box) -> Mask:
-    """Return the pixels whose positions lie in an upright box.
+    """Return the pixels with positions inside an upright box.
 
     Args:
         frame: the frame.
@@ -44,7 +43,7 @@ def inside_sphere(
     radius: float,
     part: Part = WHOLE,
 ) -> Mask:
-    """Return the pixels whose positions lie in a sphere.
+    """Return the pixels with positions inside a sphere.
 
     Args:
         frame: the frame.
@@ -63,7 +62,7 @@ def inside_sphere(
 
 
 def above_plane(frame: Frame, plane: Plane, noise: Noise, part: Part = WHOLE) -> Mask:
-    """Return the pixels that are higher above a plane than the noise explains.
+    """Return the pixels that are above a plane by more than the noise.
 
     Args:
         frame: the frame.
@@ -79,7 +78,7 @@ def above_plane(frame: Frame, plane: Plane, noise: Noise, part: Part = WHOLE) ->
     least = np.float32(0.003) * depth
     high = (height > least) & (depth > 0)
 
-    # Noise moves a point along its ray: it rises by so much as the ray does.
+    # Noise moves a point along its ray, so the height error depends on the slope of the ray.
     a, b, c = (frame.camera_to_world[:3, :3].T @ plane.normal).astype(np.float32)
     x = frame.rays[0][part[1]]
     y = frame.rays[1][part[0]]
@@ -105,12 +104,12 @@ def inside_mask(
     plane: Plane | None,
     noise: Noise,
 ) -> Mask:
-    """The pixels of a mask without the background at its edge and the support plane.
+    """Return the pixels of a mask without background at its edge and without the support plane.
 
     Args:
         frame: the frame.
         given: the mask, (H, W) bool.
-        plane: that the object stands on; None if it is not seen.
+        plane: support plane of the object; None if it is not visible.
         noise: of the frame.
     """
     if plane is None:
@@ -121,7 +120,7 @@ def inside_mask(
     part = within(mask)
     above = mask.copy()
     above[part] &= above_plane(frame, plane, noise, part)
-    # a plane may lie above what is hidden or flat
+    # keep the mask if most of it is not above the plane, as for flat objects
     return above if 2 * np.count_nonzero(above) > np.count_nonzero(mask) else mask
 
 
@@ -132,14 +131,14 @@ def touching(
     gap: float = TOUCHING_GAP,
     step: float = TOUCHING_STEP,
 ) -> bool:
-    """Whether two things meet in the picture and in depth.
+    """Return True if two objects touch in the image and in depth.
 
     Args:
-        frame: that shows them.
-        one: the pixels of one of them, (H, W) bool.
-        other: those of the other.
-        gap: metres between them in the picture, at most.
-        step: metres between their depths where they are nearest, at most.
+        frame: of both masks.
+        one: mask of one object, (H, W) bool.
+        other: mask of the other.
+        gap: largest gap between them in the image, metres.
+        step: largest depth difference at their closest pixels, metres.
     """
     part = within(one)
     away_from_camera = frame.depth[part][one[part]]
