@@ -55,10 +55,10 @@ RAW = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TF = "tf2_msgs/msg/TFMessage"
-# the end of the name of the topic of transforms that never change
+# suffix of the topic of static transforms
 STATIC_TRANSFORMS = "tf_static"
 NANOSECONDS = 1e-9
-# in place of the encoding of a topic whose messages are announced and missing
+# replaces the encoding of a topic whose announced messages are missing
 NOT_THERE = "announced, and none is there"
 LARGEST_METADATA = 2**24  # bytes of metadata.yaml
 # bytes, largest decompressed size of a chunk or a message. Recorders write chunks of a few
@@ -71,8 +71,9 @@ At = Literal["first", "last"] | float | None
 
 
 def is_bag(path: Path) -> bool:
-    """Return True if a path is a bag or a file of one, including ROS 1 bags, which ``read_bag``
-    rejects.
+    """Return True if a path is a bag or a file of one.
+
+    ROS 1 bags are included; ``read_bag`` rejects them.
     """
     if path.is_dir():
         return (path / METADATA).exists() or bool(_storage_files(path))
@@ -197,9 +198,7 @@ class Bag:
         weakref.finalize(self, _close, self._reader, self._unread)
 
     def first(self, connection: "Connection") -> Any:
-        """Return the first message of a topic; None if there is none, even if the bag announces
-        some.
-        """
+        """Return the first message of a topic; None if there is none, despite its index."""
         return next((message for _, _, message in self.messages([connection])), None)
 
     def of_type(self, *kinds: str) -> list["Connection"]:
@@ -385,7 +384,7 @@ def _close(reader: "Reader", unread: set[Generator[Any, None, None]]) -> None:
 
 
 def _opened(path: Path) -> Path:
-    """Return the path that rosbags shall open: the bag, or the only file of one without metadata."""
+    """Return the path to open: the bag, or the only file of one without metadata."""
     if path.suffix.lower() == OLD_ENDING:
         raise DatasetError(
             f"{path}: is a bag of ROS 1; rosbags-convert --src {path.name} --dst {path.stem} makes"

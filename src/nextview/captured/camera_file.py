@@ -206,9 +206,7 @@ def _part_of_sensor(camera: dict[str, Any]) -> tuple[Float, tuple[int, int] | No
 
 
 def _coefficients(values: Any) -> Float:
-    """Return the distortion coefficients, (N,), from a list or from fields like those of Zivid
-    (K1, P1).
-    """
+    """Return the distortion coefficients, (N,), from a list or from fields (K1, P1; Zivid)."""
     if values is None or isinstance(values, str):  # the name of a distortion model
         return np.zeros(0)
     if isinstance(values, Mapping) and "data" not in _fields(values):

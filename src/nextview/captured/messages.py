@@ -24,9 +24,9 @@ ENCODINGS: dict[str, np.dtype[Any]] = {
 }
 """Data type of a pixel, by encoding of a depth image."""
 ENCODING_STEPS = {"16UC1": MILLIMETRES, "mono16": MILLIMETRES, "32FC1": 1.0}
-"""Metres that one step stands for, by the encoding."""
+"""Metres per unit, by encoding."""
 PNG = b"\x89PNG\r\n\x1a\n"
-# of compressed_depth_image_transport, before the PNG: what is compressed, and two parameters of it
+# header of compressed_depth_image_transport before the PNG: format and two parameters
 DEPTH_HEADER = struct.Struct("<iff")
 
 
@@ -177,9 +177,7 @@ def pose_of(transform: Any) -> Float:
 
 
 def parts_of(transform: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return position, (3,), and quaternion (x, y, z, w) of a ``geometry_msgs/Transform`` or
-    ``Pose``.
-    """
+    """Return position and quaternion (x, y, z, w) of a ``geometry_msgs/Transform`` or ``Pose``."""
     is_pose = hasattr(transform, "position")
     t = transform.position if is_pose else transform.translation
     q = transform.orientation if is_pose else transform.rotation

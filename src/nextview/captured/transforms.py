@@ -59,9 +59,7 @@ class _Link:
         )
 
     def at(self, time: float) -> Float | None:
-        """Return the transform from the frame to its parent, (4, 4); None if not known at that
-        time.
-        """
+        """Return the transform to the parent at a time, (4, 4); None if it is not known."""
         if self.fixed:
             return matrix_of(self.positions[-1], self.quaternions[-1])
         after = int(np.searchsorted(self.stamps, time))

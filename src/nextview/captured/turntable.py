@@ -125,8 +125,7 @@ def read_turntable(folder: Path, turn: str) -> Capture:
 
 
 def _fit(clouds: list[tuple[Float, Float]], way: int) -> tuple[Float, Float]:
-    """Return the position of the axis in the plane, (2,), and the distances of neighbouring frames,
-    (N,).
+    """Return the axis position in the plane, (2,), and distances of neighbouring frames, (N,).
 
     Point-to-plane least squares with an upright axis: each point is moved onto the plane of its
     nearest neighbour.
