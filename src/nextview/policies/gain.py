@@ -91,7 +91,7 @@ def origin(sphere: ViewSphere, state: EpisodeState, frame: CellFrame) -> Index:
 
 
 def _bin_belief(sphere: ViewSphere, state: EpisodeState) -> Float:
-    """Return the belief in the azimuth bin of the current view, for each class, (B, C, azimuths)."""
+    """Return the belief in the current azimuth bin, for each class, (B, C, azimuths)."""
     if state.azimuth_bins is None or state.azimuth_bins.shape[2] != sphere.azimuths:
         raise PolicyError(
             f"this policy needs a recogniser that discriminates {sphere.azimuths} azimuth bins"
