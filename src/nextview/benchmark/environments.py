@@ -389,7 +389,7 @@ class Cohort:
         self.first = self._look(np.zeros(len(objects)))
 
     def step(self, actions: Index) -> Seen:
-        """Continue all running episodes; visited views are replaced by the nearest unvisited ones."""
+        """Continue all running episodes; visited views are replaced by the nearest free ones."""
         sphere = self.task.sphere
         running = self.episodes.running
         rules = self.task.rules

@@ -74,8 +74,9 @@ class OwnThings:
         observations: Sequence[Observation],
         log_evidence: Floats,
     ) -> OwnAnswer:
-        """Recognise one thing from several views, jointly if possible, else from the summed
-        evidence.
+        """Recognise one thing from several views.
+
+        The views are judged jointly if possible, else by their summed evidence.
 
         Args:
             observations: views of the thing, in one object frame.

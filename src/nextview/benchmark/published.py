@@ -53,7 +53,7 @@ def read_table(name: str) -> dict[str, dict[str, float]]:
 
 
 def published_classes(classes: tuple[str, ...]) -> int | None:
-    """Return 10 or 40 for the classes of ModelNet10 or ModelNet40, in any order; None for others."""
+    """Return 10 or 40 for the classes of ModelNet10 or ModelNet40, in any order; else None."""
     n = len(classes)
     return n if n in ACCURACY and set(classes) == set(read_table(ACCURACY[n])) else None
 

@@ -140,8 +140,7 @@ def _sums(differences: Float) -> Callable[[Float], Float]:
 
 
 def exchange_p(families: int, difference: Callable[[Float], Float]) -> Float:
-    """Return p-values of the hypothesis of no difference by exchanging two policies in some
-    families.
+    """Return p-values of the hypothesis that two policies do not differ, by exchanging them.
 
     Args:
         families: number F of families.

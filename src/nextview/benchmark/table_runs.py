@@ -34,12 +34,12 @@ from nextview.types import Float, Index
 
 TablePolicy = Literal["target", "random", "fixed"]
 TABLE_POLICIES: tuple[TablePolicy, ...] = ("target", "random", "fixed")
-"""Where the next view is: ``Scene.target``; any candidate view; a quarter of a circle on, at the
-same elevation."""
+"""Next views: ``Scene.target``; a random candidate view; the view a quarter turn ahead, at the same
+elevation."""
 FEWEST_THINGS = 6
 MOST_THINGS = 10
-MOST_DRAWN = 20  # draws of one table, until all things fit on it
-CAMERA_FROM_TABLE = 0.6  # metres between the camera and the middle of the table
+MOST_DRAWN = 20  # attempts to draw a table on which all objects fit
+CAMERA_FROM_TABLE = 0.6  # metres from the centre of the table
 VIEW_ELEVATIONS = (30.0, 60.0)  # degrees
 TABLE_CENTRE = np.array([0, 0, 0.03])  # metres
 STRANGER_RADII = (0.04, 0.10)  # metres

@@ -206,8 +206,9 @@ class ThingEpisode:
         return float(self.verified(views)[0].belief[self.thing])
 
     def p_value(self, views: Sequence[int]) -> float | None:
-        """Return the share of known things that are explained as badly, see
-        ``TaughtThings.p_value``.
+        """Return the share of known things that are explained as badly.
+
+        See ``TaughtThings.p_value``.
         """
         observations = [self.observation(view) for view in sorted(self.seen(views))]
         things: Any = self.things

@@ -1,4 +1,4 @@
-"""Policies of the benchmark of things: policies, rules that ignore the images, and an upper bound."""
+"""Policies of the benchmark of things, including blind rules and an upper bound."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -208,7 +208,7 @@ def _taught(
     workers: int | None,
     track: TrackProgress,
 ) -> str:
-    """Return the memory of the scans, which is taught if it does not exist; "" if none is needed."""
+    """Return the memory of the scans, taught if it does not exist; "" if none is needed."""
     if settings.recogniser is not None:
         return ""
     if settings.models is not None:
