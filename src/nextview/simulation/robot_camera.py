@@ -145,7 +145,5 @@ class RobotCamera:
         )
 
     def refused(self, error: ObservationError) -> None:
-        """Report that the target was not found in the last frame, so that its viewpoint is not used
-        again.
-        """
+        """Report that the target was not found; the viewpoint is not used again."""
         self._refused.append(self._taken.pop())

@@ -275,8 +275,9 @@ def upright_boxes(size: Float, azimuth: Float, at: Float, floor: float) -> Mesh:
 
 
 def footprint(vertices: Float) -> Float:
-    """Return the convex hull of points in the top view, (V, 3) or (V, 2), counter-clockwise,
-    (K, 2).
+    """Return the convex hull of points in the top view, counter-clockwise, (K, 2).
+
+    Points are (V, 3) or (V, 2).
     """
     around = (vertices[:, None, :2] + _AROUND).reshape(-1, 2)
     return around[ConvexHull(around).vertices]

@@ -9,13 +9,13 @@ from msgspec import Meta, Struct
 from nextview.errors import DatasetError
 from nextview.files import read_record, write_record
 
-# mean share of the target that shows
+# mean visible share of the target
 CLUTTER_LEVELS = {"light": 0.85, "medium": 0.65, "heavy": 0.45}
-# names of scenes that were drawn: target, level and number
+# names of generated scenes: target, level and number
 NAMED = re.compile(r".*@(\w+)-\d+")
 SUFFIX = ".json"
 LAYOUT_VIEWS = 40
-# or radians: what is computed with more has no precision left
+# or radians; limited to preserve numerical precision
 Length = Annotated[float, Meta(ge=-1000, le=1000)]
 Size = Annotated[float, Meta(gt=0, le=1000)]
 Hash = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}$")]

@@ -321,13 +321,13 @@ _ALL = (
 )
 SENSORS = {sensor.name: sensor for sensor in _ALL}
 """Sensors by name: "none" has no errors; "kinect" is the first Kinect; "stereo" is like a RealSense
-D435 of 848 x 480; "setup" has no errors but those of pose, object frame, table and picture; "wrist"
-is "stereo" in such a setup."""
+D435 of 848 x 480; "setup" has only errors of pose, object frame, table and image; "wrist" is
+"stereo" in such a setup."""
 
 _SIDE = 224
 _RADIUS = SENSORS["none"].radius
 _FOCAL = float(pinhole(_SIDE, CAMERA_DISTANCE)[0, 0])
-# the networks' own camera
+# virtual camera of the networks
 RENDER = Sensor(
     "render",
     _SIDE,
@@ -444,10 +444,10 @@ def shifted(
     right: Index,
     down: Index,
 ) -> tuple[Float, Index]:
-    """Replace the surface in each pixel by that of a neighbour, intersected with the pixel's own
-    ray.
+    """Replace the surface in each pixel by that of a neighbour.
 
-    Edges move, and planes are unchanged.
+    The depth is that at which the pixel's own ray meets the surface: edges move, and planes are
+    unchanged.
 
     Args:
         q: inverse depth, (H, W).

@@ -28,7 +28,8 @@ SLIVER = 1e-6
 STRAY = 1e-3
 """Rounding errors may put a hit anywhere on the ray if the cosine between ray and normal is below
 the first value, or the triangle's normal, twice its area, is shorter than the second. Such a hit is
-accepted within the third distance, object radii, from the triangle's bounding box in camera axes."""
+accepted within the third distance, object radii, from the triangle's bounding box in camera
+axes."""
 
 
 def _dot(a: Float32, b: Float32) -> Float32:
@@ -140,9 +141,7 @@ class SimulatedCamera:
         return Observation(depth, pose, self.intrinsics, self.radius, image, exact=True)
 
     def _bound(self, rotation: Float32, origin: Float32) -> tuple[slice, slice]:
-        """Return rows and columns that contain all vertices; the whole image if one is behind the
-        camera.
-        """
+        """Return rows and columns that contain all vertices; the whole image if one is behind."""
         x, y, z = rotation.T @ self._corners - (rotation.T @ origin)[:, None]
         height, width = self.shape
         if z.min() <= 1e-6:

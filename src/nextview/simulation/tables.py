@@ -120,7 +120,7 @@ def _free_place(
     rng: np.random.Generator,
     gap: float,
 ) -> Float:
-    """Find a position, (2,), where an outline around the origin, (K, 2), has a gap to all others."""
+    """Find a position, (2,), where an outline about the origin, (K, 2), is clear of all others."""
     if not others:
         return rng.uniform(-0.05, 0.05, 2)
     for _ in range(PLACEMENTS_TRIED):
@@ -196,7 +196,7 @@ class TableCamera:
 
     @property
     def truth(self) -> dict[str, Float]:
-        """Return the true pose of each object's file in the robot's world, (4, 4), metres, by name."""
+        """True pose of each object's file in the robot's world, (4, 4), metres, by name."""
         return {thing.name: self.lean @ thing.pose for thing in self.table.things}
 
     def frame(self, pose: Float) -> Frame:

@@ -1,5 +1,4 @@
-"""Random worlds for a depth camera: objects on tables, floors, shelves and belts, in bins and
-rooms.
+"""Random worlds for a depth camera: tables, floors, bins, shelves, belts and rooms with objects.
 
 Objects are dropped onto a height map: they stand side by side, lie on each other, and fill bins.
 The surfaces below them, containers and background are labelled, too. The worlds are used to train a
@@ -33,15 +32,15 @@ HOLE = -3  # label of a pixel without depth
 
 MAP_CELLS = 160  # cells on each side of a height map
 DROPS_TRIED = 25
-# by which it is found how far a solid can be pushed, from each side
+# rays from each side that measure how far a solid can be pushed
 CONTACT_RAYS = 1500
-STACKED = 0.5  # share of piled things that are put on the last one
-# share of levels whose things are turned by quarters, so that their sides meet
+STACKED = 0.5  # share of piled objects that are placed on the last one
+# share of levels whose objects are rotated by quarter turns, so that their sides are parallel
 ALIGNED = 0.4
 STEPS_OUTWARDS = 60
-SMALL_FURNITURE = 0.8  # metres: a monitor or a night stand
-RAISED = 0.7  # share of small furniture that stands on other furniture, if there is any
-LEAST_STABLE = 0.03  # share of throws of a resting pose, at least
+SMALL_FURNITURE = 0.8  # metres, size of a monitor or a night stand
+RAISED = 0.7  # share of small furniture placed on other furniture, if there is any
+LEAST_STABLE = 0.03  # least probability of a resting pose
 LARGEST_SHAPE = 20_000  # triangles
 
 
@@ -218,7 +217,7 @@ class HeightMap:
         return None
 
     def _places(self, rng: Generator, piled: bool, spread: float) -> Iterator[Float]:
-        """Iterate over positions to try, (2,) each: random ones, or from near the centre outwards."""
+        """Iterate over positions, (2,) each: random ones, or from near the centre outwards."""
         angle = rng.uniform(0, 2 * np.pi)
         start = self.centre + rng.normal(0, spread / 2, 2)
         if piled:
@@ -244,7 +243,7 @@ class HeightMap:
         return here is not None and not (here[outline] > self.level + 1e-9).any()
 
     def _profiles(self, solid: Solid) -> tuple[Float, Float]:
-        """Return the heights of the lower and the upper side over the cells of a solid's outline."""
+        """Return the lower and the upper height over the cells of a solid's outline."""
         vertices, _ = solid
         low = vertices.min(0)
         high = vertices.max(0)
