@@ -42,7 +42,7 @@ def explore(
         seed: seed of the first view, the policies and the sensor errors.
         host: address at which the page is served; 0.0.0.0 makes it reachable from other machines.
         port: port of the page; if it is taken, the next free one is used.
-        browser: open the page in a browser.
+        browser: by default the page is opened in a browser.
     """
     with extras():
         import viser  # noqa: F401  # fails early, before the models are loaded

@@ -366,9 +366,7 @@ def _layout(
     seed: int,
     rng: np.random.Generator,
 ) -> RoomLayout | None:
-    """Return a room without a first view, with the target on floor or table; None if it does not
-    fit.
-    """
+    """Return a room without a first view; None if the target does not fit."""
     width, depth, height = rng.uniform(
         *np.transpose([ROOM_SIDE, ROOM_SIDE, ROOM_HEIGHT])
     )
@@ -403,7 +401,7 @@ def _on_floor(
     room: tuple[float, float],
     rng: np.random.Generator,
 ) -> Furnished | None:
-    """Place a target on the floor, half of them with the back to a wall; None if it does not fit."""
+    """Place a target on the floor, half of them with the back to a wall; None if it cannot."""
     back = np.radians(LIFE_SIZES[task.label].back) if task.label in LIFE_SIZES else 0.0
     against = bool(rng.integers(2))
     target = _standing(thing, room, back, against, rng)
@@ -653,7 +651,7 @@ def _on_top(top: Slab, rng: np.random.Generator) -> Float:
 
 
 def _fits(outline: Float, top: Slab, taken: list[Float]) -> bool:
-    """Return True if an outline, (K, 2), is on a table, clear of its edge and of other footprints."""
+    """Return True if an outline, (K, 2), is on a table, clear of its edge and of others."""
     own = (outline - (top.x, top.y)) @ rotation_z(top.azimuth)[:2, :2]
     inside = (np.abs(own) < np.array([top.width, top.depth]) / 2 - TABLE_EDGE / 2).all()
     return bool(inside) and all(

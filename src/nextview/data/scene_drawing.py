@@ -64,21 +64,21 @@ CLUTTER_DISTANCES = {"light": (0.5, 2.6), "medium": (0.5, 2.3), "heavy": (0.5, 2
 OBJECT_RADIUS = (0.5, 1.1)
 # least number of meshes among the objects, if there are any
 FEWEST_OBJECTS = 2
-# share of objects among objects and boxes
+# share of meshes among meshes and boxes
 OBJECTS = {"light": 0.7, "medium": 0.6, "heavy": 0.4}
-# what is low hides nothing from above
+# boxes must be high to occlude views from above
 BOX_HEIGHT = {"light": BLOCK_HEIGHT, "medium": BLOCK_HEIGHT, "heavy": (1.4, 2.9)}
-# what a thing hides at least: the table is soon full
+# least share occluded by one object, because space on the table is limited
 LEAST_HIDDEN = {"light": 0.0, "medium": 0.0, "heavy": 0.008}
-# chances of 0, 1 and 2
+# probabilities of 0, 1 and 2 walls
 WALLS = {"light": (0.8, 0.2, 0.0), "medium": (0.5, 0.4, 0.1), "heavy": (0.3, 0.4, 0.3)}
 WALL_AWAY = (1.2, 1.9)
 WALL_WIDTH = (2.0, 3.5)
 WALL_DEPTH = 0.1
 WALL_HEIGHT = (1.0, 2.6)
-# meshes that are tried in one scene, at several places each: reading them takes longest
+# meshes tried per scene, each at several positions, because loading them is slow
 MESHES_TRIED = 8
-# triangles of an object around the target: larger ones are passed over, for the sake of time
+# largest number of triangles of an object around the target, to limit the run time
 MOST_FACES = 100_000
 MOST_SCENES = 100_000  # per level and split
 

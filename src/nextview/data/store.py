@@ -485,9 +485,7 @@ class ViewStore:
         return self.read("image", i)
 
     def depth(self, i: int) -> Float32:
-        """Return the depth of all views of object i, (V, S, S) float32, object radii, 0 = no
-        object.
-        """
+        """Return all depth images of object i, (V, S, S) float32, object radii, 0 = no object."""
         return self.read("depth", i).astype(np.float32) * np.float32(DEPTH_UNIT)
 
     def points(self, i: int) -> Float32:
