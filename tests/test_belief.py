@@ -78,7 +78,7 @@ def test_the_threshold_of_a_risk_is_the_lowest_that_promises_it(row, risk):
             bounds.threshold(risk, 1)
 
 
-def test_what_was_not_calibrated_is_not_promised():
+def test_an_uncalibrated_error_rate_is_not_guaranteed():
     bounds = RiskBounds((0.9,), ((0.01,), (0.02,)), 0.1)
     assert bounds.threshold(0.05, 2) == 0.9
     with pytest.raises(RiskError, match="at most 2 views, not 3"):
@@ -171,7 +171,7 @@ def test_where_sides_shall_not_count_the_sum_of_logits_is_believed():
         Calibration().belief(total + np.nan, 3, 3)
 
 
-def test_what_makes_no_sense_is_refused():
+def test_invalid_settings_are_rejected():
     for make, value in (
         (Stopping, 1.01),
         (fuse, np.array([[0.0, np.nan]])),

@@ -190,7 +190,7 @@ def test_every_array_has_to_be_there(models, name):
         open_memory(models / "memory.json")
 
 
-def test_a_memory_of_an_earlier_version_is_refused_in_a_sentence_that_says_what_to_do(
+def test_a_memory_of_an_earlier_version_is_rejected_with_advice(
     models,
 ):
     rewrite(

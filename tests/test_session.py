@@ -187,7 +187,7 @@ def test_threads_that_share_a_session_wait_for_each_other(system, camera):
     )
 
 
-def test_half_way_the_result_is_what_is_believed_so_far(system, camera):
+def test_an_unfinished_session_reports_the_current_belief(system, camera):
     session = Session(system.models, system.policy, system.sphere, 20, Stopping(1.0, 3))
     before = session.result
     assert (

@@ -572,7 +572,7 @@ def test_the_published_networks_train_on_images_and_clouds(views, tmp_path):
     }
 
 
-def test_what_is_no_finished_run_is_not_exported(trained, views, tmp_path):
+def test_an_unfinished_run_is_not_exported(trained, views, tmp_path):
     with pytest.raises(ModelError, match="holds no training run"):
         export_map(tmp_path, views, tmp_path / "models")
     with pytest.raises(ModelError, match="holds no run of a RecogniserRecipe"):

@@ -89,7 +89,7 @@ def test_one_of_the_first_proposals_is_near_the_truth(templates, seed):
     assert proposals.log_belief.argmax() == 0
 
 
-def test_what_a_camera_that_is_rolled_sees_is_turned_back(templates):
+def test_images_of_a_rolled_camera_are_rotated_back(templates):
     observations, _ = turned_views(THINGS[0], np.eye(3))
     image = MetricImage.of(observations[0])
     upright, look = seen(image)
@@ -109,7 +109,7 @@ def test_what_a_camera_that_is_rolled_sees_is_turned_back(templates):
     np.testing.assert_allclose(other_look @ roll[:3, :3].T, look, atol=1e-2)
 
 
-def test_the_mismatch_is_what_is_defined():
+def test_the_mismatch_follows_its_definition():
     rng = np.random.default_rng(0)
     made = []
     for count in (3, 5):
@@ -148,7 +148,7 @@ def test_directions_are_spread_evenly_and_cameras_look_along_them():
     np.testing.assert_allclose(looks[:, 2], -directions)
 
 
-def test_where_almost_nothing_is_seen_nothing_is_proposed(verifier, templates):
+def test_almost_empty_views_give_no_proposals(verifier, templates):
     observations, _ = turned_views(THINGS[0], np.eye(3))
     depth = np.zeros_like(observations[0].depth)
     depth[64:66, 64:67] = 3
