@@ -158,7 +158,7 @@ def test_looks_that_agree_on_the_side_are_believed_as_bayes_would(n_views):
         np.testing.assert_allclose(belief, softmax(logits[0] / 0.7))
 
 
-def test_where_sides_shall_not_count_the_sum_of_logits_is_believed():
+def test_without_azimuth_bins_the_belief_is_the_sum_of_logits():
     logits, azimuth_bins, azimuth = some_views(3)
     total = log_evidence_of(logits, azimuth_bins, azimuth * STEP).sum(0)
     for calibration in (Calibration(), Calibration(0.7, 0.5)):

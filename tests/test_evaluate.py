@@ -92,7 +92,7 @@ def test_accuracy_by_hand():
     assert table["published"].isna().all()
 
 
-def test_what_is_right_without_knowing_the_size_stands_beside():
+def test_accuracy_without_size_is_reported():
     p = by_hand()
     of_size = np.where(np.eye(2)[p.labels] > 0, 0, -99).astype(np.float32)
     sized = replace(p, logits=p.logits + of_size[:, None], of_size=of_size)

@@ -320,7 +320,7 @@ def test_a_policy_without_known_geometry_says_so():
         DiscriminateGeometry(SPHERE, travel_weight=-1.0)
 
 
-def test_what_is_known_of_a_scene_comes_from_the_views_and_the_verifier():
+def test_an_outlook_combines_the_views_and_the_verifier():
     meshes = [box_mesh(BODY), box_mesh(BODY, HANDLE)]
     verifier = Verifier(
         [Surface.from_mesh(m, str(k)) for k, m in enumerate(meshes)],

@@ -106,7 +106,7 @@ def link_away(path, place):
 
 @pytest.mark.parametrize("run", RUNS)
 @pytest.mark.parametrize("linked", ["memory.json", "learned.png", "."])
-def test_a_link_where_a_file_is_to_be_replaced_is_refused_before_anything_is_done(
+def test_an_output_path_that_is_a_link_is_rejected_early(
     place,
     looked_at,
     run,

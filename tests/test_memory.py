@@ -517,7 +517,7 @@ def test_weights_and_residuals_are_those_on_the_card(models):
         ({"correlation": 1.5}, "correlation"),
     ],
 )
-def test_weights_that_make_no_sense_are_refused(models, weights, sentence):
+def test_invalid_weights_are_rejected(models, weights, sentence):
     card = changed_card(
         models,
         set_at("memory/verification", VERIFIED | {"weights": weights}),

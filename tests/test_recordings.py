@@ -840,7 +840,7 @@ INCOMPLETE = {
 
 
 @pytest.mark.parametrize("what", INCOMPLETE)
-def test_what_a_folder_lacks_is_said(what, views, tmp_path):
+def test_missing_files_of_a_folder_are_reported(what, views, tmp_path):
     folder = written(tmp_path / "folder", views[:3])
     spoil, match = INCOMPLETE[what]
     spoil(folder)

@@ -263,7 +263,7 @@ def test_a_top_is_held_by_the_foot_that_shows_below_it(elevation, gap):
     assert_is(thing, table)
 
 
-def test_what_a_nearer_thing_hides_below_is_not_held_by_it():
+def test_an_occluded_object_is_not_part_of_a_nearer_one():
     mug, carton = (
         box((0.1, 0.3, 0.12), (0, 0, 0.06)),
         box((0.1, 0.2, 0.3), (-0.3, 0, 0.15)),
@@ -310,7 +310,7 @@ TROUGH = trimesh.util.concatenate(
 
 @pytest.mark.parametrize("asked", ["aim", "point"])
 @pytest.mark.parametrize("name", ["trough"])
-def test_what_lies_within_the_outline_of_a_thing_is_a_part_of_it(name, asked):
+def test_parts_within_the_outline_of_a_thing_belong_to_it(name, asked):
     mesh = {"lid": trimesh.util.concatenate([RIM, KNOB]), "trough": TROUGH}[name]
     ground = TABLE if name == "lid" else FLOOR
     pose = pose_at(50, 30, 0.5 if name == "lid" else 2.0, middle_of(mesh))
@@ -338,7 +338,7 @@ def test_an_object_in_a_corner_is_not_part_of_the_walls(azimuth):
 
 @pytest.mark.parametrize("shift", [-0.8, 0.8])
 @pytest.mark.parametrize("share", [0.0, 0.004])
-def test_where_noise_is_large_few_pixels_before_and_behind_a_thing_say_nothing_of_its_size(
+def test_with_large_noise_outlying_depths_do_not_affect_the_size(
     share,
     shift,
 ):

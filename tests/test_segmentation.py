@@ -198,7 +198,7 @@ def test_no_thing_is_no_mask(given):
         "cup",
     ],
 )
-def test_own_segmentation_of_another_form_is_refused(given):
+def test_an_invalid_own_segmentation_is_rejected(given):
     frame = level_frame(np.ones((48, 64), np.float32))
     with pytest.raises(ObservationError, match=r"segmentation"):
         instances_of(lambda frame: given, frame)

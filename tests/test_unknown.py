@@ -383,7 +383,7 @@ def test_a_suspicious_object_gets_more_views_and_no_confident_answer():
     )
 
 
-def test_what_a_later_frame_shows_in_another_light_is_not_held_against_the_object(
+def test_a_change_of_light_does_not_contradict_the_object(
     monkeypatch,
 ):
     """From the front a long box is half as long: novel.
